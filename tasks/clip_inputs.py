@@ -16,7 +16,7 @@ from data_contracts.redetection import redetection_name
 from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.store import Store
 
 PAGE = 256

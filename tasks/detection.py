@@ -28,7 +28,7 @@ from worldpose.detection import (
     weights_of,
 )
 from worldpose.errors import InputError
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections

@@ -34,7 +34,7 @@ from worldpose.filtering import (
     watch_motion,
 )
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.pitch import PitchTemplate
 from worldpose.redetection import (
     Expected,

@@ -27,7 +27,7 @@ from worldpose.body_fitting import (
     shift_frames,
 )
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.store import Store
 
 KNOWN: Final = 2.0

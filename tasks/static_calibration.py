@@ -21,7 +21,7 @@ from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_arrays
+from worldpose.geometry.cameras import camera_arrays
 from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (

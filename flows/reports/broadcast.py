@@ -21,7 +21,7 @@ from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
 from worldpose.broadcast_calibration import camera_before
 from worldpose.formats import JointTracks, whole_file
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import unit_frames
 from worldpose.reports import CaptionedImage
 from worldpose.reports.broadcast import (

@@ -12,7 +12,7 @@ from worldpose.body import BodyParameters, find_body
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.reports.bodies import BodyTracks
 from worldpose.store import Run
 

@@ -40,7 +40,7 @@ from worldpose.formats.challenge import (
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
 from worldpose.formats.pose_file import write_poses
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run

@@ -12,7 +12,7 @@ from command_line import succeed
 from data_contracts.pitch import PitchSpec
 from flows.registering import open_match
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import read_calibration
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store, open_run

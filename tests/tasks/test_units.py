@@ -19,7 +19,7 @@ from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.formats import read_camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.footage import write_still
 from worldpose.store import Store, explain_difference, recipe_key
 

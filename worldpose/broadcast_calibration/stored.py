@@ -13,7 +13,7 @@ from worldpose.broadcast_calibration.calibration import BroadcastCalibration
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
-from worldpose.camera_consistency.pair_scores import MIN_JOINTS, pair_scores
 from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
@@ -28,9 +28,22 @@ ORBITS_DEG: Final = (105.0, 215.0, 50.0, 320.0, 160.0, 270.0)
 JOINT_NOISES: Final = (0.015, 0.025, 0.04, 0.06, 0.08)
 """Candidate standard deviations of a detector's joint on the body [m]."""
 KEPT: Final = 0.75
-"""Share of the most matches that the chosen noise must keep."""
+"""Share of the maximum number of matches that the chosen noise must keep."""
+MIN_JOINTS = 6
+"""Minimum number of common joints of two detections."""
+_MIN_SINE = 0.08
+"""Minimum sine of the angle between two rays: nearly parallel rays meet everywhere."""
+_CLIP = 16.0
+"""Largest squared deviation of one joint: an outlier counts no more."""
+_EARLY_JOINTS, _EARLY_LIMIT = 4, 13.0
+"""After this number of joints a pair with a larger mean squared deviation is rejected."""
+_WIDTH = 1.5
+"""Deviation at which a match counts 61 %: the noise is uncertain by a factor of about two."""
+_SIZE_RANGE = (0.15, 1.1)
+"""Accepted root mean square distance of a person's joints from their mean [m]: about 0.45 for a
+standing adult, more along nearly parallel rays."""
 MIN_ANGLE: Final = 0.03
-"""Least angle between the rays of two cameras to the people for a comparison [rad]: a centimetre
+"""Minimum angle between the rays of two cameras to the people for a comparison [rad]: a centimetre
 across the rays is 0.3 m along them."""
 PIVOT_RANGE: Final = (3.0, 150.0)
 """Range of distances of the pivot of rotation from the camera [m]."""
@@ -44,8 +57,7 @@ IN_VIEW: Final = 0.7
 """Share of a person's joints in the image from which on a camera should detect the person."""
 
 
-@dataclass(frozen=True, eq=False)
-class View:
+class View(NamedTuple):
     """Rays of one camera's detections.
 
     Attributes:
@@ -132,7 +144,7 @@ class Comparison:
         self._heights = HEIGHTS if ground else (-math.inf, math.inf)
         self._joint_noise = JOINT_NOISES[-1]
         self._pixel_noise = pixel_noise
-        self._keypoints = [_packed(keypoints[:, c]) for c in range(self.count)]
+        self._keypoints = [_pack(keypoints[:, c]) for c in range(self.count)]
         self.views = [self.view(c, STATED) for c in range(self.count)]
         self.people_seen = np.array(
             [np.isfinite(v.rays[..., 0]).any(axis=-1).sum(axis=1).mean() for v in self.views]
@@ -150,7 +162,7 @@ class Comparison:
         points = self._keypoints[c if hypothesis.source is None else hypothesis.source]
         frames = self.times(hypothesis) if frames is None else frames
         points = np.where((frames >= 0)[:, None, None, None], points[frames], np.nan)
-        points = hypothesis.corrected(points, camera.image_size)
+        points = hypothesis.correct(points, camera.image_size)
         rays = np.full((*points.shape[:-1], 3), np.nan)
         known = np.isfinite(points).all(axis=-1)
         rays[known] = camera.unproject(points[known]).directions
@@ -163,20 +175,8 @@ class Comparison:
 
     def scores(self, view: View, partner: View, at: Ints, there: Ints) -> Floats:
         """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
-        return np.asarray(
-            pair_scores(
-                view.rays,
-                view.center,
-                view.spread,
-                at,
-                partner.rays,
-                partner.center,
-                partner.spread,
-                there,
-                self._heights,
-                self._joint_noise,
-            )
-        )
+        scores = pair_scores(view, at, partner, there, self._heights, self._joint_noise)
+        return np.asarray(scores)
 
     def quick(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> float:
         """Return the matches per frame in the fitting frames under a hypothesis, with chance."""
@@ -203,7 +203,7 @@ class Comparison:
             usual = np.median(
                 [
                     self.scores(moved, self.views[p], at, there).mean()
-                    for moved in _orbited(view, self.views[p], ORBITS_DEG[:4])
+                    for moved in _orbit(view, self.views[p], ORBITS_DEG[:4])
                 ]
             )
             matches += max(0.0, float(found - usual))
@@ -216,7 +216,7 @@ class Comparison:
         found = self.scores(self.views[a], self.views[b], self._everywhere, self._everywhere)
         chance = [
             self.scores(moved, self.views[b], self.search, self.search).mean()
-            for moved in _orbited(self.views[a], self.views[b], ORBITS_DEG)
+            for moved in _orbit(self.views[a], self.views[b], ORBITS_DEG)
         ]
         usual = float(np.median(chance))
         spread = 1.4826 * float(np.median(np.abs(np.array(chance) - usual)))
@@ -233,7 +233,7 @@ class Comparison:
         if not np.isfinite(depth):
             depth = float(np.linalg.norm(_meeting_place(view, partner) - view.center))
         apart = float(np.linalg.norm(view.center - partner.center))
-        return apart < MIN_ANGLE * float(np.clip(depth, *PIVOT_RANGE))
+        return apart < MIN_ANGLE * float(np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]))
 
     def fit_noise(self) -> None:
         """Choose the least joint noise with nearly as much agreement as the best one.
@@ -250,7 +250,7 @@ class Comparison:
                 found = self.scores(self.views[a], self.views[b], self.search, self.search).mean()
                 chance = [
                     self.scores(moved, self.views[b], self.search, self.search).mean()
-                    for moved in _orbited(self.views[a], self.views[b], ORBITS_DEG[:2])
+                    for moved in _orbit(self.views[a], self.views[b], ORBITS_DEG[:2])
                 ]
                 above += max(0.0, float(found - np.mean(chance)))
             totals.append(above)
@@ -351,7 +351,7 @@ def chance_noise(chance: float) -> float:
     return 0.3 * math.sqrt(float(chance) + 0.05)
 
 
-def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View]:
+def _orbit(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View]:
     """Yield the view rotated about the vertical through the point that both cameras look at.
 
     It shows as many people at the same heights as before, at wrong positions: a translation would
@@ -367,7 +367,7 @@ def _orbited(view: View, partner: View, degrees: Sequence[float]) -> Iterator[Vi
             ]
         )
         rays = np.ascontiguousarray(view.rays @ turn.T)
-        yield replace(view, rays=rays, center=pivot + turn @ (view.center - pivot))
+        yield view._replace(rays=rays, center=pivot + turn @ (view.center - pivot))
 
 
 def _meeting_place(view: View, partner: View) -> Floats:
@@ -376,7 +376,7 @@ def _meeting_place(view: View, partner: View) -> Floats:
     way = partner.center - view.center
     cosine = float(ray @ other)
     depth = float(way @ ray - cosine * (way @ other)) / max(1e-3, 1.0 - cosine**2)
-    return np.asarray(view.center + np.clip(depth, *PIVOT_RANGE) * ray)
+    return np.asarray(view.center + np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]) * ray)
 
 
 def _mean_ray(view: View) -> Floats:
@@ -387,7 +387,7 @@ def _mean_ray(view: View) -> Floats:
     return mean / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
 
 
-def _packed(keypoints: Floats) -> Floats:
+def _pack(keypoints: Floats) -> Floats:
     """Return detections (frames, detections, 17, 2) with enough joints, without gaps."""
     known = np.isfinite(keypoints[..., 0]).sum(axis=-1) >= MIN_JOINTS
     order = np.argsort(~known, axis=1, kind="stable")
@@ -396,3 +396,137 @@ def _packed(keypoints: Floats) -> Floats:
     packed = np.take_along_axis(keypoints, order[:, :, None, None], axis=1)
     there = np.take_along_axis(known, order, axis=1)
     return np.ascontiguousarray(np.where(there[..., None, None], packed, np.nan))
+
+
+@compiled
+def pair_scores(
+    view: View,
+    frames: Ints,
+    partner: View,
+    partner_frames: Ints,
+    heights: tuple[float, float],
+    joint_noise: float,
+) -> Floats:
+    """Return the number of one-to-one matches between two cameras' detections, frame by frame.
+
+    A match counts between 0 and 1, by the distance between its rays in standard deviations. The
+    assignment is greedy, best first.
+
+    Args:
+        view: of the first camera.
+        frames: (n,) its compared frames; -1 = none.
+        partner: of the second camera.
+        partner_frames: (n,) frame of the second camera for each of `frames`.
+        heights: lowest and highest mean height of a person's joints [m]; infinite where the
+            ground is unknown.
+        joint_noise: standard deviation of a detector's joint, on the body [m].
+
+    Returns:
+        (n,) sums of matches [1].
+    """
+    scores = np.zeros(len(frames))
+    for n in range(len(frames)):
+        fa, fb = frames[n], partner_frames[n]
+        if fa < 0 or fb < 0:
+            continue
+        weights = _weights(
+            view.rays[fa],
+            view.center,
+            view.spread[fa],
+            partner.rays[fb],
+            partner.center,
+            partner.spread[fb],
+            heights,
+            joint_noise,
+        )
+        scores[n] = _one_to_one(weights)
+    return scores
+
+
+@compiled
+def _one_to_one(weights: Floats) -> float:
+    """Return the sum of the best pairs, each row and column used once; clears `weights`."""
+    total = 0.0
+    rows, columns = weights.shape
+    while True:
+        best, row, column = 0.0, -1, -1
+        for i in range(rows):
+            for j in range(columns):
+                if weights[i, j] > best:
+                    best, row, column = weights[i, j], i, j
+        if row < 0:
+            return total
+        total += best
+        weights[row, :] = 0.0
+        weights[:, column] = 0.0
+
+
+@compiled
+def _weights(
+    rays_a: Floats,
+    center_a: Floats,
+    spread_a: Floats,
+    rays_b: Floats,
+    center_b: Floats,
+    spread_b: Floats,
+    heights: tuple[float, float],
+    joint_noise: float,
+) -> Floats:
+    """Return the match weights of every two detections (a, b), 0 to 1."""
+    count_a, joints, _ = rays_a.shape
+    count_b = rays_b.shape[0]
+    weights = np.zeros((count_a, count_b))
+    bx, by, bz = center_b[0] - center_a[0], center_b[1] - center_a[1], center_b[2] - center_a[2]
+    points = np.empty((joints, 3))
+    for i in range(count_a):
+        for j in range(count_b):
+            count, total = 0, 0.0
+            for step in range(joints):
+                # From the torso outwards: the face comes last.
+                joint = (11 + step) % joints if step < 6 else (5 + step - 6) % joints
+                if step >= 12:
+                    joint = step - 12
+                ux, uy, uz = rays_a[i, joint, 0], rays_a[i, joint, 1], rays_a[i, joint, 2]
+                vx, vy, vz = rays_b[j, joint, 0], rays_b[j, joint, 1], rays_b[j, joint, 2]
+                cosine = ux * vx + uy * vy + uz * vz
+                squared = 1.0 - cosine * cosine
+                if not squared > _MIN_SINE * _MIN_SINE:  # also NaN
+                    continue
+                along_u = bx * ux + by * uy + bz * uz
+                along_v = bx * vx + by * vy + bz * vz
+                s = (along_u - cosine * along_v) / squared
+                t = (cosine * along_u - along_v) / squared
+                if s <= 0.0 or t <= 0.0:  # the rays meet behind a camera
+                    total = math.inf
+                    break
+                dx, dy, dz = s * ux - bx - t * vx, s * uy - by - t * vy, s * uz - bz - t * vz
+                variance = (s * spread_a[i]) ** 2 + (t * spread_b[j]) ** 2
+                variance += 2.0 * joint_noise**2
+                points[count, 0] = center_a[0] + s * ux - 0.5 * dx
+                points[count, 1] = center_a[1] + s * uy - 0.5 * dy
+                points[count, 2] = center_a[2] + s * uz - 0.5 * dz
+                total += min(_CLIP, (dx * dx + dy * dy + dz * dz) / variance)
+                count += 1
+                if count == _EARLY_JOINTS and total > _EARLY_LIMIT * _EARLY_JOINTS:
+                    break
+            if count < MIN_JOINTS:
+                continue
+            weight = math.exp(-0.5 * total / count / _WIDTH**2)
+            if weight > 0.05 and _is_person(points[:count], heights):
+                weights[i, j] = weight
+    return weights
+
+
+@compiled
+def _is_person(points: Floats, heights: tuple[float, float]) -> bool:
+    """Return whether joints (n, 3) [m] have a person's size and height above the ground."""
+    n = len(points)
+    x = y = z = xx = 0.0
+    for k in range(n):
+        x += points[k, 0] / n
+        y += points[k, 1] / n
+        z += points[k, 2] / n
+    for k in range(n):
+        xx += ((points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2 + (points[k, 2] - z) ** 2) / n
+    low, high = _SIZE_RANGE
+    return low * low <= xx <= high * high and heights[0] <= z <= heights[1]

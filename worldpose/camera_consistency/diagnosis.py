@@ -16,26 +16,19 @@ from worldpose.camera_consistency.comparison import Comparison, Trial, chance_no
 from worldpose.camera_consistency.hypotheses import (
     STATED,
     Hypothesis,
-    focal_scaled,
     lens_hypotheses,
     pose_hypotheses,
-    turned,
+    rotate_camera,
+    scale_focal_length,
 )
-from worldpose.camera_consistency.settings import ConsistencySettings
-from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.static_calibration.parameters import project_with_jacobian
 
 PARTNERS: Final = 4
 """Number of partners for the closer comparison of a camera that agrees with others."""
 PARTNERS_OF_GROSS: Final = 6
 """The same for a camera that agrees with less than half: those with most agreement with others."""
-GIVEN_TILT: Final = 0.003
-"""Largest plausible rotation error of a given camera [rad]."""
-MIN_FOCAL_ERROR: Final = 0.03
-"""Least logarithm of a focal length's ratio that is a fault."""
 MIN_SHIFT: Final = 2
-"""Least clock offset that is a fault [frame]; triangulation estimates smaller ones."""
+"""Minimum clock offset that is a fault [frame]; triangulation estimates smaller ones."""
 CLEAR: Final = 0.5
 """Share of a camera's detections that match another camera's, below which all faults are tried."""
 RATES: Final = (0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)
@@ -52,7 +45,7 @@ MIN_GAIN: Final[dict[FaultKind, float]] = {
     "clock": 1.15,
     "frame_rate": 1.15,
 }
-"""Least ratio of matches with and without the correction. Lens orders have no free parameter."""
+"""Minimum ratio of matches with and without the correction. Lens orders have no free parameter."""
 SIMPLER: Final[dict[FaultKind, float]] = {
     "pose": 1.05,
     "focal": 1.02,
@@ -63,7 +56,7 @@ SIMPLER: Final[dict[FaultKind, float]] = {
 FINE: Final = ("focal", "lens", "clock", "frame_rate")
 """Faults that may be small."""
 MIN_CERTAINTY: Final = 3.5
-"""Least certainty of a small fault, in standard errors."""
+"""Minimum certainty of a small fault, in standard errors."""
 CONTRADICTED: Final = 0.2
 """Share of the people in its image below which a camera's detections are inconsistent."""
 
@@ -110,95 +103,7 @@ class Consistency:
     agreement: Floats
 
 
-def check_consistency(
-    cameras: Camera,
-    covariance: Floats | None,
-    keypoints: ClipArray,
-    confidence: ClipArray,
-    fps: float,
-    settings: ConsistencySettings,
-    *,
-    ground: bool = True,
-) -> Consistency:
-    """Return the inconsistent cameras, and the most probable fault of each.
-
-    The agreement of two cameras is the number of their detections that meet in 3D, one to one,
-    above chance. The largest group of cameras in agreement counts as correct. Every other camera,
-    and those of the group in partial agreement, are tested against hypotheses that each correct
-    the camera's calibration, images or clock. The fault is the one whose correction clearly
-    increases matches, in frames that it was not fitted to.
-
-    Args:
-        cameras: batch (cameras,).
-        covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); 0 or less excludes a keypoint, only the sign
-            counts.
-        fps: frames per second [1/s].
-        settings: number of compared frames, and noise.
-        ground: whether people stand on z = 0; else they may be anywhere.
-
-    Raises:
-        InputError: the shapes do not fit together.
-    """
-    if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
-        raise InputError(
-            "camera consistency",
-            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
-            "last, cameras (cameras,)",
-            found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
-            todo="Give arrays of the same clip and cameras.",
-        )
-    count = int(cameras.batch_shape[0])
-    part = _busiest(confidence, settings.stretch_frames)
-    points = np.array(keypoints[part], dtype=np.float64)
-    points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
-    if count < 2 or not len(points):
-        return Consistency((), (), tuple(range(count)), np.zeros((count, count)))
-    given, tilt = np.ones(count, dtype=np.bool_), np.full(count, GIVEN_TILT)
-    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise)
-    if covariance is not None:
-        known = [bool(np.isfinite(each).all()) for each in covariance]
-        given = np.logical_not(known)
-        for c in (place for place in range(count) if known[place]):
-            deviation = np.sqrt(np.diagonal(covariance[c]))
-            tilt[c] = max(GIVEN_TILT, 3.0 * float(deviation[:3].max()))
-            focal_error[c] = max(MIN_FOCAL_ERROR, 4.0 * float(deviation[6]))
-            noise[c] = math.hypot(noise[c], _calibration_noise(cameras[c], covariance[c]))
-    comparison = Comparison(cameras, noise, points, ground, settings)
-    comparison.fit_noise()
-    return _Diagnosis(comparison, fps, given, tilt, focal_error).run()
-
-
-def _busiest(confidence: ClipArray, longest: int) -> slice:
-    """Return the chunk of frames, of at most `longest`, with the most detections."""
-    frames = confidence.shape[0]
-    if frames <= longest:
-        return slice(0, frames)
-    starts = np.linspace(0, frames - longest, 8).astype(int)
-    middles = [int(start) + longest // 2 for start in starts]
-    counts = [np.count_nonzero(np.asarray(confidence[m : m + 1]) > 0.0) for m in middles]
-    start = int(starts[int(np.argmax(counts))])
-    return slice(start, start + longest)
-
-
-def _calibration_noise(camera: Camera, covariance: Floats) -> float:
-    """Return the standard deviation of people's image positions due to the calibration [px]."""
-    size = camera.image_size
-    grid = np.stack(np.meshgrid(*(s * np.array([0.2, 0.5, 0.8]) for s in size)), -1).reshape(-1, 2)
-    rays = camera.unproject(grid)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        way = (1.0 - rays.origins[:, 2]) / rays.directions[:, 2]
-    hit = np.isfinite(way) & (way > 0.0) & (way < 200.0)
-    if not hit.any():
-        return 0.0
-    points = rays.origins[hit] + way[hit, None] * rays.directions[hit]
-    _, jacobian = project_with_jacobian(camera, points)
-    variance = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian) / 2.0
-    return float(np.sqrt(np.nanmedian(variance)))
-
-
-class _Diagnosis:
+class Diagnosis:
     """Iterative diagnosis: removes the camera with the clearest fault until none is left."""
 
     def __init__(
@@ -227,14 +132,14 @@ class _Diagnosis:
         self.find_duplicates()
         core = self.core([c for c in range(count) if c not in self.faulty])
         if not core:
-            self.contradictions()
+            self.record_contradiction()
         for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
             found = self.explain(c, core, gross=True)
             if found is not None:
                 self.blame(c, found[0], core)
         self.complete_swaps(core)
         for c in [c for c in range(count) if c not in core and c not in self.faulty and core]:
-            self.unexplained(c, core)
+            self.record_unexplained(c, core)
         self.peel(core)
         return Consistency(
             tuple(self.faults),
@@ -344,7 +249,7 @@ class _Diagnosis:
             if fault.kind == "swapped" and other not in {None, *core, *self.faulty}:
                 self.faults.append(replace(fault, camera=int(other or 0), other=fault.camera))
 
-    def contradictions(self) -> None:
+    def record_contradiction(self) -> None:
         """Record the single fault whose correction makes cameras agree, if no two of them do."""
         comparison = self.comparison
         judged = [c for c in range(comparison.count) if c not in self.faulty]
@@ -360,9 +265,9 @@ class _Diagnosis:
                 best = (found[0].matches, c, found[0])
         for a in left:
             for b in left:
-                exchanged = self.exchanged(a, b) if a < b else None
-                if exchanged is not None and (best is None or exchanged.matches > best[0]):
-                    best = (exchanged.matches, a, exchanged)
+                swapped = self.swap_videos(a, b) if a < b else None
+                if swapped is not None and (best is None or swapped.matches > best[0]):
+                    best = (swapped.matches, a, swapped)
         if best is None:
             return
         _, c, trial = best
@@ -374,7 +279,7 @@ class _Diagnosis:
         else:
             self.blame(c, trial, [next(p for p in left if p != c)])
 
-    def exchanged(self, a: int, b: int) -> Trial | None:
+    def swap_videos(self, a: int, b: int) -> Trial | None:
         """Return the agreement of two cameras after a swap of their videos, or None."""
         comparison = self.comparison
         views = [
@@ -390,7 +295,7 @@ class _Diagnosis:
             return None
         return Trial(Hypothesis("swapped", "", source=b), found - now, now, 1, by_frame)
 
-    def unexplained(self, c: int, core: Sequence[int]) -> None:
+    def record_unexplained(self, c: int, core: Sequence[int]) -> None:
         """Record a camera that misses people seen by the others, without a known cause."""
         people = self.comparison.people(core, views=3)
         share, found, expected = self.comparison.shares(c, STATED, people)
@@ -422,10 +327,10 @@ class _Diagnosis:
             if value < need * quick or value - quick < 0.2:
                 continue
             if now is None:
-                now = comparison.trial(c, self.polished(c, STATED, partners), partners)
+                now = comparison.trial(c, self.polish(c, STATED, partners), partners)
             # The stated camera was rotated for the best fit; its small corrections get the same.
             fine = hypothesis.kind in FINE
-            tried = self.polished(c, hypothesis, partners) if fine else hypothesis
+            tried = self.polish(c, hypothesis, partners) if fine else hypothesis
             trial = comparison.trial(c, tried, partners)
             if trial.matches < need * now.matches or not self.certain(trial, now):
                 continue
@@ -451,7 +356,7 @@ class _Diagnosis:
         """Return the rank of an explanation: matches, reduced for kinds with more freedom."""
         return trial.matches / SIMPLER.get(trial.hypothesis.kind, 1.0)
 
-    def polished(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:
+    def polish(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:
         """Return the hypothesis with the camera rotated, within its uncertainty, for the best fit.
 
         A small rotation of a camera resembles some faults of its lens.
@@ -466,7 +371,7 @@ class _Diagnosis:
                     tried[axis] += sign * step * self.tilt[c]
                     if abs(tried[axis]) > self.tilt[c]:
                         continue
-                    option = replace(hypothesis, camera=turned(camera, tried))
+                    option = replace(hypothesis, camera=rotate_camera(camera, tried))
                     found = self.comparison.quick(c, option, partners)
                     if found > value:
                         best, value, turn = option, found, tried
@@ -525,12 +430,15 @@ class _Diagnosis:
         along = np.where(inside, along, 0.0).mean(axis=-1)
         shift = int(shifts[int(along[0].argmax())])
         if abs(shift) >= MIN_SHIFT:
-            yield float(along[0].max()), self.timed("clock", float(shift), shift, 1.0)
+            yield float(along[0].max()), self.change_clock("clock", float(shift), shift, 1.0)
         row, column = np.unravel_index(int(along[1:].argmax()), along[1:].shape)
         rate = float(rates[1:][row])
-        yield float(along[1:].max()), self.timed("frame_rate", rate, int(shifts[column]), rate)
+        yield (
+            float(along[1:].max()),
+            self.change_clock("frame_rate", rate, int(shifts[column]), rate),
+        )
 
-    def timed(self, kind: FaultKind, value: float, start: int, rate: float) -> Hypothesis:
+    def change_clock(self, kind: FaultKind, value: float, start: int, rate: float) -> Hypothesis:
         """Return the hypothesis of another start and rate of a camera's clock."""
         frames = np.round(start + rate * self.comparison.sample).astype(np.int64)
         inside = (frames >= 0) & (frames < self.comparison.frames)
@@ -540,4 +448,6 @@ class _Diagnosis:
 def focal_lengths(camera: Camera, around: float, reach: float, steps: int) -> Iterator[Hypothesis]:
     """Yield focal lengths around `around` times the stated one, in logarithmic steps."""
     for ratio in around * np.exp(np.linspace(-reach, reach, 2 * steps + 1)):
-        yield Hypothesis("focal", "", focal_scaled(camera, float(ratio)), value=float(1.0 / ratio))
+        yield Hypothesis(
+            "focal", "", scale_focal_length(camera, float(ratio)), value=float(1.0 / ratio)
+        )

@@ -65,9 +65,7 @@ class Hypothesis:
     source: int | None = None
     time: NDArray[np.int64] | None = None
 
-    def corrected(
-        self, stated: NDArray[np.float64], size: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def correct(self, stated: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return detections (..., 17, 2) [px] as a correct video would show them."""
         if self.mirrored:
             image = stated[..., LEFT_RIGHT, :].copy()
@@ -82,58 +80,62 @@ STATED: Final = Hypothesis("pose", "")
 """A camera as stated."""
 
 
-def posed(
+def replace_pose(
     camera: Camera, rotation: NDArray[np.float64], translation: NDArray[np.float64]
 ) -> Camera:
     """Return the camera with another pose."""
     return replace(camera, cam_from_world=Rigid(rotation, translation))
 
 
-def focal_scaled(camera: Camera, ratio: float) -> Camera:
+def scale_focal_length(camera: Camera, ratio: float) -> Camera:
     """Return the camera with its focal length times `ratio`."""
     return replace(camera, focal=camera.focal * ratio)
 
 
-def turned(camera: Camera, rotvec: NDArray[np.float64]) -> Camera:
+def rotate_camera(camera: Camera, rotvec: NDArray[np.float64]) -> Camera:
     """Return the camera rotated about its own centre by a rotation vector [rad] of its axes."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix() @ camera.cam_from_world.rotation
-    return posed(camera, rotation, -rotation @ camera.center)
+    return replace_pose(camera, rotation, -rotation @ camera.center)
 
 
 def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     """Yield possible errors of a whole pose: other end, mirrored, units, conventions."""
     rotation, t = camera.cam_from_world.rotation, camera.cam_from_world.translation
     half = np.diag([-1.0, -1.0, 1.0])
-    yield Hypothesis("flipped", "", posed(camera, rotation @ half, t))
+    yield Hypothesis("flipped", "", replace_pose(camera, rotation @ half, t))
     for axes, detail in (
         ((-1.0, 1.0, -1.0), "left and right are exchanged in the names"),
         ((1.0, -1.0, -1.0), "near and far are exchanged in the names"),
     ):
-        yield Hypothesis("mirrored", detail, posed(camera, rotation @ np.diag(axes), t))
+        yield Hypothesis("mirrored", detail, replace_pose(camera, rotation @ np.diag(axes), t))
     flip = np.diag([-1.0, 1.0, 1.0])
     for axes, detail in (
         ((-1.0, 1.0, 1.0), "its pose is mirrored left to right"),
         ((1.0, -1.0, 1.0), "its pose is mirrored near to far"),
     ):
         yield Hypothesis(
-            "mirrored", detail, posed(camera, flip @ rotation @ np.diag(axes), flip @ t)
+            "mirrored", detail, replace_pose(camera, flip @ rotation @ np.diag(axes), flip @ t)
         )
     yield Hypothesis("mirrored", "its images are mirrored", mirrored=True)
     yield Hypothesis("pose", "its images are upside down", upside_down=True)
     yield Hypothesis(
         "pose",
         "the pose is that of the camera in the world",
-        posed(camera, rotation.T, -rotation.T @ t),
+        replace_pose(camera, rotation.T, -rotation.T @ t),
     )
     yield Hypothesis(
-        "pose", "the translation is the camera's position", posed(camera, rotation, -rotation @ t)
+        "pose",
+        "the translation is the camera's position",
+        replace_pose(camera, rotation, -rotation @ t),
     )
     opengl = np.diag([1.0, -1.0, -1.0])
     yield Hypothesis(
-        "pose", "y points up and z backwards", posed(camera, opengl @ rotation, opengl @ t)
+        "pose", "y points up and z backwards", replace_pose(camera, opengl @ rotation, opengl @ t)
     )
     for unit, scale in LENGTH_UNITS.items():
-        yield Hypothesis("pose", f"the position is in {unit}", posed(camera, rotation, t * scale))
+        yield Hypothesis(
+            "pose", f"the position is in {unit}", replace_pose(camera, rotation, t * scale)
+        )
     rotvec = Rotation.from_matrix(rotation).as_rotvec()
     angle = float(np.linalg.norm(rotvec))
     if angle > 1e-9:
@@ -141,8 +143,10 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
         for turns in range(-29, 30):
             degrees = angle + 2.0 * math.pi * turns
             if 6.0 < abs(degrees) <= 181.0:
-                turned = Rotation.from_rotvec(axis * math.radians(degrees)).as_matrix()
-                yield Hypothesis("pose", "the rotation is in degrees", posed(camera, turned, t))
+                rotated = Rotation.from_rotvec(axis * math.radians(degrees)).as_matrix()
+                yield Hypothesis(
+                    "pose", "the rotation is in degrees", replace_pose(camera, rotated, t)
+                )
 
 
 def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:

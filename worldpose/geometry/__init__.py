@@ -3,8 +3,8 @@
 Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians, rays, distances.
 """
 
+from worldpose.geometry.cameras import Camera, Projection
 from worldpose.geometry.distortion import fold_radius
-from worldpose.geometry.pinhole import Camera, Projection
 from worldpose.geometry.rays import (
     Rays,
     RayStatus,

@@ -1,4 +1,6 @@
-"""Triangle rasterizer: z-buffer with four samples per pixel, spread over the exposure time.
+"""Projection of surfaces into an image, and a triangle rasterizer.
+
+The z-buffer has four samples per pixel, spread over the exposure time.
 
 Each sample has its own position within the pixel and its own moment while the shutter is open, so
 one pass antialiases edges and blurs motion. Vertices are projected through the lens one by one;
@@ -8,15 +10,21 @@ between them edges are straight, over some centimetres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Singles
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.compiled import compiled
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.projection import project_point
+from worldpose.geometry.rays import RayStatus
 
-Bytes = NDArray[np.uint8]
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom [px]; right and bottom lie outside."""
 
+_OK = int(RayStatus.OK)
 SAMPLES = 4
 _ACROSS = (-0.125, 0.375, -0.375, 0.125)
 _DOWN = (-0.375, -0.125, 0.125, 0.375)
@@ -26,12 +34,12 @@ _WHEN = (0.125, 0.625, 0.375, 0.875)
 NOBODY = -1
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
+class Samples(NamedTuple):
     """Samples of a part of an image.
 
     Attributes:
-        left, top: pixel of the image that is the first one here.
+        left: column of the image that is the first one here [px].
+        top: row of the image that is the first one here [px].
         depth: (height, width, 4) [m] along the camera's axis; infinite without a hit.
         who: (height, width, 4) number of the object hit; -1 without a hit.
         color: (height, width, 4, 3) RGB.
@@ -42,7 +50,7 @@ class Samples:
     top: int
     depth: Singles
     who: NDArray[np.int16]
-    color: Bytes
+    color: Image
     last: NDArray[np.int16]
 
     @classmethod
@@ -59,51 +67,50 @@ class Samples:
         )
 
 
+class Surface(NamedTuple):
+    """One object in an image while the shutter is open.
+
+    Attributes:
+        faces: (triangles, 3), counter-clockwise seen from outside.
+        backs: (triangles,) which of the two textures has their colours.
+        texels: (vertices, 2) column and row there.
+        textures: (2, rows, columns, 3) RGB.
+        opened: (vertices, 3) pixel [px] and depth [m] when the shutter opens.
+        closed: the same when it closes.
+        light: (vertices,) brightness of each vertex, 1 = as in the texture.
+    """
+
+    faces: NDArray[np.int32]
+    backs: NDArray[np.bool_]
+    texels: Singles
+    textures: Image
+    opened: Singles
+    closed: Singles
+    light: Singles
+
+
 @compiled
-def draw_triangles(
-    opened: Singles,
-    closed: Singles,
-    faces: NDArray[np.int32],
-    backs: NDArray[np.bool_],
-    texels: Singles,
-    pictures: Bytes,
-    light: Singles,
-    haze: Singles,
-    which: int,
-    left: int,
-    top: int,
-    depth: Singles,
-    who: NDArray[np.int16],
-    color: Bytes,
-    last: NDArray[np.int16],
-) -> int:
+def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples) -> int:
     """Draw one object into the z-buffer, and return the number of samples it would cover alone.
 
     Triangles that face away or have a vertex without an image are skipped.
 
     Args:
-        opened: (vertices, 3) pixel [px] and depth [m] when the shutter opens.
-        closed: the same when it closes.
-        faces: (triangles, 3), counter-clockwise seen from outside.
-        backs: (triangles,) which of the two textures has their colours.
-        texels: (vertices, 2) column and row there.
-        pictures: (2, rows, columns, 3) RGB.
-        light: (vertices,) brightness of each vertex, 1 = as in the texture.
+        surface: the object.
         haze: (4,) share of the haze in front of it, and the haze's colour [levels of 255].
         which: number of the object, from 0.
-        left: of the samples' first pixel.
-        top: of the samples' first pixel.
-        depth: of `Samples`, written.
-        who: of `Samples`, written.
-        color: of `Samples`, written.
-        last: of `Samples`, written.
+        samples: written.
     """
+    opened, closed, faces, light = surface.opened, surface.closed, surface.faces, surface.light
+    backs, texels = surface.backs, surface.texels
+    left, top, depth, who = samples.left, samples.top, samples.depth, samples.who
+    color, last = samples.color, samples.last
     height, width = depth.shape[0], depth.shape[1]
     count = 0
     clear = np.float32(1.0) - haze[0]
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        picture = pictures[1 if backs[f] else 0]
+        picture = surface.textures[1 if backs[f] else 0]
         for s in range(SAMPLES):
             share, right, down = _WHEN[s], left + _ACROSS[s], top + _DOWN[s]
             ax = opened[a, 0] + share * (closed[a, 0] - opened[a, 0]) - right
@@ -147,7 +154,7 @@ def draw_triangles(
 
 
 @compiled
-def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Bytes) -> None:
+def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Image) -> None:
     """Set a bit in the pixels whose centres lie within triangles of either orientation.
 
     Args:
@@ -179,8 +186,8 @@ def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: B
 @compiled
 def resolve(
     who: NDArray[np.int16],
-    color: Bytes,
-    picture: Bytes,
+    color: Image,
+    picture: Image,
     persons: NDArray[np.int16],
     seen: NDArray[np.int64],
 ) -> None:
@@ -222,3 +229,56 @@ def resolve(
             picture[v, u, 2] = (blue + rest * picture[v, u, 2] + 2) // SAMPLES
             if 2 * most >= SAMPLES:
                 persons[v, u] = best
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Image positions of surfaces.
+
+    Attributes:
+        pixels: (surfaces, vertices, 3) pixel [px] and depth [m]; NaN without an image.
+        boxes: (surfaces, 4) left, top, right, bottom of all vertices with an image [px].
+    """
+
+    pixels: Singles
+    boxes: Floats
+
+    def box(self, number: int, margin: int, width: int, height: int) -> Box | None:
+        """Return the part of the image that shows a surface: left, top, right, bottom."""
+        if not np.isfinite(self.boxes[number]).all():
+            return None
+        left, top, right, bottom = self.boxes[number]
+        part = (
+            max(int(np.floor(left)) - margin, 0),
+            max(int(np.floor(top)) - margin, 0),
+            min(int(np.ceil(right)) + margin + 1, width),
+            min(int(np.ceil(bottom)) + margin + 1, height),
+        )
+        return part if part[0] < part[2] and part[1] < part[3] else None
+
+
+def outline_surfaces(camera: Camera, vertices: Singles) -> Outlines:
+    """Return outlines in a single camera's image of (surfaces, vertices, 3) [m], world."""
+    pixels, boxes = np.empty_like(vertices), np.empty((len(vertices), 4))
+    _project(camera.numbers, vertices, pixels, boxes)
+    return Outlines(pixels, boxes)
+
+
+@compiled
+def _project(camera: Floats, vertices: Singles, pixels: Singles, boxes: Floats) -> None:
+    """Write pixels and depth (surfaces, vertices, 3), and the box (4,) around each surface."""
+    for p in range(vertices.shape[0]):
+        left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+        for v in range(vertices.shape[1]):
+            at = vertices[p, v]
+            seen = project_point(camera, float(at[0]), float(at[1]), float(at[2]))
+            if seen[0] != _OK:
+                pixels[p, v] = np.nan
+                continue
+            x, y = camera[0] * seen[1] + camera[2], camera[1] * seen[2] + camera[3]
+            pixels[p, v, 0], pixels[p, v, 1], pixels[p, v, 2] = x, y, seen[5]
+            left, right = min(left, x), max(right, x)
+            top, bottom = min(top, y), max(bottom, y)
+        boxes[p, 0], boxes[p, 1], boxes[p, 2], boxes[p, 3] = left, top, right, bottom
+        if not left < np.inf:
+            boxes[p] = np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from types import EllipsisType
 from typing import Any, TypeAlias
@@ -209,7 +210,7 @@ def common_batch(where: str, *batches: tuple[int, ...]) -> tuple[int, ...]:
         InputError: they do not broadcast.
     """
     try:
-        return np.broadcast_shapes(*batches)
+        return functools.reduce(np.broadcast_shapes, batches)
     except ValueError:
         raise InputError(
             where,

@@ -1,4 +1,8 @@
-"""Alignment of a survey with the world frame: rigid transform, length, width, crown, residuals."""
+"""Alignment of a survey with the world frame: rigid transform, length, width, crown, residuals.
+
+Checks before and after the alignment reject surveys in another unit, in a mirrored frame, or with
+wrong names.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +11,151 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from data_contracts.pitch import PitchSpec
+from data_contracts.records import Record
 from worldpose.errors import InputError
-from worldpose.pitch.survey_checks import (
-    STANDARD_SIZE,
-    best_turn,
-    law_places,
-    nominal_places,
-    plane_rotation,
-    require_names,
-    require_orientation,
-    require_spread,
-)
+from worldpose.pitch.laws import law_points
 from worldpose.pitch.survey_file import Survey
-from worldpose.pitch.survey_settings import SurveySettings
+
+
+class SurveySettings(Record):
+    """Plausible properties of a survey, and priors where it determines nothing."""
+
+    left_handed: bool = False
+    """Whether x, y and height of the survey are a left-handed frame, such as x north and y east."""
+    fit_scale: bool = False
+    """Divide by the survey's scale, as of a map projection, instead of only reporting it."""
+    accuracy: float = Field(default=0.03, ge=1e-6, le=10)
+    """Standard deviation of painted markings from the Laws of the Game [m]: a quarter of a line."""
+    largest_offset: float = Field(default=1.0, ge=1e-6, le=100)
+    """Offset beyond which a point's name is wrong [m]: no painter errs by that much."""
+    largest_scale: float = Field(default=0.08, ge=1e-6, le=10)
+    """Deviation of the scale from 1 beyond which lengths have another unit [1]: yards differ by 9
+    %; a survey of the corners alone passes for pitches of 97 to 113 m by 63 to 73 m."""
+    length_spread: float = Field(default=5.0, ge=1e-6, le=1000)
+    """Standard deviation of pitch lengths around 105 m [m]: prior of a length not surveyed."""
+    width_spread: float = Field(default=4.0, ge=1e-6, le=1000)
+    """Standard deviation of pitch widths around 68 m [m]: as `length_spread`."""
+    crown_spread: float = Field(default=0.1, ge=1e-6, le=10)
+    """Standard deviation of crowns around 0.2 m [m]: as `length_spread`."""
+    slope_spread: float = Field(default=0.01, ge=1e-6, le=1)
+    """Standard deviation of the pitch's slope across it [1]: 1 %, the most on sport grounds."""
+
+
+_STANDARD_SIZE: Final = (105.0, 68.0)
+"""Initial length and width of a pitch [m]."""
+
+
+def _law_places(survey: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the positions of the survey's points in the Laws of the Game.
+
+    Returns:
+        Positions (n, 3) [m] on a pitch of no length and width, z above the surface, and the change
+        of x by length and of y by width (n, 2) [1].
+    """
+    base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
+    at = np.array([base[name] for name in survey.names]).reshape(-1, 3)
+    change = np.array([larger[name] for name in survey.names]).reshape(-1, 3) - at
+    return at, change[:, :2]
+
+
+def _nominal_places(survey: Survey) -> NDArray[np.float64]:
+    """Return the points' positions in plan (n, 2) [m] on a pitch of 105 x 68 m."""
+    law, change = _law_places(survey)
+    return np.asarray(law[:, :2] + change * _STANDARD_SIZE)
+
+
+def _best_rotation(
+    centred: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the rotation (2, 2) that brings centred points nearest to others."""
+    (a, b), (c, d) = centred.T @ (places - places.mean(axis=0))
+    return _plane_rotation(float(np.arctan2(b - c, a + d)))
+
+
+def _plane_rotation(angle: float) -> NDArray[np.float64]:
+    """Return the rotation (2, 2) by an angle [rad], from x towards y."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine], [sine, cosine]])
+
+
+def _require_spread(survey: Survey) -> None:
+    """Reject fewer than four points, or points near one line.
+
+    Raises:
+        InputError: it names the points.
+    """
+    enough = len(survey.names) >= 4
+    for places in (survey.places[:, :2], _nominal_places(survey)) if enough else ():
+        extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        enough = enough and extents[1] > 0.05 * extents[0]
+    if not enough:
+        raise InputError(
+            survey.where,
+            expected="at least four points that do not lie near one line",
+            found=f"{len(survey.names)}: {', '.join(survey.names) or 'none'}",
+            todo="Survey the four corners, and the penalty areas if there is time.",
+        )
+
+
+def _require_orientation(
+    survey: Survey, places: NDArray[np.float64], settings: SurveySettings
+) -> None:
+    """Reject a survey whose mirror image fits far better than the survey.
+
+    Args:
+        survey: for its names and messages.
+        places: (n, 2) [m], in a right-handed frame if the settings are correct.
+        settings: stated handedness of the frame.
+
+    Raises:
+        InputError: it names possible causes.
+    """
+    nominal = _nominal_places(survey)
+    target = nominal - nominal.mean(axis=0)
+    errors = []
+    for mirror in ((1.0, 1.0), (1.0, -1.0)):
+        centred = (places - places.mean(axis=0)) * mirror
+        centred = centred * np.linalg.norm(target) / np.linalg.norm(centred)
+        off = centred @ _best_rotation(centred, target).T - target
+        errors.append(float(np.median(np.linalg.norm(off, axis=-1))))
+    if errors[1] < 0.5 * errors[0]:
+        raise InputError(
+            survey.where,
+            expected="left and right, near and far as seen from the main camera",
+            found="a mirror image of the pitch",
+            todo="Exchange left and right in the names, or say that the frame is "
+            f"{'right' if settings.left_handed else 'left'}-handed (x north and y east are "
+            "left-handed; columns named easting and northing need not say so).",
+        )
+
+
+def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: SurveySettings) -> None:
+    """Reject points that are far from the positions of their names.
+
+    Args:
+        survey: for its names and messages.
+        offsets: (n, 2) of the aligned survey from the Laws [m].
+        settings: largest plausible error of the markings.
+
+    Raises:
+        InputError: it names the points.
+    """
+    offset = np.linalg.norm(offsets, axis=-1)
+    far = [
+        f"{survey.names[n]} ({offset[n]:.2f} m)"
+        for n in np.argsort(-offset)
+        if offset[n] > settings.largest_offset
+    ]
+    if far:
+        raise InputError(
+            survey.where,
+            expected=f"every point within {settings.largest_offset:g} m of the place of its name",
+            found=f"farther off: {', '.join(far[:6])}",
+            todo="Exchange or correct these names, or remove the points from the file.",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +201,19 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
         C1.
     """
     settings = settings or SurveySettings()
-    require_spread(survey)
+    _require_spread(survey)
     places = survey.places * (1.0, -1.0 if settings.left_handed else 1.0, 1.0)
     places = places - np.append(places[:, :2].mean(axis=0), 0.0)  # a grid's numbers are large
-    require_orientation(survey, places[:, :2], settings)
-    scale = _scale(survey, places[:, :2], settings)
+    _require_orientation(survey, places[:, :2], settings)
+    scale = _estimate_scale(survey, places[:, :2], settings)
     if settings.fit_scale:
         places = places / scale
     level = np.eye(3)
     for _ in range(2):
-        plan, heights = _fit(survey, _levelled(places, level), settings)
-        level = _levelling(plan.turn.T @ heights.slope) @ level
-    plan, heights = _fit(survey, _levelled(places, level), settings)
-    require_names(survey, plan.places - plan.law, settings)
+        plan, heights = _fit_plan_and_heights(survey, _rotate_to_level(places, level), settings)
+        level = _leveling_rotation(plan.turn.T @ heights.slope) @ level
+    plan, heights = _fit_plan_and_heights(survey, _rotate_to_level(places, level), settings)
+    _require_names(survey, plan.places - plan.law, settings)
     world = np.column_stack([plan.places, heights.places])
     pitch = PitchSpec(
         length=round(plan.length, 4),
@@ -125,18 +259,20 @@ class _Heights:
     measured: bool
 
 
-_ROUNDS: Final = 30
+_MAX_ITERATIONS: Final = 30
 """Iterations of reweighted Gauss-Newton; the loss has its final width after ten."""
 
 
-def _fit(
+def _fit_plan_and_heights(
     survey: Survey, places: NDArray[np.float64], settings: SurveySettings
 ) -> tuple[_Plan, _Heights]:
     plan = _fit_plan(survey, places[:, :2], settings)
     return plan, _fit_heights(survey, plan, places[:, 2], settings)
 
 
-def _levelled(places: NDArray[np.float64], level: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate_to_level(
+    places: NDArray[np.float64], level: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return points (n, 3) [m] after a rotation; a point without height lies on the plane."""
     taken = np.isfinite(places[:, 2])
     if not taken.any():
@@ -153,19 +289,19 @@ def _fit_plan(
     survey: Survey, places: NDArray[np.float64], settings: SurveySettings, stretch: bool = False
 ) -> _Plan:
     """Fit rotation, shift, length and width by robust least squares, with `stretch` the scale."""
-    law, change = law_places(survey)
+    law, change = _law_places(survey)
     middle = places.mean(axis=0)
     centred = places - middle
-    size = np.array(STANDARD_SIZE)
-    turn = best_turn(centred, law[:, :2] + change * size)
+    size = np.array(_STANDARD_SIZE)
+    turn = _best_rotation(centred, law[:, :2] + change * size)
     shift = (law[:, :2] + change * size).mean(axis=0)
     spreads = np.array([settings.length_spread, settings.width_spread])
     scale = 1.0
-    for round_ in range(_ROUNDS):
+    for iteration in range(_MAX_ITERATIONS):
         turned = centred @ turn.T
         residual = scale * turned + shift - law[:, :2] - change * size
         # Wide at first: the start may be metres off if the pitch is not 105 x 68 m.
-        loss = max(3.0 * settings.accuracy, 3.0 * 0.7**round_)
+        loss = max(3.0 * settings.accuracy, 3.0 * 0.7**iteration)
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=-1) / loss**2)
         jacobian = np.zeros((len(places), 2, 6))
         jacobian[..., 0] = scale * turned @ np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -175,9 +311,9 @@ def _fit_plan(
         root = np.sqrt(weight)[:, None] / settings.accuracy
         rows = np.concatenate([(jacobian * root[..., None]).reshape(-1, 6), np.zeros((2, 6))])
         rows[[-2, -1], [3, 4]] = 1.0 / spreads
-        right = np.concatenate([(residual * root).ravel(), (size - STANDARD_SIZE) / spreads])
+        right = np.concatenate([(residual * root).ravel(), (size - _STANDARD_SIZE) / spreads])
         step = -np.linalg.lstsq(rows, right, rcond=None)[0]
-        turn = plane_rotation(step[0]) @ turn
+        turn = _plane_rotation(step[0]) @ turn
         shift, size, scale = shift + step[1:3], size + step[3:5], scale + step[5]
     covariance = np.linalg.pinv(rows[:, :5].T @ rows[:, :5])
     known = np.sqrt(np.diagonal(covariance))[3:] < 0.5 * spreads
@@ -197,7 +333,7 @@ def _fit_heights(
     survey: Survey, plan: _Plan, heights: NDArray[np.float64], settings: SurveySettings
 ) -> _Heights:
     """Fit level, slope and crown by least squares to the points with a height."""
-    above = law_places(survey)[0][:, 2]
+    above = _law_places(survey)[0][:, 2]
     ridge = -((plan.places[:, 1] / (0.5 * plan.width)) ** 2)
     taken = np.isfinite(heights)
     if not taken.any():
@@ -226,7 +362,7 @@ def _fit_heights(
     )
 
 
-def _levelling(slope: NDArray[np.float64]) -> NDArray[np.float64]:
+def _leveling_rotation(slope: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation (3, 3) that makes a plane with this slope horizontal."""
     normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1.0 + slope @ slope)
     x, y, z = normal
@@ -239,13 +375,13 @@ def _levelling(slope: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _scale(survey: Survey, places: NDArray[np.float64], settings: SurveySettings) -> float:
+def _estimate_scale(survey: Survey, places: NDArray[np.float64], settings: SurveySettings) -> float:
     """Return the ratio of lengths in the survey to true ones.
 
     Raises:
         InputError: the ratio differs from 1 by more than in any grid.
     """
-    nominal = nominal_places(survey)
+    nominal = _nominal_places(survey)
     extents = [np.linalg.norm(each - each.mean(axis=0)) for each in (places, nominal)]
     gross = float(extents[0] / extents[1])
     scale = gross

@@ -17,8 +17,14 @@ from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.pitch import PitchSpec
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.geometry import Camera
-from worldpose.geometry.outlines import outline_surfaces
-from worldpose.geometry.rasters import NOBODY, Samples, draw_triangles, resolve
+from worldpose.geometry.rasters import (
+    NOBODY,
+    Samples,
+    Surface,
+    draw_triangles,
+    outline_surfaces,
+    resolve,
+)
 from worldpose.reports.drawing import INK, draw_label, markings, person_color, png, style
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
@@ -91,23 +97,16 @@ def paint_bodies(
     plain = np.zeros(len(faces), dtype=np.bool_), np.zeros((*bodies.shape[1:-1], 2), np.float32)
     for number in inside:
         shade = np.rint(255.0 * colors[number]).astype(np.uint8)
-        draw_triangles(
-            outlines.pixels[number],
-            outlines.pixels[number],
-            triangles,
-            plain[0],
-            plain[1],
-            np.broadcast_to(shade, (2, 1, 1, 3)).copy(),
-            _light(surfaces[number], triangles, corners, camera.center.astype(np.float32)),
-            np.zeros(4, dtype=np.float32),
-            number,
-            samples.left,
-            samples.top,
-            samples.depth,
-            samples.who,
-            samples.color,
-            samples.last,
+        surface = Surface(
+            faces=triangles,
+            backs=plain[0],
+            texels=plain[1],
+            textures=np.broadcast_to(shade, (2, 1, 1, 3)).copy(),
+            opened=outlines.pixels[number],
+            closed=outlines.pixels[number],
+            light=_light(surfaces[number], triangles, corners, camera.center.astype(np.float32)),
         )
+        draw_triangles(surface, np.zeros(4, dtype=np.float32), number, samples)
     painted = canvas.copy()
     owner = np.full((height, width), NOBODY, dtype=np.int16)
     resolve(samples.who, samples.color, painted, owner, np.zeros(len(bodies), dtype=np.int64))

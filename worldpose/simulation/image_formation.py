@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
-from worldpose.geometry.outlines import Box, Outlines, outline_surfaces
-from worldpose.geometry.rasters import NOBODY, Samples, draw_triangles, resolve
+from worldpose.geometry.rasters import (
+    NOBODY,
+    Box,
+    Outlines,
+    Samples,
+    Surface,
+    draw_triangles,
+    outline_surfaces,
+    resolve,
+)
 from worldpose.simulation.casting import Cast
 from worldpose.simulation.looks import RenderingSettings
 from worldpose.simulation.mannequins import Surfaces
@@ -72,19 +80,6 @@ class Moment:
     props: Sequence[Prop]
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """A surface as `draw_triangles` takes it."""
-
-    faces: NDArray[np.int32]
-    backs: NDArray[np.bool_]
-    texels: Singles
-    picture: Bytes
-    opened: Singles
-    closed: Singles
-    light: Singles
-
-
 def expose(
     venue: Venue, camera: Camera, sharp: Bytes, blurred: Bytes, grain: NDArray[np.int8],
     moment: Moment, frame: int,
@@ -113,23 +108,7 @@ def expose(
         samples = Samples.empty(left, top, right, bottom)
         for number in members:
             thing = drawn[number]
-            count = draw_triangles(
-                thing.opened,
-                thing.closed,
-                thing.faces,
-                thing.backs,
-                thing.texels,
-                thing.picture,
-                thing.light,
-                _haze(venue, thing.opened),
-                number,
-                left,
-                top,
-                samples.depth,
-                samples.who,
-                samples.color,
-                samples.last,
-            )
+            count = draw_triangles(thing, _haze(venue, thing.opened), number, samples)
             if number < persons:
                 filled[number] = count
         part = (slice(top, bottom), slice(left, right))
@@ -146,7 +125,7 @@ def expose(
 
 def _outlined(
     venue: Venue, camera: Camera, moment: Moment, width: int, height: int
-) -> tuple[list[_Drawn], list[Box | None], Floats]:
+) -> tuple[list[Surface], list[Box | None], Floats]:
     """Return all surfaces, people first; the image region of each; people's boxes (n, 4)."""
     cast = moment.cast
     opened = outline_surfaces(camera, moment.opened.vertices)
@@ -156,15 +135,35 @@ def _outlined(
     light = _lit(venue, moment.opened)
     shape = cast.mannequin
     drawn = [
-        _Drawn(shape.faces, shape.backs, shape.texels, *each)
-        for each in zip(cast.pictures, opened.pixels, closed.pixels, light, strict=True)
+        Surface(
+            faces=shape.faces,
+            backs=shape.backs,
+            texels=shape.texels,
+            textures=textures,
+            opened=first,
+            closed=last,
+            light=brightness,
+        )
+        for textures, first, last, brightness in zip(
+            cast.pictures, opened.pixels, closed.pixels, light, strict=True
+        )
     ]
     spans = [_span(opened, closed, person, width, height) for person in range(len(drawn))]
     for prop in moment.props:
         outline = outline_surfaces(camera, prop.surfaces.vertices)
         pixels = outline.pixels[0]
         lit = _lit(venue, prop.surfaces)[0]
-        drawn.append(_Drawn(prop.faces, prop.backs, prop.texels, prop.picture, pixels, pixels, lit))
+        drawn.append(
+            Surface(
+                faces=prop.faces,
+                backs=prop.backs,
+                texels=prop.texels,
+                textures=prop.picture,
+                opened=pixels,
+                closed=pixels,
+                light=lit,
+            )
+        )
         spans.append(outline.box(0, 1, width, height))
     both = np.stack([opened.boxes, closed.boxes])
     boxes = np.concatenate([both[..., :2].min(axis=0), both[..., 2:].max(axis=0)], axis=1)

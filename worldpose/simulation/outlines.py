@@ -7,7 +7,7 @@ import numpy as np
 from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
-from worldpose.geometry.outlines import Outlines, outline_surfaces
+from worldpose.geometry.rasters import Outlines, outline_surfaces
 from worldpose.simulation.venues import Venue
 
 

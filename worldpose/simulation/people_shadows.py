@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
-from worldpose.geometry.outlines import Box
-from worldpose.geometry.rasters import cover_triangles
+from worldpose.geometry.rasters import Box, cover_triangles
 from worldpose.simulation.outlines import outline_shadows
 from worldpose.simulation.venues import Venue
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.geometry import Camera, RayStatus
-from worldpose.geometry.stored import camera_arrays
+from worldpose.geometry.cameras import camera_arrays
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import Explanation, compute_residuals

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.geometry.rasters import Samples, cover_triangles, draw_triangles, resolve
+from worldpose.geometry.rasters import Samples, Surface, cover_triangles, draw_triangles, resolve
 
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 """Of a rectangle whose corners go down first, as a camera has what faces it."""
@@ -18,23 +18,16 @@ def rectangle(left, top, right, bottom, depth=10.0):
 
 
 def draw(samples, opened, which, closed=None, faces=FACES, level=200, light=1.0):
-    return draw_triangles(
-        opened,
-        opened if closed is None else closed,
-        faces,
-        BACKS,
-        TEXELS,
-        np.full((2, 1, 1, 3), level, dtype=np.uint8),
-        np.full(4, light, dtype=np.float32),
-        CLEAR,
-        which,
-        samples.left,
-        samples.top,
-        samples.depth,
-        samples.who,
-        samples.color,
-        samples.last,
+    surface = Surface(
+        faces=faces,
+        backs=BACKS,
+        texels=TEXELS,
+        textures=np.full((2, 1, 1, 3), level, dtype=np.uint8),
+        opened=opened,
+        closed=opened if closed is None else closed,
+        light=np.full(4, light, dtype=np.float32),
     )
+    return draw_triangles(surface, CLEAR, which, samples)
 
 
 def test_a_rectangle_on_pixel_borders_has_all_samples_of_its_pixels():

@@ -4,7 +4,7 @@ import xarray as xr
 
 from data_contracts.static_calibration import STATIC_CALIBRATION
 from tasks.bundle_adjustment import _clicks
-from worldpose.geometry.stored import camera_arrays, camera_from_arrays
+from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
 from worldpose.static_calibration import (
     calibrate,
     calibration_arrays,

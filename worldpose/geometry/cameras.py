@@ -1,9 +1,10 @@
-"""Pinhole cameras with lens distortion: projection with Jacobians, and unprojection to rays."""
+"""Pinhole cameras with lens distortion: projection with Jacobians, unprojection, storage."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -212,7 +213,7 @@ class Camera:
         batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
         image = np.empty((*points.shape[:-1], 2))
         projection.project(cameras, points, image)
-        return image.reshape(*batch, *image.shape[1:])
+        return image.reshape((*batch, *image.shape[1:]))
 
     def project_with_jacobians(self, points_world: ArrayLike) -> Projection:
         """Return the pixels of world points with their derivatives.
@@ -229,14 +230,14 @@ class Camera:
         jacobian = np.empty((*shape, 2, 18))
         status = np.empty(shape, dtype=np.uint8)
         projection.project_with_jacobians(cameras, points, image, jacobian, status)
-        jacobian = jacobian.reshape(*batch, *jacobian.shape[1:])
+        jacobian = jacobian.reshape((*batch, *jacobian.shape[1:]))
         return Projection(
-            points_image=image.reshape(*batch, *image.shape[1:]),
+            points_image=image.reshape((*batch, *image.shape[1:])),
             d_points=jacobian[..., :3],
             d_pose=jacobian[..., 3:9],
             d_intrinsics=jacobian[..., 9:13],
             d_distortion=jacobian[..., 13:],
-            status=status.reshape(*batch, *status.shape[1:]),
+            status=status.reshape((*batch, *status.shape[1:])),
         )
 
     def unproject(self, points_image: ArrayLike) -> Rays:
@@ -257,8 +258,8 @@ class Camera:
         projection.point_rays(cameras, plane, directions)
         return Rays(
             origins=self.center[..., None, :],
-            directions=directions.reshape(*batch, *directions.shape[1:]),
-            status=status.reshape(*batch, *status.shape[1:]),
+            directions=directions.reshape((*batch, *directions.shape[1:])),
+            status=status.reshape((*batch, *status.shape[1:])),
         )
 
     def normalize(self, points_image: ArrayLike) -> NDArray[np.float64]:
@@ -275,7 +276,7 @@ class Camera:
         """
         batch, cameras, points = self._flat("Camera.normalize: points_image", points_image, 2)
         plane, _ = _normalize(cameras, points)
-        return plane.reshape(*batch, *plane.shape[1:])
+        return plane.reshape((*batch, *plane.shape[1:]))
 
     def _flat(
         self, where: str, points: ArrayLike, width: int
@@ -286,7 +287,7 @@ class Camera:
         size = int(np.prod(batch))
         cameras = np.broadcast_to(self.numbers, (*batch, 22)).reshape(size, 22)
         shape = values.shape[-2:]
-        return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape(size, *shape)
+        return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape((size, *shape))
 
 
 def _normalize(
@@ -302,3 +303,31 @@ def _normalize(
 def _vector3(values: NDArray[np.float64]) -> Vector3:
     x, y, z = values.tolist()
     return x, y, z
+
+
+_STORED: Final = ("focal", "principal_point", "distortion", "rotation", "translation", "image_size")
+"""Arrays of `data_contracts.cameras`."""
+
+
+def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays of a single camera, by name."""
+    return {
+        "focal": camera.focal,
+        "principal_point": camera.principal_point,
+        "distortion": camera.distortion,
+        "rotation": camera.cam_from_world.rotation,
+        "translation": camera.cam_from_world.translation,
+        "image_size": camera.image_size,
+    }
+
+
+def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
+    """Return the camera of stored arrays, bit for bit the one that was stored."""
+    stored = {name: np.asarray(arrays[name]) for name in _STORED}
+    return Camera(
+        focal=stored["focal"],
+        principal_point=stored["principal_point"],
+        distortion=stored["distortion"],
+        cam_from_world=Rigid(stored["rotation"], stored["translation"]),
+        image_size=stored["image_size"],
+    )

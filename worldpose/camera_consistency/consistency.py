@@ -1,0 +1,110 @@
+"""Check of a rig's cameras for faults, from the people that they detect."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.camera_consistency.comparison import Comparison
+from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis
+from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.tracking.clip_arrays import ClipArray
+
+GIVEN_TILT: Final = 0.003
+"""Largest plausible rotation error of a given camera [rad]."""
+MIN_FOCAL_ERROR: Final = 0.03
+"""Minimum logarithm of a focal length's ratio that is a fault."""
+
+
+def check_consistency(
+    cameras: Camera,
+    covariance: Floats | None,
+    keypoints: ClipArray,
+    confidence: ClipArray,
+    fps: float,
+    settings: ConsistencySettings,
+    *,
+    ground: bool = True,
+) -> Consistency:
+    """Return the inconsistent cameras, and the most probable fault of each.
+
+    The agreement of two cameras is the number of their detections that meet in 3D, one to one,
+    above chance. The largest group of cameras in agreement counts as correct. Every other camera,
+    and those of the group in partial agreement, are tested against hypotheses that each correct
+    the camera's calibration, images or clock. The fault is the one whose correction clearly
+    increases matches, in frames that it was not fitted to.
+
+    Args:
+        cameras: batch (cameras,).
+        covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
+        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
+        confidence: (frames, cameras, detections, 17); 0 or less excludes a keypoint, only the sign
+            counts.
+        fps: frames per second [1/s].
+        settings: number of compared frames, and noise.
+        ground: whether people stand on z = 0; else they may be anywhere.
+
+    Raises:
+        InputError: the shapes do not fit together.
+    """
+    if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
+        raise InputError(
+            "camera consistency",
+            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
+            "last, cameras (cameras,)",
+            found=f"{keypoints.shape}, {confidence.shape}, {cameras.batch_shape}",
+            todo="Give arrays of the same clip and cameras.",
+        )
+    count = int(cameras.batch_shape[0])
+    part = _select_busiest_frames(confidence, settings.stretch_frames)
+    points = np.array(keypoints[part], dtype=np.float64)
+    points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
+    if count < 2 or not len(points):
+        return Consistency((), (), tuple(range(count)), np.zeros((count, count)))
+    given, tilt = np.ones(count, dtype=np.bool_), np.full(count, GIVEN_TILT)
+    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise)
+    if covariance is not None:
+        known = [bool(np.isfinite(each).all()) for each in covariance]
+        given = np.logical_not(known)
+        for c in (place for place in range(count) if known[place]):
+            deviation = np.sqrt(np.diagonal(covariance[c]))
+            tilt[c] = max(GIVEN_TILT, 3.0 * float(deviation[:3].max()))
+            focal_error[c] = max(MIN_FOCAL_ERROR, 4.0 * float(deviation[6]))
+            noise[c] = math.hypot(noise[c], _calibration_noise(cameras[c], covariance[c]))
+    comparison = Comparison(cameras, noise, points, ground, settings)
+    comparison.fit_noise()
+    return Diagnosis(comparison, fps, given, tilt, focal_error).run()
+
+
+def _select_busiest_frames(confidence: ClipArray, longest: int) -> slice:
+    """Return the chunk of frames, of at most `longest`, with the most detections."""
+    frames = confidence.shape[0]
+    if frames <= longest:
+        return slice(0, frames)
+    starts = np.linspace(0, frames - longest, 8).astype(int)
+    middles = [int(start) + longest // 2 for start in starts]
+    counts = [np.count_nonzero(np.asarray(confidence[m : m + 1]) > 0.0) for m in middles]
+    start = int(starts[int(np.argmax(counts))])
+    return slice(start, start + longest)
+
+
+def _calibration_noise(camera: Camera, covariance: Floats) -> float:
+    """Return the standard deviation of people's image positions due to the calibration [px]."""
+    size = camera.image_size
+    grid = np.stack(np.meshgrid(*(s * np.array([0.2, 0.5, 0.8]) for s in size)), -1).reshape(-1, 2)
+    rays = camera.unproject(grid)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way = (1.0 - rays.origins[:, 2]) / rays.directions[:, 2]
+    hit = np.isfinite(way) & (way > 0.0) & (way < 200.0)
+    if not hit.any():
+        return 0.0
+    points = rays.origins[hit] + way[hit, None] * rays.directions[hit]
+    _, jacobian = project_with_jacobian(camera, points)
+    variance = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian) / 2.0
+    return float(np.sqrt(np.nanmedian(variance)))
