@@ -16,8 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -30,13 +29,16 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.rendering import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.stadium import place_camera
-from worldpose.static_calibration.line_refinement import refine_on_lines
-from worldpose.static_calibration.line_search import LineSearch
+from worldpose.static_calibration.line_detection import brightness
+from worldpose.static_calibration.line_refinement import refine_by_search, refine_on_lines
+from worldpose.static_calibration.line_samples import LineSamples, ProjectedLines
+from worldpose.static_calibration.line_search import LineFit, LineSearch, MeasuredBars
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
     project_with_jacobian,
     stepped,
 )
+from worldpose.static_calibration.settings import LineRefinementSettings
 
 PITCH = PitchTemplate.standard()
 SPREAD = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 2e-3, 4.0, 4.0, 0.01, 0.01, 0.0])
@@ -192,23 +194,28 @@ def _camera(
     )
 
 
-@contextmanager
-def fitting(spent: list[float]) -> Iterator[None]:
-    """Append the time of the refinement's own iterations [s], without the reading of bars."""
-    settle = LineSearch._settle
+class TimedSearch(LineSearch):
+    """A line search that adds up the time of its own iterations, without the reading of bars.
 
-    def timed(*args: object, **named: object) -> object:
+    Attributes:
+        seconds: spent in `converge` [s].
+    """
+
+    seconds = 0.0
+
+    def converge(
+        self,
+        camera: Camera,
+        samples: LineSamples,
+        seen: ProjectedLines,
+        measured: MeasuredBars,
+        fine: bool,
+    ) -> LineFit:
+        """Return the converged fit to bars at fixed pixels."""
         begin = time.perf_counter()
-        result = settle(*args, **named)  # type: ignore[arg-type]
-        spent[-1] += time.perf_counter() - begin
-        return result
-
-    LineSearch._settle = timed  # type: ignore[assignment,method-assign]
-    try:
-        spent.append(0.0)
-        yield
-    finally:
-        LineSearch._settle = settle  # type: ignore[method-assign]
+        found = super().converge(camera, samples, seen, measured, fine)
+        self.seconds += time.perf_counter() - begin
+        return found
 
 
 def measured(
@@ -236,7 +243,6 @@ def main() -> None:
     cv2.setNumThreads(1)
     scenario = SCENARIOS["match"]
     table: dict[str, list[tuple[float, float]]] = {}
-    alone: list[float] = []
     own: list[float] = []
     for index in range(options.cameras):
         rng = np.random.default_rng(index)
@@ -265,10 +271,12 @@ def main() -> None:
             "clicks: calibrateCamera": lambda w=world, c=clicked, z=size: clicks_by_opencv(w, c, z),
             "clicks: solvePnP + SciPy": lambda w=world, c=clicked, z=size: clicks_by_scipy(w, c, z),
         }
+        grey, alone = brightness(picture), []
         for _ in range(options.rounds):
-            with fitting(alone):
-                sides["lines: ours, from the picture"]()
-        own.append(min(alone[-options.rounds :]))
+            search = TimedSearch(prior, PITCH, grey, 0.0, LineRefinementSettings())
+            refine_by_search(search, PITCH)
+            alone.append(search.seconds)
+        own.append(min(alone))
         for name, (camera, seconds) in measured(sides, options.rounds).items():
             error = np.nan if camera is None else line_error(camera, true)
             table.setdefault(name, []).append((seconds, error))

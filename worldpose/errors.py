@@ -22,8 +22,8 @@ class InputError(WorldposeError):
     """
 
     def __init__(self, where: str, *, expected: str, found: str, todo: str) -> None:
-        self.where, self.expected = _shortened(where), expected
-        self.found, self.todo = _shortened(found), todo
+        self.where, self.expected = _shorten(where), expected
+        self.found, self.todo = _shorten(found), todo
         super().__init__(f"{self.where}: expected {expected}, found {self.found}. {todo}")
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -31,14 +31,14 @@ class InputError(WorldposeError):
         return _input_error, (type(self), self.where, self.expected, self.found, self.todo)
 
 
-_LONGEST: Final = 600
-"""Most characters of the input that a message repeats: a name may have a million."""
+_MAX_LENGTH: Final = 600
+"""Maximum characters of the input that a message repeats: a name may have a million."""
 
 
-def _shortened(text: str) -> str:
-    if len(text) <= _LONGEST:
+def _shorten(text: str) -> str:
+    if len(text) <= _MAX_LENGTH:
         return text
-    half = _LONGEST // 2 - 20  # leaves room for the text between, so the result is short enough
+    half = _MAX_LENGTH // 2 - 20  # leaves room for the text between, so the result is short enough
     return f"{text[:half]}...[{len(text) - 2 * half} characters]...{text[-half:]}"
 
 

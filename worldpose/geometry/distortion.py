@@ -13,7 +13,7 @@ from worldpose.compiled import compiled
 from worldpose.geometry.rigid import checked
 
 # Radii beyond this belong to rays within a millionth of a radian of the camera's own plane.
-_FARTHEST = 1e6
+_MAX_RADIUS = 1e6
 
 
 def fold_radius(distortion: ArrayLike) -> NDArray[np.float64]:
@@ -70,8 +70,8 @@ def fold_squared(k1: float, k2: float, k3: float) -> float:
     # The slope is monotone between the roots of its own derivative a + 2 b s + 3 c s^2, so the
     # first of these intervals that ends below zero holds the first root.
     low = 0.0
-    for stop in (*_turning_points(a, b, c), _FARTHEST**2):
-        high = min(stop, _FARTHEST**2)
+    for stop in (*_turning_points(a, b, c), _MAX_RADIUS**2):
+        high = min(stop, _MAX_RADIUS**2)
         if high <= low:
             continue
         if 1.0 + high * (a + high * (b + high * c)) > 0.0:

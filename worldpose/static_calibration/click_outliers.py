@@ -33,12 +33,12 @@ _ROBUST: Final = 3.0
 _SINGULAR: Final = 1e-14
 """Minimum eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
 and rounding decides."""
-_CLEARLY: Final = 0.002
+_SIGNIFICANCE: Final = 0.002
 """Significance level of the test that residuals contradict the stated noise [1]."""
 _STATED_FREEDOM: Final = 4.0
 """Degrees of freedom of the stated noise as a prior where residuals contradict it [1]: it is
 correct within a factor of 1.4."""
-_LARGEST_SCALE: Final = 5.0
+_MAX_SCALE: Final = 5.0
 """Maximum factor on the stated noise [1]; beyond, names are wrong."""
 _NOISES: Final = (1.5, 2.0, 3.0, 4.0)
 """Factors on the stated noise to try where it does not explain the clicks [1]; the last is the
@@ -186,7 +186,7 @@ def fit_inliers(
     row = robust.rows[0]
     problem = problem.with_survey_error(row, settings)
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1) / problem.click_noise
-    inliers = (length < limit * max(1.0, _spread(length))) & _imageable(problem, row)
+    inliers = (length < limit * max(1.0, _median_spread(length))) & _imageable(problem, row)
     markings = _select_markings(problem, row, inliers, settings)
     seen = set()
     while True:
@@ -343,7 +343,7 @@ def noise_ratio(problem: Problem, row: NDArray[np.float64]) -> float:
         row: (22,) camera.
     """
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1)
-    return _spread(length / problem.click_noise)
+    return _median_spread(length / problem.click_noise)
 
 
 def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
@@ -424,7 +424,7 @@ def _imageable(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
 
-def _spread(length: NDArray[np.float64]) -> float:
+def _median_spread(length: NDArray[np.float64]) -> float:
     # 1.1774 is the median length of a standard Gaussian in two dimensions.
     return float(np.median(length)) / 1.1774 if len(length) else 1.0
 
@@ -446,17 +446,17 @@ class _Noise:
     freedom: float
 
     @classmethod
-    def told(cls, squared: float, freedom: float) -> _Noise:
+    def estimate(cls, squared: float, freedom: float) -> _Noise:
         """Return the stated noise, unless the residuals clearly contradict it."""
         stated = cls(1.0, np.inf, squared, freedom)
         if freedom < 1.0:
             return stated
-        low, high = chdtri(freedom, [1.0 - 0.5 * _CLEARLY, 0.5 * _CLEARLY])
+        low, high = chdtri(freedom, [1.0 - 0.5 * _SIGNIFICANCE, 0.5 * _SIGNIFICANCE])
         if low <= squared <= high:
             return stated
         worth = _STATED_FREEDOM + freedom
         scale = np.sqrt((_STATED_FREEDOM + squared) / (worth - 2.0))
-        return cls(min(float(scale), _LARGEST_SCALE), worth, squared, freedom)
+        return cls(min(float(scale), _MAX_SCALE), worth, squared, freedom)
 
 
 def _judge_clicks(
@@ -482,7 +482,7 @@ def _judge_clicks(
         others = noise
         if inliers[index]:
             left = max(noise.squared - (own * noise.scale) ** 2, 0.0)
-            others = _Noise.told(left, noise.freedom - 2.0)
+            others = _Noise.estimate(left, noise.freedom - 2.0)
         # Drawn pixels that are more accurate than stated do not make clicks more accurate.
         scale = max(others.scale, 1.0)
         mahalanobis[index] = _gaussian_distance(own * noise.scale / scale, others.worth)
@@ -508,7 +508,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Nois
     if not _is_invertible(fit.information[0][free]):
         raise _no_camera(problem, count)
     spent = float(np.trace(np.linalg.solve(fit.information[0][free], observed[free])))
-    noise = _Noise.told(squared, max(count - spent, 0.0))
+    noise = _Noise.estimate(squared, max(count - spent, 0.0))
     covariance = np.zeros_like(prior)
     total = observed[free] / noise.scale**2 + prior[free]
     size = np.sqrt(np.abs(np.diag(total)))

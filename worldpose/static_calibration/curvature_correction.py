@@ -151,11 +151,11 @@ def whiten_residuals(
     return np.concatenate(residuals), np.concatenate(rows) * problem.free
 
 
-_TURNS: Final = 20
+_MAX_STEPS: Final = 20
 """Gauss-Newton steps at most [1]."""
 _SETTLED: Final = 0.01
 """Step length at which the iteration stops [standard deviations]."""
-_HALVINGS: Final = 6
+_MAX_HALVINGS: Final = 6
 """Maximum halvings of a step that does not lower the cost [1]."""
 _FIRST: Final = 8
 _DRAWS: Final = 64
@@ -195,12 +195,12 @@ class ClicksAndBars:
         """
         residuals, rows = self.residuals(camera)
         noise = np.zeros(len(residuals)) if noise is None else noise
-        for _ in range(_TURNS):
+        for _ in range(_MAX_STEPS):
             size = np.linalg.norm(rows, axis=0)
             step = np.zeros(SIZE)
             free_step = -np.linalg.lstsq(rows / size, residuals + noise)[0] / size
             before = float(((residuals + noise) ** 2).sum())
-            for _ in range(_HALVINGS):
+            for _ in range(_MAX_HALVINGS):
                 step[self.problem.free] = free_step
                 trial = stepped(camera, step)
                 ahead, by_ahead = self.residuals(trial)

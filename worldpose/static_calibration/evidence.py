@@ -93,7 +93,7 @@ def gather_evidence(
             where,
             expected="clicked points or drawn markings",
             found="none",
-            todo="Click four or more named points of the pitch, spread over the picture, such as "
+            todo="Click four or more named points of the pitch, spread over the image, such as "
             "penalty_area_left_near_front, and draw the lines between them.",
         )
     names = [point.name for point in clicked.points]
@@ -159,9 +159,9 @@ def _check_inside(where: str, pixel: tuple[float, float], image_size: tuple[int,
     if not inside:
         raise InputError(
             where,
-            expected=f"a pixel of the picture, 0 to {width - 1} by 0 to {height - 1}",
+            expected=f"a pixel of the image, 0 to {width - 1} by 0 to {height - 1}",
             found=f"{pixel[0]:g}, {pixel[1]:g}",
-            todo="Click it again, or check that the picture has the camera's image_size.",
+            todo="Click it again, or check that the image has the camera's image_size.",
         )
 
 
@@ -185,7 +185,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
                 where,
                 expected=f"{_POINTS} clicked points or more, better 8, or drawn markings as well",
                 found=found,
-                todo=f"Add what the picture shows of {', '.join(new)}, far from the others.",
+                todo=f"Click further points, far from the others, for example {', '.join(new)}.",
             )
         plan = evidence.points_world[:, :2]
         spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
@@ -195,7 +195,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
                 where,
                 expected="points off one line",
                 found=f"{found}, all on one line of the pitch",
-                todo=f"Add what the picture shows of {', '.join(more)}, off that line.",
+                todo=f"Click points off that line, for example {', '.join(more)}.",
             )
         return
     numbers = 2 * points
@@ -209,7 +209,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
             where,
             expected="three straight markings in two directions, or two points and a marking",
             found=found,
-            todo=f"Draw another marking, or add what the picture shows of {', '.join(more)}.",
+            todo=f"Draw another marking, or click points, for example {', '.join(more)}.",
         )
 
 

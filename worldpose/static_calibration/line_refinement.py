@@ -117,10 +117,23 @@ def refine_on_lines(
     Raises:
         InputError: the image size is not that of the start's camera.
     """
-    settings = settings or LineRefinementSettings()
     grey = brightness(picture)
     _check_size(start.camera, grey)
-    search = LineSearch(start, pitch, grey, survey_error, settings)
+    search = LineSearch(start, pitch, grey, survey_error, settings or LineRefinementSettings())
+    return refine_by_search(search, pitch, begin)
+
+
+def refine_by_search(
+    search: LineSearch, pitch: PitchTemplate, begin: CameraEstimate | None = None
+) -> LineRefinement:
+    """Return the camera that a line search finds, as `refine_on_lines` does.
+
+    Args:
+        search: prepared for the image, with the start and the settings.
+        pitch: the template.
+        begin: camera to begin the search at; the start of the search if None.
+    """
+    start, settings = search.start, search.settings
     everywhere = sample_markings(pitch, _WORLD_SPACING)
     begin = begin or start
     seen = search.look(begin.camera, everywhere)
@@ -163,10 +176,10 @@ _WORLD_SPACING: Final = 0.2
 """Spacing of samples before thinning [m]; the nearest paint has 40 px per metre."""
 _INLIER: Final = 0.25
 """Weight above which a sample is an inlier: within one scale of the loss [1]."""
-_MOST_CORRELATED: Final = 0.95
+_MAX_CORRELATION: Final = 0.95
 _OWN_WORTH: Final = 20.0
 """Weight of the expected noise in the estimate of a marking's noise [residuals]."""
-_LEAST_KEPT: Final = 0.5
+_MIN_KEPT: Final = 0.5
 """Minimum share of the samples that remain as degrees of freedom [1]."""
 
 
@@ -175,9 +188,9 @@ def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
     if grey.shape != (height, width):
         raise InputError(
             "refine_on_lines: picture",
-            expected=f"{width} x {height} px, as the camera's pictures",
+            expected=f"an image of {width} x {height} px, the camera's image_size",
             found=f"{grey.shape[1]} x {grey.shape[0]}",
-            todo="Give a picture of this camera in its full size.",
+            todo="Give an image of this camera in its full size.",
         )
 
 
@@ -207,14 +220,14 @@ def _residual_noise(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[Floats,
 
     # The fit's degrees of freedom are missing from its residuals.
     used = float(inliers.sum())
-    kept = max(1.0 - found.adjusted.spent / used, _LEAST_KEPT)
+    kept = max(1.0 - found.adjusted.spent / used, _MIN_KEPT)
     squares = total(scaled**2, marking) / kept
     products = total(np.where(pairs, scaled[1:] * scaled[:-1], 0.0), marking[1:])
     # For a few samples, the mean square of all samples is the better estimate.
     mean = squares.sum() / used + np.finfo(np.float64).tiny
     correlation = products / np.maximum(squares, _OWN_WORTH * mean)
     excess = (squares + _OWN_WORTH) / (total(inliers.astype(np.float64), marking) + _OWN_WORTH)
-    return np.clip(correlation, 0.0, _MOST_CORRELATED)[marking], excess[marking]
+    return np.clip(correlation, 0.0, _MAX_CORRELATION)[marking], excess[marking]
 
 
 def _marking_fits(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:

@@ -21,7 +21,7 @@ from worldpose.static_calibration.parameters import by_step
 
 _STRIDE: Final = 0.1
 """Step along an arc for finite differences of its curvature [m]."""
-_NARROWEST: Final = 0.5
+_MIN_WIDTH: Final = 0.5
 """Minimum projected width of paint to search [px]."""
 
 
@@ -175,7 +175,7 @@ def project_lines(
         side = (spread * normals).sum(-1)
         widths = np.abs(side) * line_width
         inside = ((image > 0.0) & (image < camera.image_size - 1.0)).all(-1)
-        visible = inside & (widths >= _NARROWEST) & np.isfinite(jacobian).all((1, 2))
+        visible = inside & (widths >= _MIN_WIDTH) & np.isfinite(jacobian).all((1, 2))
     curvatures = _curvatures(camera, samples, normals)
     by_point = survey_error * np.einsum("nij,ni->nj", projected.d_points, normals)
     moved = (samples.shares[:, :, None] * by_point[:, None]).reshape(len(points), 6)

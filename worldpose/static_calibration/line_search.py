@@ -194,13 +194,13 @@ def _accumulate(
                 normal[free + index[i, a], free + index[i, b]] += left * by_paint[i, b]
 
 
-_ROUNDS: Final = 8
+_MAX_PASSES: Final = 8
 """Maximum iterations of search and fit; one or two from ordinary clicks."""
 _COARSE_ERROR: Final = 1.0
 """Standard deviation of a detected bar before its subpixel fit [px]."""
 _FEW: Final = 500
 """Approximate number of samples in coarse iterations [1]."""
-_LEAST_REACH: Final = 1.5
+_MIN_REACH: Final = 1.5
 """Margin of the search beyond three standard deviations [px]."""
 _FINE: Final = 5.5
 """Search width up to which bars are fitted to subpixel accuracy [px]."""
@@ -208,7 +208,7 @@ _BEST: Final = 1.0 / 3.0
 """Share of the samples to search where all have a large uncertainty [1]."""
 _MOSTLY: Final = 0.8
 """Minimum share of the samples within this search width [1]."""
-_TURNS: Final = 4
+_MAX_FITS: Final = 4
 """Maximum fits to subpixel bars, each relinearized at the last camera."""
 _SETTLED: Final = 0.02
 """Maximum sample displacement at which these fits stop [px]."""
@@ -281,7 +281,7 @@ class LineSearch:
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
         found = None
-        for left in reversed(range(_ROUNDS)):
+        for left in reversed(range(_MAX_PASSES)):
             chosen = few
             seen = self.look(camera, few)
             if seen.visible.sum() < 0.5 * self.settings.least_found:
@@ -353,7 +353,7 @@ class LineSearch:
         bars = seen.places + measured.offsets[:, None] * seen.normals
         final = (self.settings.loss,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
-        for _ in range(_TURNS if fine else 1):
+        for _ in range(_MAX_FITS if fine else 1):
             adjusted = self._adjust(camera, seen, measured, scales)
             scales = (2.0 * self.settings.loss, self.settings.loss, self.settings.loss)
             camera = stepped(camera, self._full_step(adjusted.step))
@@ -369,7 +369,7 @@ class LineSearch:
         rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
         own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
         variance = ((rows @ covariance) * rows).sum(-1) + own
-        return np.asarray(3.0 * np.sqrt(variance) + _LEAST_REACH)
+        return np.asarray(3.0 * np.sqrt(variance) + _MIN_REACH)
 
     def _measure(self, seen: ProjectedLines, reach: Floats, fine: bool) -> MeasuredBars:
         """Return the bars matched to the samples, to a subpixel (`fine`) or to a pixel."""

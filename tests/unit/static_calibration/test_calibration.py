@@ -28,7 +28,10 @@ def test_nothing_clicked_is_an_error():
 def test_three_points_are_too_few_and_the_message_names_others():
     camera, _ = people.seat(0)
     three = dict(list(people.visible(camera).items())[:3])
-    with pytest.raises(InputError, match=r"4 clicked points.*Add what the picture shows of \w+"):
+    with pytest.raises(
+        InputError,
+        match=r"4 clicked points.*Click further points, far from the others, for example \w+",
+    ):
         of(people.points(three))
 
 

@@ -22,7 +22,7 @@ def fitted(wrong, misfit=1.0):
 def judge(monkeypatch):
     """A function that judges ten clicks that no other size of the pitch explains."""
     monkeypatch.setattr(calibration, "_find_size", lambda *_: None)
-    monkeypatch.setattr(calibration, "at_noise", lambda problem, *_: (problem, None))
+    monkeypatch.setattr(calibration, "scale_noise", lambda problem, *_: (problem, None))
     problem = SimpleNamespace(where="cam01", evidence=SimpleNamespace(points=NAMES, markings=()))
     settings = StaticCalibrationSettings()
     return lambda fit: calibration.check_agreement(
