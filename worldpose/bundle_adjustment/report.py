@@ -16,7 +16,7 @@ from worldpose.bundle_adjustment.problems import KeypointNoise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.geometry import Camera
-from worldpose.geometry.stored import camera_arrays
+from worldpose.geometry.cameras import camera_arrays
 from worldpose.static_calibration import image_problems, project_with_jacobian
 from worldpose.triangulation import triangulate_joints
 

@@ -7,14 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import ClipArray, Floats
 from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
-from worldpose.tracking.clip_arrays import ClipArray
 
 GIVEN_TILT: Final = 0.003
 """Largest plausible rotation error of a given camera [rad]."""

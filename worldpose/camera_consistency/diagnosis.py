@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Floats
+from data_contracts.arrays import Floats
 from data_contracts.camera_consistency import FaultKind
 from worldpose.camera_consistency.comparison import Comparison, Trial, chance_noise
 from worldpose.camera_consistency.hypotheses import (

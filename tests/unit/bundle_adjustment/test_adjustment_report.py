@@ -19,7 +19,7 @@ from worldpose.bundle_adjustment import (
     weak_direction,
 )
 from worldpose.bundle_adjustment.problems import KeypointNoise
-from worldpose.geometry.stored import camera_from_arrays
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.static_calibration import PARAMETERS
 from worldpose.store.groups import checked_arrays, checked_attributes
 
