@@ -24,7 +24,7 @@ from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scenario, Scene, simulate_scene
-from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import StaticCalibration, calibrate, project_with_jacobian
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints

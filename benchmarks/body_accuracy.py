@@ -41,7 +41,7 @@ from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scene, simulate_scene
-from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
+from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
 

@@ -32,7 +32,7 @@ from worldpose.broadcast_calibration.priors import build_prior, second_differenc
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, descend, equations_at, solve
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.broadcast import film
+from worldpose.simulation.cameras import move_broadcast_camera
 from worldpose.simulation.settings import BroadcastSettings
 
 SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4, 1e-3, 1e-2, 1e-2])
@@ -44,7 +44,9 @@ def true_camera(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Fl
     times = np.arange(frames) / 50.0
     at = np.arange(-2.0, times[-1] + 1.0, 0.1)
     action = np.stack([25.0 * np.sin(0.25 * at), 8.0 * np.sin(0.4 * at)], axis=1)
-    camera = film(BroadcastSettings(sweep=10.0), times, action, at, (1920, 1080), rng)
+    camera = move_broadcast_camera(
+        BroadcastSettings(sweep=10.0), times, action, at, (1920, 1080), rng
+    )
     where = np.stack([np.interp(times, at, axis) for axis in action.T], axis=-1)
     return MovingCamera.of(camera, camera.center[0], camera.principal_point[0]), where
 

@@ -32,7 +32,7 @@ from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.reports.broadcast import largest_pose_changes, plot_before_after
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.video import VideoReader
 
 STILL = {"smooth": False, "flow_weight": 0.0}
@@ -118,7 +118,9 @@ def main() -> None:
         picture = options.picture if seed == options.seeds[0] else None
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / "clip"
-            simulate_match(scenario, seed, folder, duration=3.0, cameras=1, stills=False)
+            simulate_match(
+                scenario, seed, folder, MatchOptions(duration=3.0, cameras=1, stills=False)
+            )
             tables[f"seed {seed}"] = rows_of(folder, settings, picture)
     names = list(next(iter(tables.values())))
     tables["mean"] = {

@@ -32,7 +32,7 @@ from scipy.sparse import csr_matrix
 
 from worldpose.bundle_adjustment import Problem, SolverSettings, solve
 from worldpose.geometry import Camera, Rigid
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 from worldpose.static_calibration import PARAMETERS, stepped
 
 Solution = tuple[Camera, np.ndarray]
@@ -48,7 +48,7 @@ def make_problem(cameras: int, frames: int, players: int) -> Problem:
     rng = np.random.default_rng(5)
     angles = 2.0 * np.pi * (np.arange(cameras) + 0.5) / cameras
     centers = np.stack([80.0 * np.cos(angles), 62.0 * np.sin(angles), np.full(cameras, 18.0)], 1)
-    poses = [looking(center, np.array([0.0, 0.0, 1.0]), 0.0) for center in centers]
+    poses = [look_at(center, np.array([0.0, 0.0, 1.0]), 0.0) for center in centers]
     true = Camera(
         focal=np.repeat(rng.uniform(1300.0, 1700.0, (cameras, 1)), 2, axis=1),
         principal_point=np.array([959.5, 539.5]) + rng.normal(0.0, 8.0, (cameras, 2)),

@@ -361,11 +361,11 @@ def plant(
     detector: Detector,
     rng: np.random.Generator,
 ) -> bool:
-    """Plant a fault into the rig; return False if this rig cannot have it."""
+    """Plant a fault into the rig; return False, with the rig unchanged, if it cannot have it."""
     c = int(rng.choice(eligible))
     camera = rig.cameras[c]
     rotation, center = camera.cam_from_world.rotation, camera.center
-    rig.fault, rig.faulty = kind, (c,)
+    faulty: tuple[int, ...] = (c,)
     if kind == "flipped":
         half = np.diag([-1.0, -1.0, 1.0])
         rig.cameras[c] = with_pose(camera, rotation @ half, half @ center)
@@ -389,10 +389,12 @@ def plant(
         rig.cameras[c] = replace(camera, focal=camera.focal * ratio)
     elif kind == "lens":
         order = LENS_ORDERS[int(rng.integers(len(LENS_ORDERS)))]
-        rig.cameras[c] = replace(camera, distortion=camera.distortion[order])
-        shift = lens_shift(rig.true[c], rig.cameras[c], world)
+        misread = replace(camera, distortion=camera.distortion[order])
+        shift = lens_shift(rig.true[c], misread, world)
+        if not shift > 4.0:
+            return False
+        rig.cameras[c] = misread
         rig.about = f"{order} {shift:.0f} px"
-        return shift > 4.0
     elif kind in ("clock", "frame_rate"):
         frames = len(rig.keypoints)
         if kind == "clock":
@@ -409,14 +411,15 @@ def plant(
         rig.keypoints[:, c] = points
     else:
         other = int(rng.choice([n for n in range(len(rig.cameras)) if n != c]))
-        rig.faulty = (c, other)
+        faulty = (c, other)
         rig.about = f"{c} and {other}"
         if kind == "swapped":
             rig.keypoints[:, [c, other]] = rig.keypoints[:, [other, c]]
         else:
             jitter = rng.normal(0, rng.choice([0.0, 0.7]), rig.keypoints[:, c].shape)
             rig.keypoints[:, other] = rig.keypoints[:, c] + jitter
-            rig.faulty = (other, c)
+            faulty = (other, c)
+    rig.fault, rig.faulty = kind, faulty
     return True
 
 

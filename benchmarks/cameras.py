@@ -11,13 +11,11 @@ computes its Jacobians. Its `undistortPoints` stops after five iterations by def
 from __future__ import annotations
 
 import argparse
-import sys
-import time
-from collections.abc import Callable
 from functools import partial
 
 import cv2
 import numpy as np
+from common import best_seconds
 
 from worldpose.geometry import Camera, Rigid
 
@@ -30,21 +28,6 @@ CAMERA = Camera(
 )
 MATRIX = np.array([[3200.0, 0.0, 960.0], [0.0, 3200.0, 540.0], [0.0, 0.0, 1.0]])
 TO_THE_LAST_BIT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-
-
-def best_seconds(sides: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Return the best time of each side, taken in turns after one unmeasured call each."""
-    for run in sides.values():
-        run()
-    best = dict.fromkeys(sides, np.inf)
-    for done in range(rounds):
-        for name, run in sides.items():
-            start = time.perf_counter()
-            run()
-            best[name] = min(best[name], time.perf_counter() - start)
-        print(f"\r  round {done + 1} of {rounds}", end="", file=sys.stderr, flush=True)
-    print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
-    return best
 
 
 def main() -> None:

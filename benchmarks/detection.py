@@ -25,12 +25,11 @@ from worldpose.detection import People
 from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
-from worldpose.simulation.casting import dress_people, roles_of
+from worldpose.simulation.cameras import place_camera
+from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import gather
-from worldpose.simulation.filming import open_view, render_frame
-from worldpose.simulation.looks import RenderingSettings
-from worldpose.simulation.settings import RigSettings
-from worldpose.simulation.stadium import place_camera
+from worldpose.simulation.footage import open_view, render_frame
+from worldpose.simulation.settings import RenderingSettings, RigSettings
 from worldpose.video import open_video, write_video
 
 Result = TypeVar("Result")
@@ -98,7 +97,7 @@ def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
     looks = RenderingSettings()
     poses, later = crowd.poses(times), crowd.poses(times + looks.shutter)
     cast = dress_people(
-        poses.betas[:, 0], roles_of(scenario.crowd, len(crowd.paths)), 5, looks.patterns
+        poses.betas[:, 0], assign_roles(scenario.crowd, len(crowd.paths)), 5, looks.patterns
     )
     middle = np.median(crowd.joints(times[:1])[0, :, 11], axis=0)
     rig = RigSettings(person_height=60.0, image_size=(1920, 1080))
@@ -106,8 +105,8 @@ def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
     view = open_view(camera, pitch, 5, looks)
 
     def film(frame: int) -> Image:
-        moment = (cast.posed(poses[:, frame]), cast.posed(later[:, frame]))
-        return render_frame(view, cast, *moment, frame=frame).picture
+        moment = (cast.pose(poses[:, frame]), cast.pose(later[:, frame]))
+        return render_frame(view, cast, *moment, frame=frame).image
 
     film(0)
     return timed(lambda: [film(frame) for frame in range(frames)])

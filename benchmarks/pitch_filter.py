@@ -27,8 +27,8 @@ from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_iou
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
-from worldpose.simulation.casting import dress_people, roles_of, stand_by
-from worldpose.simulation.filming import open_view, render_frame
+from worldpose.simulation.cast import assign_roles, dress_people, place_bystanders
+from worldpose.simulation.footage import open_view, render_frame
 from worldpose.simulation.image_formation import RenderedFrame
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
@@ -56,8 +56,8 @@ def main() -> None:
     for seed in asked.seeds:
         counts = np.zeros((5, 2), int)
         for name, camera, frame, bystanders in filmed(scenario, pitch, seed):
-            found = boxes_of(finder, frame.picture, None)
-            on_pitch = boxes_of(finder, frame.picture, Place(camera, pitch))
+            found = boxes_of(finder, frame.image, None)
+            on_pitch = boxes_of(finder, frame.image, Place(camera, pitch))
             players = frame.boxes[frame.visible >= SEEN]
             counts[0] += len(players), np.count_nonzero(shared(players, found))
             kept = shared(found, on_pitch, 0.99)
@@ -69,7 +69,7 @@ def main() -> None:
             for row, chosen in enumerate(kinds, 1):
                 counts[row] += np.count_nonzero(chosen), np.count_nonzero(chosen & ~kept)
             if asked.pictures is not None:
-                draw(asked.pictures / f"{seed}-{name}.png", frame.picture, found, kept)
+                draw(asked.pictures / f"{seed}-{name}.png", frame.image, found, kept)
         (players, seen), *boxes = counts.tolist()
         words = ("players", "bystanders", "the stands", "other things")
         taken = ", ".join(
@@ -87,10 +87,10 @@ def filmed(
     """Yield every static camera, its first image and the boxes of bystanders (n, 4) [px]."""
     scene = simulate_scene(scenario, seed)
     poses = scene.crowd.poses(np.zeros(1))
-    roles = roles_of(scenario.crowd, len(scene.crowd.paths))
+    roles = assign_roles(scenario.crowd, len(scene.crowd.paths))
     cast = dress_people(poses.betas[:, 0], roles, seed, scenario.look.patterns)
-    surfaces = cast.posed(poses[:, 0])
-    bystanders = stand_by(pitch, scenario.look.bystanders, seed)
+    surfaces = cast.pose(poses[:, 0])
+    bystanders = place_bystanders(pitch, scenario.look.bystanders, seed)
     for name, camera in scene.cameras.items():
         view = open_view(camera, pitch, seed, scenario.look)
         outlines = [camera.project(prop.surfaces.vertices[0].astype(float)) for prop in bystanders]

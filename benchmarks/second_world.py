@@ -47,7 +47,7 @@ from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 from worldpose.store import Store, open_run
 
@@ -134,7 +134,9 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
         row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
         row["detector"] = record["detector"]["name"]
     else:
-        simulate_match(SCENARIOS[name], seed, out, duration=plan["duration"], video=False)
+        simulate_match(
+            SCENARIOS[name], seed, out, MatchOptions(duration=plan["duration"], video=False)
+        )
     row["simulated_s"] = round(time.monotonic() - begun, 1)
     spec = read_match(out).spec
     truth = read_joints(out / "reference" / "joints.npz")

@@ -27,7 +27,7 @@ from worldpose.evaluation.cameras import surface_points
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
-from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
 
 SHARES = (0.5, 0.8, 0.95, 0.99)

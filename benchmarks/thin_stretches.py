@@ -32,7 +32,7 @@ from flows.registering import register
 from flows.stages import refitting
 from worldpose.formats import read_joints, write_archive
 from worldpose.simulation import SCENARIOS
-from worldpose.simulation.matches import simulate_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.store import Store, recipe_key
 
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12
@@ -147,7 +147,9 @@ def measure(folder: Path, seed: int, duration: float) -> dict[str, tuple[int, fl
     scenario = SCENARIO.model_copy(update={"crowd": crowd})
     given, aside = match / "estimates" / "clip.npz", folder / "estimates.npz"
     if not match.exists():
-        simulate_match(scenario, seed, match, duration=duration, calibrated=True, stills=False)
+        simulate_match(
+            scenario, seed, match, MatchOptions(duration=duration, calibrated=True, stills=False)
+        )
     elif aside.exists():
         aside.rename(given)
     left, filmed = thin(match, seed, scenario.fps)

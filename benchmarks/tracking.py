@@ -11,14 +11,14 @@ loops are typical research code, joint by joint, and are timed on one frame.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 
 import numpy as np
+from common import best_seconds, stadium_rig
 from scipy.optimize import linear_sum_assignment
 
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry import Camera
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, match_optimally, ray_affinity
@@ -34,29 +34,6 @@ SKELETON = np.array(
     ]
 ).reshape(-1, 3)
 SKELETON = np.concatenate([SKELETON, [(0.0, -0.13, 0.09)]])
-
-
-def stadium(rng: np.random.Generator) -> Camera:
-    """Return cameras in the stands, each of which sees a part of the pitch."""
-    cameras = []
-    for n in range(CAMERAS):
-        angle = 2 * np.pi * (n + rng.uniform(-0.2, 0.2)) / CAMERAS
-        center = np.array([85 * np.cos(angle), 65 * np.sin(angle), rng.uniform(14, 28)])
-        forward = np.array([rng.uniform(-25, 25), rng.uniform(-15, 15), 0.0]) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        cameras.append(
-            Camera(
-                focal=np.full(2, rng.uniform(1500, 2300)),
-                principal_point=np.array([960.0, 540.0]),
-                distortion=np.array([rng.uniform(-0.12, 0.02), 0.0, 0.0, 0.0, 0.0]),
-                cam_from_world=Rigid(rotation, -rotation @ center),
-                image_size=np.array([1920, 1080]),
-            )
-        )
-    return Camera.stack(cameras)
 
 
 def crowd(frames: int, people: int, rng: np.random.Generator) -> np.ndarray:
@@ -148,20 +125,6 @@ def numpy_epipolar(centers: np.ndarray, rays: np.ndarray) -> list[np.ndarray]:
     return tables
 
 
-def best_seconds(sides: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Return the best time of each side, taken in turns after one unmeasured call each."""
-    best = dict.fromkeys(sides, np.inf)
-    for done in range(rounds + 1):
-        for name, run in sides.items():
-            start = time.perf_counter()
-            run()
-            if done:
-                best[name] = min(best[name], time.perf_counter() - start)
-        print(f"\r  round {done} of {rounds}", end="", file=sys.stderr, flush=True)
-    print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
-    return best
-
-
 def main() -> None:
     """Print one line per method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -170,7 +133,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     rng = np.random.default_rng(4)
-    cameras = stadium(rng)
+    cameras = stadium_rig(CAMERAS, rng, varied_lenses=False)
     joints = crowd(options.frames + 1, options.people, rng)
     keypoints, owner = detections(cameras, joints[1:], rng)
     frames, few = range(options.frames), range(min(10, options.frames))

@@ -18,9 +18,10 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from common import stadium_rig
 
 from data_contracts.keypoints import TrackedDetections
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 CAMERAS, PEOPLE, JOINTS = 16, 22, 17
@@ -29,33 +30,10 @@ PART = 17 * 60
 STATED = TriangulationSettings(learn_noise=False, offsets="none", undo_swaps=False)
 
 
-def rig(rng: np.random.Generator) -> Camera:
-    """Return cameras in the stands, each of which sees a part of the pitch."""
-    cameras = []
-    for n in range(CAMERAS):
-        angle = 2 * np.pi * (n + rng.uniform(-0.2, 0.2)) / CAMERAS
-        center = np.array([85 * np.cos(angle), 65 * np.sin(angle), rng.uniform(14, 28)])
-        forward = np.array([rng.uniform(-25, 25), rng.uniform(-15, 15), 0.0]) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        cameras.append(
-            Camera(
-                focal=np.full(2, rng.uniform(1500, 2300)),
-                principal_point=np.array([960.0, 540.0]) + rng.normal(0, 8, 2),
-                distortion=np.array([rng.uniform(-0.12, 0.02), rng.uniform(-0.02, 0.04), 0, 0, 0]),
-                cam_from_world=Rigid(rotation, -rotation @ center),
-                image_size=np.array([1920, 1080]),
-            )
-        )
-    return Camera.stack(cameras)
-
-
 def workload(frames: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return cameras, joints (n, 3), pixels (cameras, n, 2), confidence (cameras, n), outliers."""
     rng = np.random.default_rng(0)
-    cameras = rig(rng)
+    cameras = stadium_rig(CAMERAS, rng, varied_lenses=True)
     seconds = np.arange(frames)[:, None] / 50.0
     start = rng.uniform([-40, -26], [40, 26], (PEOPLE, 2))
     way = start + 2.0 * np.sin(rng.uniform(0.1, 0.5, (PEOPLE, 2)) * seconds[..., None])

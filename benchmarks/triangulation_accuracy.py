@@ -20,7 +20,7 @@ from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.simulation import SCENARIOS, CalibrationErrors, Scene, simulate_scene
-from worldpose.simulation.calibrating import misjudge
+from worldpose.simulation.annotations import add_calibration_errors
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -48,7 +48,7 @@ def some_way_off(scene: Scene, seed: int) -> Camera:
         errors = SMALL.model_copy(
             update={name: size * getattr(SMALL, name) for name in ("rotation", "center", "focal")}
         )
-        given = misjudge(scene.cameras, errors, np.random.default_rng(seed))
+        given = add_calibration_errors(scene.cameras, errors, np.random.default_rng(seed))
         off = misplaced(Camera.stack(list(given.values())), true, scene.truth.joints)
         size *= WANTED / off
     return Camera.stack(list(given.values()))

@@ -71,7 +71,7 @@ def simulate(
 
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
     """
-    from worldpose.simulation import SCENARIOS, simulate_match
+    from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
     from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
 
     about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
@@ -124,16 +124,18 @@ def simulate(
             SCENARIOS[scenario],
             seed,
             out,
-            duration=duration,
-            cameras=cameras,
-            players=players,
-            trajectories=trajectories,
-            mocap=mocap,
-            calibrated=calibrated,
-            stills=stills,
-            video=video,
-            render=render,
-            masks=masks,
+            MatchOptions(
+                duration=duration,
+                cameras=cameras,
+                players=players,
+                trajectories=trajectories,
+                mocap=mocap,
+                calibrated=calibrated,
+                stills=stills,
+                video=video,
+                render=render,
+                masks=masks,
+            ),
             advance=advance,
         )
     _report_match(spec.match_id, out, as_json)
@@ -147,7 +149,7 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
                 option,
                 expected=f"an option of {what}",
                 found=f"{option}, which it does not have",
-                todo="Leave the option out; docs/explanation/synthetic.md says what replaces it.",
+                todo="Leave the option out; docs/explanation/simulation.md says what replaces it.",
             )
 
 

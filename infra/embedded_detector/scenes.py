@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.casting import dress_people, roles_of
+from worldpose.simulation.cameras import place_camera
+from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.filming import RenderedFrame, open_view, render_frame
-from worldpose.simulation.kits import PATTERNS
-from worldpose.simulation.settings import CrowdSettings, RigSettings, Scenario
-from worldpose.simulation.stadium import place_camera
-from worldpose.simulation.venues import RenderingSettings
+from worldpose.simulation.footage import RenderedFrame, open_view, render_frame
+from worldpose.simulation.settings import (
+    PATTERNS,
+    CrowdSettings,
+    RenderingSettings,
+    RigSettings,
+    Scenario,
+)
 from worldpose.training import LabelledPicture, read_labels, write_labels
 
 HIDDEN = 0.3
@@ -108,7 +112,7 @@ def _scene(
     settings = _rendering(kind, rng)
     poses, later = crowd.poses(times), crowd.poses(times + settings.shutter)
     joints = crowd.joints(times)
-    roles = roles_of(scenario.crowd, len(crowd.paths))
+    roles = assign_roles(scenario.crowd, len(crowd.paths))
     cast = dress_people(poses.betas[:, 0], roles, seed, settings.patterns)
     pictures = []
     for index in range(views):
@@ -116,10 +120,10 @@ def _scene(
         view = open_view(camera, pitch, seed, settings)
         for frame in range(frames):
             rendered = render_frame(
-                view, cast, cast.posed(poses[:, frame]), cast.posed(later[:, frame]), frame=frame
+                view, cast, cast.pose(poses[:, frame]), cast.pose(later[:, frame]), frame=frame
             )
             path = folder / f"{index}_{frame}.jpg"
-            cv2.imwrite(str(path), rendered.picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+            cv2.imwrite(str(path), rendered.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
             pictures.append(label(path, rendered, camera, joints[frame]))
     return pictures
 
@@ -128,7 +132,7 @@ def label(
     path: Path, rendered: RenderedFrame, camera: Camera, joints: NDArray[np.float64]
 ) -> LabelledPicture:
     """Return the labels of a rendered frame; joints (persons, 17, 3) [m], world."""
-    height, width = rendered.picture.shape[:2]
+    height, width = rendered.image.shape[:2]
     limits = np.array([width, height, width, height]) - 0.5
     boxes = np.clip(rendered.boxes, -0.5, limits)
     sides = boxes[:, 2:] - boxes[:, :2]

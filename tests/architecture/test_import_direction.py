@@ -107,9 +107,9 @@ def test_packages_of_worldpose_import_earlier_ones_only():
 def test_an_import_of_a_later_package_is_seen(tmp_path):
     package = tmp_path / "worldpose" / "geometry"
     package.mkdir(parents=True)
-    (package / "lens.py").write_text("from worldpose.simulation.noise import x\n")
+    (package / "lens.py").write_text("from worldpose.simulation.settings import x\n")
     assert later_imports(ORDER_IN_WORLDPOSE, tmp_path) == [
-        "worldpose/geometry/lens.py imports worldpose.simulation.noise"
+        "worldpose/geometry/lens.py imports worldpose.simulation.settings"
     ]
 
 

@@ -24,7 +24,7 @@ from checker import problems_of
 from machines import Machines
 from recoveries import Fault, by_kind, reason_in, summary_of
 
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 
 WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}
@@ -222,7 +222,7 @@ def soak(
     for number in range(matches):
         folders.append(folder / f"match-{number}")
         options = {**SMALL, "calibrated": True, "stills": False, "video": False}
-        simulate_match(SCENARIOS["tiny"], number, folders[-1], **options)
+        simulate_match(SCENARIOS["tiny"], number, folders[-1], MatchOptions(**options))
     faults, rounds, problems = [], [], []
     with Machines(folder / "machines", preload=preload) as machines:
         stream = Stream(machines, folders)

@@ -12,7 +12,7 @@ from flows.orchestration import prefect_database
 from flows.orchestration.cluster_errors import require_room
 from flows.orchestration.prefect_database import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def small_disk(tmp_path):
 @pytest.fixture
 def match(tmp_path):
     small = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
-    simulate_match(SCENARIOS["tiny"], 0, tmp_path / "match", **small)
+    simulate_match(SCENARIOS["tiny"], 0, tmp_path / "match", MatchOptions(**small))
     return tmp_path / "match"
 
 

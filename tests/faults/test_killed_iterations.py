@@ -23,7 +23,7 @@ from flows.registering import open_match, register
 from flows.review.verdicts import correct
 from flows.running import RunRequest
 from flows.settings import selected_stages
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.store import Store
 from worldpose.store.blobs import install_fault_hook
 
@@ -90,7 +90,7 @@ def short(tmp_path_factory):
     """A third of a second of a small match with given cameras."""
     folder = tmp_path_factory.mktemp("short") / "match"
     options = {"duration": 0.32, "calibrated": True, "stills": False, "video": False}
-    simulate_match(SCENARIOS["tiny"], 3, folder, **options)
+    simulate_match(SCENARIOS["tiny"], 3, folder, MatchOptions(**options))
     return folder
 
 

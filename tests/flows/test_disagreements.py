@@ -9,7 +9,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.disagreements import worst_views
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 
 FRAMES = np.arange(20, 24)
 
@@ -19,7 +19,7 @@ def camera(x):
         focal=np.array([2000.0, 2000.0]),
         principal_point=np.array([960.0, 540.0]),
         distortion=np.zeros(5),
-        cam_from_world=looking(np.array([x, -60.0, 20.0]), np.zeros(3), 0.0),
+        cam_from_world=look_at(np.array([x, -60.0, 20.0]), np.zeros(3), 0.0),
         image_size=np.array([1920, 1080]),
     )
 

@@ -16,7 +16,7 @@ from threading import Thread
 import pytest
 from service import Served
 
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +25,7 @@ def small_match(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arriving") / "small"
     tiny = SCENARIOS["tiny"]
     small = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
-    simulate_match(tiny, 0, folder, **small)
+    simulate_match(tiny, 0, folder, MatchOptions(**small))
     return folder
 
 

@@ -14,7 +14,7 @@ from command_line import WORLDPOSE, succeed
 from flows.method import METHOD
 from flows.planning import plan_run
 from flows.registering import register
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600), pytest.mark.usefixtures("server")]
@@ -55,7 +55,7 @@ def test_ten_matches_at_once_take_no_more_memory_and_hardly_more_time(dask, tmp_
     for number, folder in enumerate(folders):
         small = {"duration": 0.2, "cameras": 3, "players": 2}
         bare = {"calibrated": True, "stills": False, "video": False}
-        simulate_match(SCENARIOS["tiny"], number, folder, **small, **bare)
+        simulate_match(SCENARIOS["tiny"], number, folder, MatchOptions(**small, **bare))
 
     def command(folder, project):
         return ["run", str(folder), "--project", str(project), "--dask", address]
@@ -140,7 +140,7 @@ def many_cameras(folder, count):
     """A match of so many cameras, all of which saw and are what one of a small match did and is."""
     small = folder.with_name("small")
     options = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
-    simulate_match(SCENARIOS["tiny"], 0, small, calibrated=True, **options)
+    simulate_match(SCENARIOS["tiny"], 0, small, MatchOptions(calibrated=True, **options))
     names = [f"c{number:05d}" for number in range(count)]
     spec = yaml.safe_load((small / "match.yaml").read_text())
     (clip,) = spec["clips"]

@@ -10,7 +10,7 @@ from stand_ins import publish_stand_in
 
 from flows.planning import plan_run
 from flows.registering import register
-from worldpose.simulation import SCENARIOS, simulate_match
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -41,7 +41,7 @@ def long_match(folder):
     small = folder.with_name("small")
     seen = {"duration": 0.2, "cameras": CAMERAS, "players": 1}
     bare = {"calibrated": True, "stills": False, "video": False}
-    simulate_match(SCENARIOS["match"], 0, small, **seen, **bare)
+    simulate_match(SCENARIOS["match"], 0, small, MatchOptions(**seen, **bare))
     shutil.copytree(small, folder)
     spec = yaml.safe_load((small / "match.yaml").read_text())
     (clip,) = spec["clips"]

@@ -14,7 +14,7 @@ from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.cameras import camera_arrays
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 
 LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]
 
@@ -63,7 +63,7 @@ def test_clips_that_say_nothing_of_somebody_leave_him_anybody(monkeypatch, weigh
 
 def beside(frames):
     """A camera 70 m beside the pitch (frames,), which looks at the origin."""
-    pose = looking(np.array([0.0, -70.0, 15.0]), np.array([0.0, 0.0, 1.0]), 0.0)
+    pose = look_at(np.array([0.0, -70.0, 15.0]), np.array([0.0, 0.0, 1.0]), 0.0)
     return Camera(
         focal=np.full((frames, 2), 4000.0),
         principal_point=np.tile([959.5, 539.5], (frames, 1)),

@@ -4,20 +4,20 @@ Inputs: a `Scenario` (people, cameras, detector errors) and a seed.
 Outputs: a `Scene` in memory, a match folder with `reference/`, or images of it.
 """
 
-from worldpose.simulation.looks import RenderingSettings
-from worldpose.simulation.matches import simulate_match
-from worldpose.simulation.noise import ObservationNoise
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.recordings import read_trajectories
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Identities, Scene, StaticViews, simulate_scene
 from worldpose.simulation.settings import (
     BroadcastSettings,
     CalibrationErrors,
     CrowdSettings,
+    ObservationNoise,
+    RenderingSettings,
     RigSettings,
     Scenario,
     Seat,
 )
-from worldpose.simulation.trajectories import read_trajectories
 
 __all__ = [
     "SCENARIOS",
@@ -25,6 +25,7 @@ __all__ = [
     "CalibrationErrors",
     "CrowdSettings",
     "Identities",
+    "MatchOptions",
     "ObservationNoise",
     "RenderingSettings",
     "RigSettings",

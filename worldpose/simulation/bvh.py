@@ -41,8 +41,8 @@ class Clip:
 
     Attributes:
         time: (frames,) [s], from 0.
-        points: (frames, 13, 3) [m], in the order of `worldpose.simulation.clips.NAMES`, z up, above
-            the ground.
+        points: (frames, 13, 3) [m], z up, above the ground, in the order of
+            `worldpose.simulation.recordings.NAMES`.
     """
 
     time: Floats
@@ -187,5 +187,5 @@ def _unusable(path: Path, found: str) -> InputError:
         str(path),
         expected="a BVH file: HIERARCHY, MOTION, and as many numbers as frames times channels",
         found=found,
-        todo="Export the clip again, with the usual six or three channels a joint.",
+        todo="Export the clip again with six or three channels per joint.",
     )

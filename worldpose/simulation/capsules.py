@@ -7,12 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-
-Pictures = NDArray[np.float32]
 
 _SHIRT, _SHORTS, _SKIN, _SOCKS, _BOOTS, _HAIR = range(6)
 _GOAL_RADIUS = 0.06
@@ -106,7 +104,7 @@ def goal_capsules(pitch: PitchTemplate) -> tuple[Floats, Floats]:
 
 
 def draw_shadows(
-    shade: Pictures, ground: Pictures, camera: Camera, limbs: Floats, light: Floats, bend: float
+    shade: Singles, ground: Singles, camera: Camera, limbs: Floats, light: Floats, bend: float
 ) -> None:
     """Darken the ground where limbs block a light.
 
@@ -135,7 +133,7 @@ def draw_shadows(
 
 
 def draw_things(
-    picture: Pictures,
+    image: Singles,
     camera: Camera,
     limbs: list[Floats],
     colors: list[Floats],
@@ -144,7 +142,7 @@ def draw_things(
     """Draw things over the image, the far ones first.
 
     Args:
-        picture: (height, width, 3), changed in place.
+        image: (height, width, 3), changed in place.
         camera: a single camera.
         limbs: (limbs, 8) per thing [m], world.
         colors: (limbs, 3) per thing.
@@ -160,10 +158,10 @@ def draw_things(
         depth = camera.cam_from_world.apply(ends)[:, 2].reshape(-1, 2).mean(1)
         rows = np.concatenate([pixels, radii], axis=1)
         seen = np.isfinite(rows).all(1)
-        box = _box(rows[seen, :4].reshape(-1, 2), radii[seen].ravel() + 2.0, picture.shape)
+        box = _box(rows[seen, :4].reshape(-1, 2), radii[seen].ravel() + 2.0, image.shape)
         if box is not None:
             order = np.flatnonzero(seen)[np.argsort(-depth[seen], kind="stable")]
-            _capsules(picture, rows[order], brightness[index] * colors[index][order])
+            _capsules(image, rows[order], brightness[index] * colors[index][order])
 
 
 def _middle(thing: Floats) -> Floats:
@@ -191,7 +189,7 @@ def _box(pixels: Floats, margin: Floats, shape: tuple[int, ...]) -> NDArray[np.i
 
 @compiled
 def _shadow(
-    shade: Pictures, ground: Pictures, rows: Floats, box: NDArray[np.int64], share: float
+    shade: Singles, ground: Singles, rows: Floats, box: NDArray[np.int64], share: float
 ) -> None:
     """Subtract the light's share from pixels in a box within capsules (n, 6) on the ground."""
     for v in range(box[1], box[3]):
@@ -216,7 +214,7 @@ def _shadow(
 
 
 @compiled
-def _capsules(picture: Pictures, rows: Floats, colors: Floats) -> None:
+def _capsules(picture: Singles, rows: Floats, colors: Floats) -> None:
     """Draw capsules (n, 6) of ends and radii [px] in order, with rounded shading."""
     height, width = picture.shape[0], picture.shape[1]
     for i in range(len(rows)):

@@ -1,28 +1,297 @@
-"""Paths of footballers: two teams and officials who follow a ball, with bounded accelerations."""
+"""Football: the ball, duels for it, and the paths of two teams and officials."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 
 from data_contracts.arrays import Floats
-from worldpose.simulation.ball import roll_ball
-from worldpose.simulation.duels import (
-    AT_EASE,
-    COASTING,
-    PUSHING,
-    STOPPING,
-    Duels,
-    in_order,
-)
-from worldpose.simulation.idling import keep_ready
-from worldpose.simulation.paths import MARGIN, STEP, GroundPath
-from worldpose.simulation.processes import drift
-from worldpose.simulation.settings import CrowdSettings
+from worldpose.simulation.falls import dive, fall, slide
+from worldpose.simulation.motions import SETTLE, Action, Motion, jump, kick
+from worldpose.simulation.paths import MARGIN, STEP, GroundPath, keep_ready
+from worldpose.simulation.random_processes import drift
+from worldpose.simulation.settings import ActionRates, CrowdSettings
+
+PASS_EVERY: Final = (2.0, 4.5)
+"""Time between passes [s]."""
+PASS_LENGTH: Final = 12.0
+"""Standard deviation of a pass per axis [m]."""
+SHOT_RANGE: Final = 28.0
+"""Maximum distance from the goal for shots [m]."""
+SHOT_SPEED: Final = 24.0
+"""Mean speed of a shot on its way [m/s]; instep kicks of trained players leave at 25 to 34 m/s."""
+GOAL_LINE: Final = 51.5
+"""Where the goalkeeper catches shots [m]: before the line of a pitch of 105 m."""
+HELD: Final = 2.0
+"""Time that a goalkeeper keeps the ball [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """A player's touch of the ball.
+
+    Attributes:
+        time: [s].
+        place: (2,) [m].
+        target: (2,) destination of the ball [m].
+        kind: a kick on the ground; a header that two contest; a kick that an opponent slides into;
+            a shot; a save.
+    """
+
+    time: float
+    place: Floats
+    target: Floats
+    kind: Literal["pass", "header", "tackle", "shot", "save"]
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """Trajectory of the ball.
+
+    Attributes:
+        position: (samples, 2) [m], every `STEP`.
+        touches: in temporal order.
+    """
+
+    position: Floats
+    touches: tuple[Touch, ...]
+
+
+def roll_ball(time: Floats, rates: ActionRates, rng: np.random.Generator) -> Ball:
+    """Return a ball that goes from pass to pass and stays in play.
+
+    Args:
+        time: (samples,) [s], every `STEP`.
+        rates: shares of headers, tackles and shots.
+        rng: draws passes and touches.
+    """
+    place = rng.uniform(-1.0, 1.0, 2) * [30.0, 18.0]
+    when, places, kinds = [float(time[0])], [place], ["pass"]
+    while when[-1] < time[-1]:
+        chance, across = rng.random(), rng.uniform(-3.3, 3.3)
+        wait, way = rng.uniform(PASS_EVERY[0], PASS_EVERY[1]), PASS_LENGTH * rng.standard_normal(2)
+        goal = np.array([np.copysign(GOAL_LINE, place[0]), across])
+        far = float(np.linalg.norm(goal - place))
+        if kinds[-1] == "pass" and far < SHOT_RANGE and rng.random() < rates.shots:
+            kinds[-1] = "shot"
+            when += [when[-1] + far / SHOT_SPEED, when[-1] + far / SHOT_SPEED + HELD]
+            places += [goal, goal]
+            kinds += ["save", "pass"]
+            place = goal
+            continue
+        # Play drifts back to the middle third instead of staying in a corner.
+        place = np.clip(0.9 * place + way, [-46.0, -29.0], [46.0, 29.0])
+        when.append(when[-1] + wait)
+        places.append(place)
+        high = chance < rates.headers
+        kinds.append("header" if high else "tackle" if chance > 1.0 - rates.tackles else "pass")
+    # Smoothed over a third of a second: the target of people's gaze must not jump.
+    raw = np.stack([np.interp(time, when, axis) for axis in np.array(places).T], axis=-1)
+    half = round(0.35 / STEP)
+    kernel = np.hanning(2 * half + 1)
+    padded = np.pad(raw, ((half, half), (0, 0)), mode="edge")
+    position = [np.convolve(axis, kernel / kernel.sum(), mode="valid") for axis in padded.T]
+    touches = tuple(
+        Touch(when[n], places[n], places[n + 1], kinds[n])  # type: ignore[arg-type]
+        for n in range(1, len(when) - 1)
+    )
+    return Ball(np.stack(position, axis=-1), touches)
+
+
+CALL: Final = 2.5
+"""Time before a touch at which a player goes for the ball [s]."""
+REACH: Final = 1.8
+"""Distance from which the ball is played [m]: a player who is farther away at the start of the
+motion leaves it."""
+KICK_SPEED: Final = 3.2
+"""Speed of a kicker [m/s]; kickers in motion capture run up at 3 to 3.5 m/s."""
+JUMP_SPEED: Final = 1.8
+"""Speed of a person who jumps off both feet [m/s]."""
+SLIDE_SPEED: Final = 5.5
+"""Speed of a person who slides in [m/s]."""
+DIVE_SPEED: Final = 3.3
+"""Sideward speed of a goalkeeper at take-off [m/s]; measurements give 3.9 +- 0.3 m/s."""
+DIVE_REACH: Final = (0.7, 3.5)
+"""A goalkeeper catches balls nearer than the first standing, and lets in balls beyond the second
+[m]."""
+
+AT_EASE, COASTING, STOPPING, PUSHING = range(4)
+"""Modes of movement: free; constant velocity; to a stop; sideward, off a leg."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """A person's planned action at a touch."""
+
+    person: int
+    touch: Touch
+    motion: Motion
+    speed: float
+    aside: float = 0.0
+
+
+class Duels:
+    """The touches of a game and the players' responses; updated during the game.
+
+    Attributes:
+        mode: (samples, people), mode of movement.
+        max_speed: (samples, people), speed limit before an action [m/s].
+        push: (samples, people, 2), acceleration off a leg [m/s^2].
+        actions: of each person.
+    """
+
+    def __init__(
+        self,
+        time: Floats,
+        touches: tuple[Touch, ...],
+        team: NDArray[np.int64],
+        players: int,
+        rates: ActionRates,
+        rng: np.random.Generator,
+    ) -> None:
+        """Take the game's arguments; players are the first people, of both teams in turn."""
+        self._time, self._team, self._players = time, team, players
+        self._rates, self._rng = rates, rng
+        self._waiting, self._calls = list(touches), list[_Call]()
+        self._busy_until = np.full(len(team), -np.inf)
+        self.mode = np.full((len(time), len(team)), AT_EASE, dtype=np.int8)
+        self.max_speed = np.full((len(time), len(team)), np.inf)
+        self.push = np.zeros((len(time), len(team), 2))
+        self.actions = [list[Action]() for _ in team]
+
+    def advance(
+        self, sample: int, position: Floats, velocity: Floats, heading: Floats
+    ) -> dict[int, tuple[Floats, float]]:
+        """Update responses; return targets [m] of people on the ball and times left [s].
+
+        Args:
+            sample: its index.
+            position: (people, 2) [m].
+            velocity: (people, 2) [m/s].
+            heading: (people,) [rad].
+        """
+        now = float(self._time[sample])
+        while self._waiting and self._waiting[0].time - CALL <= now:
+            self._call(self._waiting.pop(0), now, position)
+        due = [call for call in self._calls if call.touch.time - call.motion.blow <= now]
+        for call in due:
+            self._calls.remove(call)
+            self._begin(call, sample, position, velocity, heading)
+        return {
+            call.person: (call.touch.place, call.touch.time - now)
+            for call in self._calls
+            if call.touch.kind != "save"
+        }
+
+    def _call(self, touch: Touch, now: float, position: Floats) -> None:
+        far = np.linalg.norm(position - touch.place, axis=-1)
+        free = np.flatnonzero((np.arange(len(far)) < self._players) & (self._busy_until <= now))
+        field = free[free >= 2]
+        if touch.kind == "save":
+            keeper = int(touch.place[0] > 0.0)
+            if keeper in free:
+                climb = self._rng.uniform(0.8, 2.2)
+                self._add(_Call(keeper, touch, dive(climb), np.inf))
+            return
+        if not len(field):
+            return
+        first = int(field[np.argmin(far[field])])
+        others = field[self._team[field] != self._team[first]]
+        second = int(others[np.argmin(far[others])]) if len(others) else -1
+        draws = self._rng.random(3)
+        if touch.kind == "header":
+            for person, draw in ((first, draws[0]), (second, draws[1])):
+                if person >= 0:
+                    self._add(_Call(person, touch, jump(0.28 + 0.17 * draw), JUMP_SPEED))
+        elif touch.kind == "tackle" and second >= 0 and far[second] < 8.0:
+            self._add(_Call(second, touch, slide(), SLIDE_SPEED))
+            tripped = draws[0] < self._rates.tripped
+            motion = fall() if tripped else jump(0.22 + 0.1 * draws[1], hurdle=True)
+            self._add(_Call(first, touch, motion, 4.0 if tripped else 2.5))
+        else:
+            length = float(np.linalg.norm(touch.target - touch.place))
+            power = 1.0 if touch.kind == "shot" else float(np.clip(0.3 + length / 40.0, 0.4, 0.9))
+            self._add(_Call(first, touch, kick(power), KICK_SPEED))
+
+    def _add(self, call: _Call) -> None:
+        self._calls.append(call)
+        self._busy_until[call.person] = call.touch.time + 0.5
+        begin = call.touch.time - call.motion.blow
+        first, behind = (
+            round((when + MARGIN) / STEP) for when in (begin - 0.5, begin + call.motion.duration)
+        )
+        stretch = slice(max(first, 0), max(behind, 0))
+        self.max_speed[stretch, call.person] = call.speed
+
+    def _begin(
+        self, call: _Call, sample: int, position: Floats, velocity: Floats, heading: Floats
+    ) -> None:
+        person, motion, begin = call.person, call.motion, float(self._time[sample])
+        ahead = call.touch.time - begin
+        way = call.touch.place - position[person] - ahead * velocity[person]
+        facing = heading[person]
+        aside = np.array([-np.sin(facing), np.cos(facing)])
+        left, turn = bool(self._rng.random() < 0.5), 0.0
+        if motion.name == "dive":
+            reach = float(way @ aside)
+            if not DIVE_REACH[0] < abs(reach) < DIVE_REACH[1]:
+                return
+            left = reach > 0.0
+        elif np.linalg.norm(way) > REACH:
+            self.max_speed[sample:, person] = np.inf
+            return
+        if motion.name == "kick":
+            course = call.touch.target - call.touch.place
+            off = (np.arctan2(course[1], course[0]) - facing + np.pi) % (2.0 * np.pi) - np.pi
+            turn = float(np.clip(off, -0.7, 0.7))
+            # Most kick with the right foot; a ball to the left of the body needs the left one.
+            left = bool(self._rng.random() < 0.2)
+        self.actions[person].append(Action(begin, motion, left, turn))
+        end = begin + motion.duration
+        self._busy_until[person] = end
+        self.max_speed[sample:, person] = np.inf
+        if motion.stops is None:
+            self._set(self.max_speed, person, begin, begin + motion.blow, call.speed)
+        if motion.flight is not None:
+            off_ground, land = motion.flight
+            self._set(self.mode, person, begin + off_ground - SETTLE, begin + land, COASTING)
+            if motion.name == "dive":
+                self._set(self.mode, person, begin, begin + 0.2, STOPPING)
+                self._set(self.mode, person, begin + 0.2, begin + off_ground, PUSHING)
+                pace = DIVE_SPEED / (off_ground - 0.2) * (1.0 if left else -1.0)
+                self._set(self.push, person, begin + 0.2, begin + off_ground, pace * aside)
+            else:
+                self._set(self.max_speed, person, begin, begin + land + 0.3, call.speed)
+        if motion.stops is not None:
+            moves_again = begin + motion.moves_again
+            self._set(self.mode, person, begin + motion.stops, moves_again, STOPPING)
+            # After getting up, people do not sprint at once.
+            self._set(self.max_speed, person, moves_again, end, 1.5)
+
+    def _set(
+        self, array: NDArray[Any], person: int, begin: float, end: float, value: float | Floats
+    ) -> None:
+        first, behind = (max(round((when + MARGIN) / STEP), 0) for when in (begin, end))
+        array[first:behind, person] = value
+
+
+def overlaps_any(actions: list[Action], begin: float, end: float) -> bool:
+    """Return whether an action overlaps an interval [s]."""
+    return any(action.begin < end and action.end > begin for action in actions)
+
+
+def sort_actions(actions: list[Action]) -> tuple[Action, ...]:
+    """Return actions by their start, without those that overlap an earlier one."""
+    kept: list[Action] = []
+    for action in sorted(actions, key=lambda action: action.begin):
+        if not overlaps_any(kept, action.begin, action.end):
+            kept.append(replace(action))
+    return tuple(kept)
+
 
 FORMATION: Final = np.array(
     # goalkeeper, four defenders, three midfielders, three forwards
@@ -78,7 +347,7 @@ def play(
     Every person steers for a target that moves: players for their place in a formation that shifts
     with the ball, the nearest of each team for the ball, a sprinter for open space, the referee
     for a place near play, assistants along the touch lines. Targets need not be smooth: people
-    accelerate within human bounds (docs/explanation/synthetic.md).
+    accelerate within human bounds (docs/explanation/simulation.md).
 
     Args:
         crowd: number of people and of officials among them.
@@ -92,8 +361,8 @@ def play(
     side = np.where(team == 0, 1.0, -1.0)
     game = roll_ball(time, crowd.actions, rng)
     ball = game.position
-    targets, hurry = _targets(time, ball, players, crowd.people, side, rng)
-    top = rng.uniform(*TOP_SPEED, crowd.people)
+    targets, hurry = _draw_targets(time, ball, players, crowd.people, side, rng)
+    top = rng.uniform(TOP_SPEED[0], TOP_SPEED[1], crowd.people)
     duels = Duels(time, game.touches, team, players, crowd.actions, rng)
 
     position, velocity = targets[0].copy(), np.zeros((crowd.people, 2))
@@ -120,7 +389,7 @@ def play(
             push,
             moving,
             target - position,
-            _Wishes(hurry[i], haste, np.minimum(duels.most[i], top), mode, duels.push[i]),
+            _Wishes(hurry[i], haste, np.minimum(duels.max_speed[i], top), mode, duels.push[i]),
             top,
         )
         places[i], headings[i] = position, heading
@@ -132,7 +401,7 @@ def play(
         heading = heading + np.where(mode == AT_EASE, turn, 0.0) * STEP
         position = position + velocity * STEP
     paths = [
-        GroundPath(time, places[:, n], headings[:, n], speeds[:, n], in_order(duels.actions[n]))
+        GroundPath(time, places[:, n], headings[:, n], speeds[:, n], sort_actions(duels.actions[n]))
         for n in range(crowd.people)
     ]
     for keeper in range(min(2, players)):
@@ -143,7 +412,7 @@ def play(
     return paths, GroundPath(time, ball, course, np.linalg.norm(way, axis=-1))
 
 
-def _targets(
+def _draw_targets(
     time: Floats,
     ball: Floats,
     players: int,
@@ -191,14 +460,14 @@ class _Wishes:
     Attributes:
         hurry: factor on the usual speed to the target [1].
         haste: speed that reaches the target in time [m/s]; NaN = free choice.
-        most: speed limit [m/s].
+        max_speed: speed limit [m/s].
         mode: at ease, coasting, stopping or pushing off.
         off_leg: (people, 2), acceleration of those who push off [m/s^2].
     """
 
     hurry: Floats
     haste: Floats
-    most: Floats
+    max_speed: Floats
     mode: NDArray[np.int8]
     off_leg: Floats
 
@@ -217,7 +486,7 @@ def _steer(
     called = ~np.isnan(wishes.haste)
     moving = (far > np.where(moving, NEAR_ENOUGH, WORTH_GOING)) | called
     wish = np.where(called, wishes.haste, EAGERNESS * wishes.hurry * far)
-    wish = np.where(moving, np.minimum(wish, wishes.most), 0.0)
+    wish = np.where(moving, np.minimum(wish, wishes.max_speed), 0.0)
     wished = way * (wish / np.maximum(far, 1e-9))[:, None]
     apart = position[:, None] - position
     gap = np.linalg.norm(apart, axis=-1)
@@ -229,8 +498,8 @@ def _steer(
     speed = np.linalg.norm(velocity, axis=-1)
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     drive = (change * ahead).sum(-1)
-    most = ACCELERATION * np.maximum(1.0 - speed / top, 0.0)
-    change = change + (np.minimum(drive, most) - drive)[:, None] * ahead
+    max_drive = ACCELERATION * np.maximum(1.0 - speed / top, 0.0)
+    change = change + (np.minimum(drive, max_drive) - drive)[:, None] * ahead
     size = np.linalg.norm(change, axis=-1)
     change = change * np.minimum(1.0, ACCELERATION / np.maximum(size, 1e-9))[:, None]
     change = np.where((wishes.mode == COASTING)[:, None], 0.0, change)

@@ -1,4 +1,4 @@
-"""Image formation of one exposure: people and things drawn over a scene, then lens and sensor."""
+"""Image formation of one exposure: shadows, people and things over a scene, lens and sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Singles
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.compiled import compiled
 from worldpose.geometry import Camera
 from worldpose.geometry.rasters import (
@@ -19,18 +19,121 @@ from worldpose.geometry.rasters import (
     Outlines,
     Samples,
     Surface,
+    cover_triangles,
     draw_triangles,
     outline_surfaces,
     resolve,
 )
-from worldpose.simulation.casting import Cast
-from worldpose.simulation.looks import RenderingSettings
+from worldpose.simulation.cast import Cast, Prop
 from worldpose.simulation.mannequins import Surfaces
-from worldpose.simulation.people_shadows import shade_ground
-from worldpose.simulation.props import Prop
+from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.venues import FOG_COLOR, Venue
 
-Bytes = NDArray[np.uint8]
+
+def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floats) -> Outlines:
+    """Return outlines of the shadows that surfaces cast on the grass.
+
+    A vertex casts no shadow beyond the boards, or where the stand's shadow already covers the
+    grass; the stand does not block light that comes straight down.
+
+    Args:
+        venue: the stadium.
+        camera: a single camera.
+        vertices: (persons, vertices, 3) [m], world.
+        light: (4,) direction down from the light, z = -1, and its share of all light.
+    """
+    straight_down = not light[:2].any()
+    edge = venue.edge if venue.shade > 0.0 and not straight_down else np.inf
+    fallen = np.empty_like(vertices)
+    ground = np.array([venue.bend, *venue.half, venue.side, edge])
+    _throw(vertices, light, ground, fallen)
+    return outline_surfaces(camera, fallen)
+
+
+@compiled
+def _throw(vertices: Singles, light: Floats, ground: Floats, fallen: Singles) -> None:
+    """Write the grass points in the shadows of vertices; NaN where none is darkened.
+
+    Args:
+        vertices: (persons, vertices, 3) [m], world.
+        light: (4,), its direction down first.
+        ground: the bend of the surface, half the distances between the boards along x and y, the
+            side of the stand that casts a shadow, and the start of that shadow.
+        fallen: (persons, vertices, 3), written.
+    """
+    for p in range(vertices.shape[0]):
+        for v in range(vertices.shape[1]):
+            x, y, z = vertices[p, v, 0], vertices[p, v, 1], vertices[p, v, 2]
+            up = max(z + ground[0] * y * y, 0.0)
+            gx, gy = x + up * light[0], y + up * light[1]
+            if not (abs(gx) < ground[1] and abs(gy) < ground[2] and ground[3] * gy < ground[4]):
+                fallen[p, v] = np.nan
+                continue
+            fallen[p, v, 0], fallen[p, v, 1] = gx, gy
+            fallen[p, v, 2] = -ground[0] * gy * gy
+
+
+Faces = NDArray[np.int32]
+
+SKY: Final = np.array([0.0, 0.0, -1.0, 0.2])
+"""Ambient light, as a light straight from above: dims the grass at the feet."""
+SOFT: Final = 0.9
+"""Standard deviation of a shadow's rim [px]: some centimetres."""
+_MARGIN: Final = 3
+"""Margin around a shadow, the extent of its rim [px]."""
+
+
+def shade_ground(
+    venue: Venue, camera: Camera, image: Image, things: Sequence[tuple[Faces, Singles]]
+) -> list[Box]:
+    """Darken the grass in shadows, and return the boxes that changed.
+
+    Args:
+        venue: the stadium and its lights.
+        camera: a single camera.
+        image: (height, width, 3), changed in place.
+        things: faces (triangles, 3) and vertices (things, vertices, 3) [m], world, of objects that
+            cast shadows.
+    """
+    height, width = image.shape[:2]
+    mask = np.zeros((height, width), dtype=np.uint8)
+    # Levels of 255 that each combination of lights takes.
+    taken = np.zeros(256, dtype=np.uint8)
+    boxes: list[Box] = []
+    for index, light in enumerate((*venue.lights, SKY)):
+        bit = 1 << index
+        taken[[value for value in range(256) if value & bit]] += round(255.0 * float(light[3]))
+        for faces, vertices in things:
+            shadows = outline_shadows(venue, camera, vertices, light)
+            for number in range(len(vertices)):
+                box = shadows.box(number, _MARGIN, width, height)
+                if box is not None:
+                    cover_triangles(shadows.pixels[number], faces, bit, mask)
+                    boxes.append(box)
+    dark = np.zeros((height, width), dtype=np.uint8)
+    for left, top, right, bottom in boxes:
+        part = (slice(top, bottom), slice(left, right))
+        soft = cv2.GaussianBlur(taken[mask[part]], (0, 0), SOFT)
+        # Where boxes overlap, both have the whole shadow.
+        np.maximum(dark[part], soft, out=dark[part])
+    for left, top, right, bottom in boxes:
+        part = (slice(top, bottom), slice(left, right))
+        _darken(image[part], dark[part])
+    return boxes
+
+
+@compiled
+def _darken(picture: Image, dark: Image) -> None:
+    """Subtract a share (height, width) [1/255] from an image, and reset the share to zero."""
+    for v in range(picture.shape[0]):
+        for u in range(picture.shape[1]):
+            left = 255 - int(dark[v, u])
+            if left == 255:
+                continue
+            for k in range(3):
+                picture[v, u, k] = (int(picture[v, u, k]) * left + 127) // 255
+            dark[v, u] = 0
+
 
 AMBIENT: Final = 0.58
 """Ambient light on an upright surface [1]."""
@@ -38,8 +141,6 @@ FROM_ABOVE: Final = 0.12
 """Additional ambient light on a surface that faces up [1]."""
 DIRECT: Final = 1.3
 """Light on a surface that faces a light source, per share of light that its shadow takes [1]."""
-_MARGIN: Final = 3
-"""Margin around pixels that people change [px]: the extent of the blur."""
 _SPARE: Final = 64
 """Additional rows and columns of noise, for another offset in every frame [px]."""
 
@@ -49,7 +150,7 @@ class RenderedFrame:
     """An image with its pixel labels.
 
     Attributes:
-        picture: (height, width, 3) RGB.
+        image: (height, width, 3) RGB.
         person_ids: (height, width) the person that fills most of a pixel, -1 for none.
         boxes: (persons, 4) left, top, right, bottom of every person's whole outline [px], also
             outside the image; NaN for a person who is missing or behind the camera.
@@ -57,7 +158,7 @@ class RenderedFrame:
             outside the image.
     """
 
-    picture: Bytes
+    image: Image
     person_ids: NDArray[np.int16]
     boxes: Floats
     visible: Floats
@@ -81,7 +182,7 @@ class Moment:
 
 
 def expose(
-    venue: Venue, camera: Camera, sharp: Bytes, blurred: Bytes, grain: NDArray[np.int8],
+    venue: Venue, camera: Camera, sharp: Image, blurred: Image, grain: NDArray[np.int8],
     moment: Moment, frame: int,
 ) -> RenderedFrame:  # fmt: skip
     """Return the image of people before a scene.
@@ -101,14 +202,14 @@ def expose(
     throwing = [(each.faces, each.surfaces.vertices) for each in moment.props if each.shadow]
     throwing.append((cast.mannequin.faces, moment.opened.vertices))
     changed = shade_ground(venue, camera, sharp, throwing)
-    drawn, spans, boxes = _outlined(venue, camera, moment, width, height)
+    drawn, spans, boxes = _outline_surfaces(venue, camera, moment, width, height)
     ids = np.full((height, width), NOBODY, dtype=np.int16)
     seen, filled = np.zeros(persons, dtype=np.int64), np.zeros(persons, dtype=np.int64)
-    for (left, top, right, bottom), members in clusters(spans):
+    for (left, top, right, bottom), members in cluster_boxes(spans):
         samples = Samples.empty(left, top, right, bottom)
         for number in members:
             thing = drawn[number]
-            count = draw_triangles(thing, _haze(venue, thing.opened), number, samples)
+            count = draw_triangles(thing, _haze_before(venue, thing.opened), number, samples)
             if number < persons:
                 filled[number] = count
         part = (slice(top, bottom), slice(left, right))
@@ -123,7 +224,7 @@ def expose(
     return RenderedFrame(blurred, ids, boxes, visible)
 
 
-def _outlined(
+def _outline_surfaces(
     venue: Venue, camera: Camera, moment: Moment, width: int, height: int
 ) -> tuple[list[Surface], list[Box | None], Floats]:
     """Return all surfaces, people first; the image region of each; people's boxes (n, 4)."""
@@ -132,33 +233,33 @@ def _outlined(
     closed = opened
     if moment.closed is not moment.opened:
         closed = outline_surfaces(camera, moment.closed.vertices)
-    light = _lit(venue, moment.opened)
+    light = _shade_surfaces(venue, moment.opened)
     shape = cast.mannequin
     drawn = [
         Surface(
             faces=shape.faces,
             backs=shape.backs,
             texels=shape.texels,
-            textures=textures,
+            textures=image,
             opened=first,
             closed=last,
             light=brightness,
         )
-        for textures, first, last, brightness in zip(
-            cast.pictures, opened.pixels, closed.pixels, light, strict=True
+        for image, first, last, brightness in zip(
+            cast.images, opened.pixels, closed.pixels, light, strict=True
         )
     ]
-    spans = [_span(opened, closed, person, width, height) for person in range(len(drawn))]
+    spans = [_exposed_box(opened, closed, person, width, height) for person in range(len(drawn))]
     for prop in moment.props:
         outline = outline_surfaces(camera, prop.surfaces.vertices)
         pixels = outline.pixels[0]
-        lit = _lit(venue, prop.surfaces)[0]
+        lit = _shade_surfaces(venue, prop.surfaces)[0]
         drawn.append(
             Surface(
                 faces=prop.faces,
                 backs=prop.backs,
                 texels=prop.texels,
-                textures=prop.picture,
+                textures=prop.image,
                 opened=pixels,
                 closed=pixels,
                 light=lit,
@@ -170,14 +271,16 @@ def _outlined(
     return drawn, spans, boxes
 
 
-def _span(opened: Outlines, closed: Outlines, person: int, width: int, height: int) -> Box | None:
+def _exposed_box(
+    opened: Outlines, closed: Outlines, person: int, width: int, height: int
+) -> Box | None:
     a, b = (each.box(person, 1, width, height) for each in (opened, closed))
     if a is None or b is None:
         return None
     return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
 
 
-def _lit(venue: Venue, surfaces: Surfaces) -> Singles:
+def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
     """Return the light (persons, vertices) on surfaces, 1 = their own colour."""
     normals, vertices = surfaces.normals, surfaces.vertices
     light = np.float32(AMBIENT) + np.float32(FROM_ABOVE) * normals[..., 2]
@@ -193,7 +296,7 @@ def _lit(venue: Venue, surfaces: Surfaces) -> Singles:
     return np.asarray(np.float32(venue.settings.exposure) * light, dtype=np.float32)
 
 
-def _haze(venue: Venue, outline: Singles) -> Singles:
+def _haze_before(venue: Venue, outline: Singles) -> Singles:
     """Return the haze before a thing, as `draw_triangles` takes it."""
     share = 0.0
     if venue.settings.fog > 0.0:
@@ -201,7 +304,7 @@ def _haze(venue: Venue, outline: Singles) -> Singles:
     return np.array([share, *(255.0 * venue.settings.exposure * FOG_COLOR)], dtype=np.float32)
 
 
-def clusters(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
+def cluster_boxes(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
     """Return image regions that share no pixel, each with the indices of the things in it.
 
     Args:
@@ -227,14 +330,14 @@ def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def through_lens(light: Singles, settings: RenderingSettings) -> Singles:
+def blur_by_lens(light: Singles, settings: RenderingSettings) -> Singles:
     """Return an image blurred by the lens."""
     if settings.blur == 0.0:
         return light
     return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur), dtype=np.float32)
 
 
-def to_bytes(light: Singles) -> Bytes:
+def to_bytes(light: Singles) -> Image:
     """Return levels of 255 rounded and clipped."""
     return np.asarray(np.clip(np.rint(light), 0.0, 255.0), dtype=np.uint8)
 
@@ -249,7 +352,7 @@ def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
     return np.repeat(levels.astype(np.int8), 3, axis=1)
 
 
-def _refocus(settings: RenderingSettings, sharp: Bytes, blurred: Bytes, box: Box) -> None:
+def _refocus(settings: RenderingSettings, sharp: Image, blurred: Image, box: Box) -> None:
     """Write `sharp` blurred by the lens into `blurred` around a box."""
     height, width = sharp.shape[:2]
     left, top = max(box[0] - _MARGIN, 0), max(box[1] - _MARGIN, 0)
@@ -264,7 +367,7 @@ def _refocus(settings: RenderingSettings, sharp: Bytes, blurred: Bytes, box: Box
 
 
 @compiled
-def _add_grain(picture: Bytes, grain: NDArray[np.int8]) -> None:
+def _add_grain(picture: Image, grain: NDArray[np.int8]) -> None:
     """Add noise (height, 3 width) to an image (height, width, 3), in place."""
     for v in range(picture.shape[0]):
         row, noise = picture[v].reshape(-1), grain[v]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,36 +19,56 @@ from worldpose.formats.pose_file import write_poses
 from worldpose.geometry import Camera
 from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.broadcast_rendering import render_broadcast
-from worldpose.simulation.clips import read_clip
+from worldpose.simulation.annotations import click_key_frames
+from worldpose.simulation.bvh import Clip
+from worldpose.simulation.detector_errors import write_estimates
 from worldpose.simulation.footage import Advance, film_scene
-from worldpose.simulation.key_frames import click_key_frames
-from worldpose.simulation.monocular import write_estimates
-from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.paths import GroundPath
+from worldpose.simulation.recordings import read_clip, read_trajectories
+from worldpose.simulation.renderer import render_broadcast, render_pitch
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import CalibrationErrors, Scenario
-from worldpose.simulation.trajectories import read_trajectories
 from worldpose.video import write_video
 
 CLIP_ID = "clip"
 BROADCAST_ID = "broadcast"
 
 
+@dataclass(frozen=True)
+class MatchOptions:
+    """What a simulated match changes in its scenario, and which files it has."""
+
+    duration: float | None = None
+    """[s], instead of the scenario's."""
+    cameras: int | None = None
+    """Number of static cameras, instead of the scenario's."""
+    players: int | None = None
+    """Number of people, instead of the scenario's."""
+    trajectories: Path | None = None
+    """Tracking data (`read_trajectories`) that drives the people instead; the clip ends with it."""
+    mocap: Path | None = None
+    """Motion capture (`worldpose.simulation.recordings.read_clip`) that one person plays."""
+    calibrated: bool = False
+    """Write the true static cameras as calibration.toml; without, the folder has such a file only
+    if the scenario has calibration errors."""
+    stills: bool = True
+    """Add one image of every static camera, about a second each."""
+    video: bool = True
+    """If the scenario has key frames, add the broadcast camera's video, about 0.1 s per frame,
+    annotated key frames, and bodies from a simulated monocular method (`estimates/`)."""
+    render: bool = False
+    """Film all cameras (`worldpose.simulation.footage.film_scene`), and write no detections, so
+    that pixels are the only input. Stills are first frames."""
+    masks: bool = False
+    """Add person masks of all filmed frames."""
+
+
 def simulate_match(
     scenario: Scenario,
     seed: int,
     out: Path,
+    options: MatchOptions | None = None,
     *,
-    duration: float | None = None,
-    cameras: int | None = None,
-    players: int | None = None,
-    trajectories: Path | None = None,
-    mocap: Path | None = None,
-    calibrated: bool = False,
-    stills: bool = True,
-    video: bool = True,
-    render: bool = False,
-    masks: bool = False,
     advance: Advance | None = None,
 ) -> MatchSpec:
     """Write a synthetic match folder with its ground truth; the same arguments give the same bytes.
@@ -73,22 +94,8 @@ def simulate_match(
         scenario: the scenario to simulate.
         seed: from 0.
         out: absent or an empty folder; the write is atomic.
-        duration: [s], instead of the scenario's.
-        cameras: number of static cameras, instead of the scenario's.
-        players: number of people, instead of the scenario's.
-        trajectories: tracking data (`read_trajectories`) that drives the people instead; the clip
-            ends with it.
-        calibrated: write the true static cameras as calibration.toml; without, the folder has such
-            a file only if the scenario has calibration errors.
-        stills: add one image of every static camera, about a second each.
-        video: if the scenario has key frames, add the broadcast camera's video, about 0.1 s per
-            frame, annotated key frames, and bodies from a simulated monocular method
-            (`estimates/`).
-        render: film all cameras (`worldpose.simulation.footage.film_scene`), and write no
-            detections, so that pixels are the only input. Stills are first frames.
-        masks: add person masks of all filmed frames.
+        options: changes of the scenario, and which files to write; the defaults if None.
         advance: receives the filming's progress.
-        mocap: motion capture (`worldpose.simulation.clips.read_clip`) that one person plays.
 
     Returns:
         The match's match.yaml. Its id names scenario, seed and overrides of the scenario.
@@ -96,37 +103,18 @@ def simulate_match(
     Raises:
         InputError: `out` holds files, or the trajectories or the capture cannot be used.
     """
-    changes = []
-    if duration is not None:
-        scenario = scenario.model_copy(update={"duration": duration})
-        changes.append(f"{duration:g}s")
-    if cameras is not None:
-        rig = scenario.rig.model_copy(update={"cameras": cameras})
-        scenario = scenario.model_copy(update={"rig": rig})
-        changes.append(f"{cameras}cameras")
-    if players is not None:
-        crowd = scenario.crowd.model_copy(update={"people": players})
-        scenario = scenario.model_copy(update={"crowd": crowd})
-        changes.append(f"{players}players")
-    driven = None
-    if trajectories is not None:
-        driven, length = read_trajectories(trajectories, scenario.duration, most=players)
-        scenario = scenario.model_copy(update={"duration": length})
-        changes.append(f"tracks{hashlib.sha256(trajectories.read_bytes()).hexdigest()[:8]}")
-    clip = None
-    if mocap is not None:
-        clip = read_clip(mocap)
-        changes.append(f"mocap{hashlib.sha256(mocap.read_bytes()).hexdigest()[:8]}")
-    if calibrated:
-        scenario = scenario.model_copy(update={"calibration": CalibrationErrors()})
-        changes.append("calibrated")
+    options = options or MatchOptions()
+    scenario, changes, driven, clip = _apply_options(scenario, options)
     scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven, clip=clip)
-    given = scene.given if calibrated or scenario.calibration != CalibrationErrors() else {}
-    pictures = _stills(scenario, scene, seed) if stills and not render else {}
+    given = scene.given if options.calibrated or scenario.calibration != CalibrationErrors() else {}
+    images = _stills(scenario, scene, seed) if options.stills and not options.render else {}
     width, height = scenario.rig.image_size
     specs = [
         CameraSpec(
-            id=name, width=width, height=height, still=f"stills/{name}.png" if stills else None
+            id=name,
+            width=width,
+            height=height,
+            still=f"stills/{name}.png" if options.stills else None,
         )
         for name in scene.cameras
     ]
@@ -146,35 +134,70 @@ def simulate_match(
     )
 
     def write_further(folder: Path) -> None:
-        write_references(folder / "reference", scenario, scene, detected=not render)
-        if render:
+        write_references(folder / "reference", scenario, scene, detected=not options.render)
+        if options.render:
             film_scene(
                 scene,
                 scenario,
                 seed,
                 folder,
                 clip_id=CLIP_ID,
-                stills=stills,
-                masks=masks,
+                stills=options.stills,
+                masks=options.masks,
                 advance=advance,
             )
-        elif scene.broadcast is not None and scenario.key_frames and video:
+        elif scene.broadcast is not None and scenario.key_frames and options.video:
             _write_broadcast(folder, scenario, scene.broadcast, scene, seed)
 
     write_match(
         out,
         spec,
         calibrations={name: camera.to_calibration(name) for name, camera in given.items()},
-        observations={} if render else scene.observations,
+        observations={} if options.render else scene.observations,
         pitch=scene.surveyed,
         annotations=MatchAnnotations(
             clicked={name: clicks.markings for name, clicks in scene.clicks.items()},
-            key_frames=_key_frames(scenario, scene, seed) if video or render else {},
+            key_frames=_key_frames(scenario, scene, seed)
+            if options.video or options.render
+            else {},
         ),
-        stills=pictures,
+        stills=images,
         further=write_further,
     )
     return spec
+
+
+def _apply_options(
+    scenario: Scenario, options: MatchOptions
+) -> tuple[Scenario, list[str], list[GroundPath] | None, Clip | None]:
+    """Return the changed scenario, names of the changes, tracked paths, and motion capture."""
+    changes = []
+    if options.duration is not None:
+        scenario = scenario.model_copy(update={"duration": options.duration})
+        changes.append(f"{options.duration:g}s")
+    if options.cameras is not None:
+        rig = scenario.rig.model_copy(update={"cameras": options.cameras})
+        scenario = scenario.model_copy(update={"rig": rig})
+        changes.append(f"{options.cameras}cameras")
+    if options.players is not None:
+        crowd = scenario.crowd.model_copy(update={"people": options.players})
+        scenario = scenario.model_copy(update={"crowd": crowd})
+        changes.append(f"{options.players}players")
+    driven = None
+    if options.trajectories is not None:
+        driven, length = read_trajectories(
+            options.trajectories, scenario.duration, max_people=options.players
+        )
+        scenario = scenario.model_copy(update={"duration": length})
+        changes.append(f"tracks{hashlib.sha256(options.trajectories.read_bytes()).hexdigest()[:8]}")
+    clip = None
+    if options.mocap is not None:
+        clip = read_clip(options.mocap)
+        changes.append(f"mocap{hashlib.sha256(options.mocap.read_bytes()).hexdigest()[:8]}")
+    if options.calibrated:
+        scenario = scenario.model_copy(update={"calibration": CalibrationErrors()})
+        changes.append("calibrated")
+    return scenario, changes, driven, clip
 
 
 def _stills(scenario: Scenario, scene: Scene, seed: int) -> dict[str, NDArray[np.uint8]]:
@@ -208,8 +231,8 @@ def _write_broadcast(
     file = folder / "broadcast" / f"{CLIP_ID}.mp4"
     file.parent.mkdir()
     painted = PitchTemplate.from_spec(scenario.pitch)
-    pictures = render_broadcast(camera, painted, scene.truth.joints, seed)
-    write_video(file, pictures, scenario.fps)
+    images = render_broadcast(camera, painted, scene.truth.joints, seed)
+    write_video(file, images, scenario.fps)
     estimates = folder / "estimates" / f"{CLIP_ID}.npz"
     write_estimates(estimates, scene.poses, camera, scenario.fps, seed)
 

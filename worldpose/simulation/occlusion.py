@@ -31,7 +31,7 @@ class Bodies:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Projections:
     """Projections of bodies into an image, and their occlusions.
 
     Attributes:
@@ -62,7 +62,7 @@ class Sight:
         return seen
 
 
-def see(camera: Camera, bodies: Bodies) -> Sight:
+def project_bodies(camera: Camera, bodies: Bodies) -> Projections:
     """Return the exact pixels of bodies, and the occlusions of joints by nearer bodies.
 
     A nearer body hides the contents of its box: from its highest to its lowest joint, as wide as
@@ -82,7 +82,7 @@ def see(camera: Camera, bodies: Bodies) -> Sight:
     focal = camera.focal.mean(axis=-1)[..., None]
     front, left = facing(bodies.joints)
     away = camera.center.reshape(-1, 1, 3) - middle
-    return Sight(
+    return Projections(
         keypoints=np.where(np.all(inside, axis=-1, keepdims=True), pixels, np.nan),
         bias=bias,
         hider=_hiders(pixels, depth),

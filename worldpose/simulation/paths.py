@@ -1,18 +1,102 @@
-"""Paths of people: smooth curves over a part of the pitch."""
+"""Paths of people: smooth curves over a part of the pitch, with the actions of standing people."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from worldpose.simulation.bvh import Clip
-from worldpose.simulation.motions import Action
-from worldpose.simulation.outbursts import draw_actions, steadied
-from worldpose.simulation.settings import CrowdSettings
+from worldpose.simulation.falls import draw_actions, steady_speed
+from worldpose.simulation.motions import (
+    STANDING,
+    Action,
+    Arm,
+    Height,
+    Motion,
+    Stance,
+    key,
+    stack_keys,
+)
+from worldpose.simulation.settings import ActionRates, CrowdSettings
+
+
+def shift_weight(duration: float) -> Motion:
+    """Return a shift of weight to the left leg, then to the right one."""
+
+    def over(side: float) -> Floats:
+        return key(
+            turn=(0.0, 3.5 * side, 4.0 * side),
+            bend=(4.0, -4.5 * side, -3.0 * side),
+            away=(0.0, 0.045 * side),
+        )
+
+    return _hold_poses(
+        "shift", duration, [key(), over(1.0), over(1.0), over(-1.0), over(-1.0), key()]
+    )
+
+
+def hands_on_hips(duration: float) -> Motion:
+    """Return a rest with both hands on the hips, looking around."""
+    arms = (Arm(-22.0, 46.0, 98.0, 76.0), Arm(-20.0, 44.0, 98.0, 76.0))
+
+    def looking(yaw: float, aside: float) -> Floats:
+        return key(bend=(2.0, 0.0, 0.15 * yaw), nod=(0.0, 0.0, yaw), away=(0.0, aside), arms=arms)
+
+    looks = [looking(20.0, 0.02), looking(45.0, 0.03), looking(-35.0, -0.02)]
+    return _hold_poses("hands on hips", duration, [key(), *looks, looking(0.0, 0.0), key()])
+
+
+def look_around(duration: float) -> Motion:
+    """Return turns of the head, followed by the chest, from side to side."""
+
+    def looking(yaw: float) -> Floats:
+        return key(bend=(3.0, 0.0, 0.25 * yaw), nod=(2.0, 0.0, yaw))
+
+    return _hold_poses(
+        "look", duration, [key(), looking(60.0), looking(40.0), looking(-65.0), key()]
+    )
+
+
+def ready(duration: float) -> Motion:
+    """Return a goalkeeper's ready stance: knees bent by 62 degrees, trunk leaning, hands up."""
+    waiting = [
+        key(
+            turn=(27.0, 0.0, 0.0),
+            bend=(5.0, 0.0, 0.0),
+            nod=(-3.0, 0.0, 0.0),
+            away=(0.0, aside),
+            arms=(Arm(42.0, 28.0, 60.0, 20.0), Arm(42.0, 28.0, 60.0, 20.0)),
+        )
+        for aside in (0.02, -0.02, 0.02, -0.02)
+    ]
+    motion = _hold_poses("ready", duration, [key(), *waiting, key()])
+    back = duration - 0.35
+    return Motion(
+        name=motion.name,
+        duration=duration,
+        time=motion.time,
+        channels=motion.channels,
+        # Thigh and shank of equal length that bend by 62 degrees leave 86 % of the leg.
+        heights=(Height(0.0, 0.835),),
+        stances=(
+            (Stance(0.05, 0.35, back, 0.0, outward=0.08),),
+            (Stance(0.2, 0.5, back - 0.1, 0.0, outward=0.08),),
+        ),
+        ease=(0.6, 0.5),
+    )
+
+
+def _hold_poses(name: str, duration: float, keys: Sequence[Floats]) -> Motion:
+    time, channels = stack_keys(list(zip(np.linspace(0.0, duration, len(keys)), keys, strict=True)))
+    return Motion(
+        name, duration, time, channels, heights=(Height(0.0, STANDING - 0.005),), ease=(0.7, 0.7)
+    )
+
 
 STEP: Final = 0.01
 """Time between samples of a path [s]: 4 cm at 4 m/s, a hundredth of a stride."""
@@ -82,11 +166,11 @@ def wander(
     position, heading = np.empty((len(time), 2)), np.empty(len(time))
     here, angle, turn = starts[start], rng.uniform(-np.pi, np.pi), 0.0
     actions = draw_actions(time, speed, crowd.actions, rng)
-    speed, steady = steadied(time, speed, actions)
+    speed, steady = steady_speed(time, speed, actions)
     for i in range(len(time)):
         position[i], heading[i] = here, angle
         own = speed[i] * np.array([np.cos(angle), np.sin(angle)])
-        velocity = own if steady[i] else own + _shove(here - place[:, i])
+        velocity = own if steady[i] else own + _shove_velocity(here - place[:, i])
         speed[i] = np.linalg.norm(velocity)
         wish = (
             whim[i]
@@ -103,7 +187,7 @@ def wander(
     return GroundPath(time, position, heading, speed, actions)
 
 
-def _shove(apart: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shove_velocity(apart: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the velocity (2,) [m/s] of a person in contact with bodies (others, 2) [m] away."""
     gap = np.linalg.norm(apart, axis=-1, keepdims=True)
     push = SHOVE * np.clip(1.0 - gap / BODY_WIDTH, 0.0, 1.0)
@@ -115,7 +199,7 @@ def _slow_wave(
     time: NDArray[np.float64], periods: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return the sum of two sines of different period [s], within -1 and 1."""
-    first = rng.uniform(*periods)
+    first = rng.uniform(periods[0], periods[1])
     angle = 2.0 * np.pi * (time[:, None] / (first, 0.6 * first) + rng.random(2))
     wave: NDArray[np.float64] = np.sin(angle) @ np.array([0.65, 0.35])
     return wave
@@ -150,3 +234,63 @@ def _turn_aside(
     # On an exact collision course, pass on one side rather than meet undecided.
     away = np.where(nearest @ leftward > 0.0, -1.0, 1.0)
     return float(2.0 * TURN_RATE * (urgency * away).sum())
+
+
+STANDING_SPEED: Final = 0.25
+"""Slower people stand [m/s]."""
+MIN_REST: Final = 1.6
+"""Minimum duration of a rest with actions [s]."""
+MAX_ACTION_TIMES: Final = (3.0, 6.0)
+"""Range of the maximum duration of an action [s]."""
+ALERT: Final = 35.0
+"""Distance of the ball from the goal at which a goalkeeper gets ready [m]."""
+
+
+def stand_about(path: GroundPath, rates: ActionRates, rng: np.random.Generator) -> GroundPath:
+    """Return the path with actions while the person stands: shift weight, look, hands on hips."""
+    motions = (shift_weight, look_around, hands_on_hips)
+    actions = list(path.actions)
+    for begin, end in _rest_intervals(path):
+        while end - begin > MIN_REST:
+            duration = min(end - begin, rng.uniform(MAX_ACTION_TIMES[0], MAX_ACTION_TIMES[1]))
+            kind, left = rng.choice(len(motions), p=(0.5, 0.3, 0.2)), bool(rng.random() < 0.5)
+            if rng.random() < rates.standing_about:
+                actions.append(Action(begin, motions[kind](duration), left))
+            begin += duration
+    return replace(path, actions=_sort_actions(actions))
+
+
+def keep_ready(path: GroundPath, goal: Floats, ball: Floats) -> GroundPath:
+    """Return a goalkeeper's path, with readiness during rests while the ball is near.
+
+    Args:
+        path: of the goalkeeper.
+        goal: (2,) [m].
+        ball: (samples, 2) [m], at the path's times.
+    """
+    near = np.linalg.norm(ball - goal, axis=-1) < ALERT
+    actions = list(path.actions)
+    for begin, end in _rest_intervals(path, near):
+        if end - begin > MIN_REST:
+            actions.append(Action(begin, ready(end - begin)))
+    return replace(path, actions=_sort_actions(actions))
+
+
+def _rest_intervals(
+    path: GroundPath, also: NDArray[np.bool_] | None = None
+) -> list[tuple[float, float]]:
+    """Return start and end [s] of intervals in which a person stands without other actions."""
+    still = path.speed < STANDING_SPEED
+    turning = np.abs(np.gradient(path.heading, path.time))
+    still &= turning < 0.5 * STANDING_SPEED
+    if also is not None:
+        still &= also
+    for action in path.actions:
+        still &= (path.time < action.begin) | (path.time > action.end)
+    edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(float(path.time[a]), float(path.time[b])) for a, b in zip(begins, ends, strict=True)]
+
+
+def _sort_actions(actions: list[Action]) -> tuple[Action, ...]:
+    return tuple(sorted(actions, key=lambda action: action.begin))

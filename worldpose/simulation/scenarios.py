@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from worldpose.simulation.looks import RenderingSettings
-from worldpose.simulation.noise import ObservationNoise
 from worldpose.simulation.settings import (
     BroadcastSettings,
     CalibrationErrors,
     ClickSettings,
     CrowdSettings,
+    ObservationNoise,
+    RenderingSettings,
     RigSettings,
     Scenario,
     Seat,
@@ -110,7 +110,7 @@ SCENARIOS: Final = {
         _TINY,
         _variant(
             "tiny-broadcast",
-            "The same, and key frames clicked in the broadcast camera's video.",
+            "tiny, with key frames clicked in the broadcast camera's video.",
             _TINY,
             key_frames=4,
         ),
@@ -130,8 +130,8 @@ SCENARIOS: Final = {
         ),
         Scenario(
             name="crossing",
-            about="12 people run through each other on 9 x 9 m, half of them shoulder to shoulder: "
-            "who is who when they come apart.",
+            about="12 people run through each other on 9 x 9 m, half of them shoulder to shoulder; "
+            "their identities are ambiguous when they separate.",
             duration=4.0,
             fps=50.0,
             crowd=CrowdSettings(
@@ -146,7 +146,7 @@ SCENARIOS: Final = {
         ),
         Scenario(
             name="corner-kick",
-            about="18 players jostle before a goal, as at a corner kick: most hide each other.",
+            about="18 players jostle before a goal, as at a corner kick; most occlude each other.",
             duration=4.0,
             fps=50.0,
             crowd=CrowdSettings(

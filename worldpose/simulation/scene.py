@@ -14,26 +14,25 @@ from worldpose.body import BodyParameters
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.broadcast import film
+from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
 from worldpose.simulation.bvh import Clip
-from worldpose.simulation.calibrating import misjudge
-from worldpose.simulation.clicking import Clicks, click, every
+from worldpose.simulation.cameras import move_broadcast_camera, place_camera
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.detecting import (
+from worldpose.simulation.detector_errors import (
+    MAX_FALSE_POSITIVES,
     Detections,
-    Habits,
+    Report,
+    SystematicErrors,
     detect,
-    draw_habits,
+    draw_false_positives,
+    draw_systematic_errors,
     perceived_bias,
+    report,
 )
-from worldpose.simulation.false_positives import PHANTOMS, draw_false_positives
-from worldpose.simulation.occlusion import Bodies, Sight, see
+from worldpose.simulation.occlusion import Bodies, Projections, project_bodies
 from worldpose.simulation.paths import GroundPath
-from worldpose.simulation.processes import bursts
-from worldpose.simulation.reporting import Report, report
+from worldpose.simulation.random_processes import bursts
 from worldpose.simulation.settings import Scenario
-from worldpose.simulation.stadium import place_camera
-from worldpose.simulation.surveying import survey
 
 Seed = np.random.SeedSequence
 
@@ -132,14 +131,14 @@ class _World:
     scenario: Scenario
     crowd: Crowd
     pitch: PitchTemplate
-    habits: Habits
+    systematic: SystematicErrors
     own_bias: NDArray[np.float64]
 
     def bodies(self, times: NDArray[np.float64]) -> Bodies:
         joints, noise = self.crowd.joints(times), self.scenario.noise
         bias = None
         if noise.shared_bias > 0.0 or noise.own_bias > 0.0:
-            bias = perceived_bias(joints, self.habits, noise, self.own_bias)
+            bias = perceived_bias(joints, self.systematic, noise, self.own_bias)
         return Bodies(joints, self.crowd.heights, bias)
 
 
@@ -164,16 +163,16 @@ def simulate_scene(
         driven: paths of the people, instead of the scenario's movement.
         clip: motion capture for one of them.
     """
-    people_seed, rig_seed, habit_seed, broadcast_seed, error_seed, survey_seed, click_seed = Seed(
-        seed
-    ).spawn(7)
+    people_seed, rig_seed, systematic_seed, broadcast_seed, error_seed, survey_seed, click_seed = (
+        Seed(seed).spawn(7)
+    )
     pitch = PitchTemplate.from_spec(scenario.pitch)
     crowd = gather(scenario, pitch, people_seed, driven, clip)
     persons = len(crowd.paths)
-    common, own = habit_seed.spawn(2)
+    common, own = systematic_seed.spawn(2)
     own_bias = np.array([_rng(each).standard_normal((17, 3)) for each in own.spawn(persons)])
-    habits = draw_habits(_rng(common))
-    world = _World(scenario, crowd, pitch, habits, own_bias.reshape(persons, 17, 3))
+    systematic = draw_systematic_errors(_rng(common))
+    world = _World(scenario, crowd, pitch, systematic, own_bias.reshape(persons, 17, 3))
     times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
     bodies = world.bodies(times)
     x, y = scenario.crowd.area_center
@@ -189,10 +188,12 @@ def simulate_scene(
         name = f"cam{index:02d}"
         place, clock, *errors, hand = camera_seed.spawn(7)
         camera = place_camera(scenario.rig, index, target, scenario.pitch, _rng(place))
-        late = scenario.rig.clock_spread * float(_rng(clock).standard_normal())
-        seen_bodies = bodies if late == 0.0 else world.bodies(times + late / scenario.fps)
-        sight = see(camera, seen_bodies)
-        views += sight.seen
+        clock_offset = scenario.rig.clock_spread * float(_rng(clock).standard_normal())
+        seen_bodies = (
+            bodies if clock_offset == 0.0 else world.bodies(times + clock_offset / scenario.fps)
+        )
+        projections = project_bodies(camera, seen_bodies)
+        views += projections.seen
         clicks[name] = click(
             camera,
             pitch,
@@ -202,22 +203,24 @@ def simulate_scene(
             mistaken=every(scenario.clicks.wrong, index, from_wrong),
             rng=_rng(hand),
         )
-        cameras[name], clocks[name] = camera, late
-        reports[name] = _reported(world, camera, sight, errors)
+        cameras[name], clocks[name] = camera, clock_offset
+        reports[name] = _report_detections(world, camera, projections, errors)
     broadcast = None
     if scenario.broadcast is not None:
         place, *errors = broadcast_seed.spawn(5)
         size = scenario.rig.image_size
-        broadcast = film(
+        broadcast = move_broadcast_camera(
             scenario.broadcast, times, crowd.action, crowd.action_times, size, _rng(place)
         )
-        reports[clip_id] = _reported(world, broadcast, see(broadcast, bodies), errors)
+        reports[clip_id] = _report_detections(
+            world, broadcast, project_bodies(broadcast, bodies), errors
+        )
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
         crowd=crowd,
         poses=crowd.poses(times),
         cameras=cameras,
-        given=misjudge(cameras, scenario.calibration, _rng(error_seed)),
+        given=add_calibration_errors(cameras, scenario.calibration, _rng(error_seed)),
         broadcast=broadcast,
         observations={name: each.observations for name, each in reports.items()},
         identities={name: _identities(each, persons) for name, each in reports.items()},
@@ -227,15 +230,19 @@ def simulate_scene(
     )
 
 
-def _reported(world: _World, camera: Camera, sight: Sight, seeds: list[Seed]) -> Report:
+def _report_detections(
+    world: _World, camera: Camera, projections: Projections, seeds: list[Seed]
+) -> Report:
     """Return a camera's detections, false positives included; `seeds` are four."""
-    order, deception, errors, loss = seeds
+    order, false_seed, errors, loss = seeds
     scenario, noise = world.scenario, world.scenario.noise
-    frames, persons = sight.size.shape
-    real = detect(sight, noise, world.habits, scenario.fps, _rngs(errors.spawn(persons)))
-    figures, *figure_errors = deception.spawn(1 + PHANTOMS)
-    deceit = see(camera, draw_false_positives(scenario, world.pitch, frames, _rng(figures)))
-    false = detect(deceit, noise, world.habits, scenario.fps, _rngs(figure_errors))
+    frames, persons = projections.size.shape
+    real = detect(projections, noise, world.systematic, scenario.fps, _rngs(errors.spawn(persons)))
+    figures, *figure_errors = false_seed.spawn(1 + MAX_FALSE_POSITIVES)
+    projected = project_bodies(
+        camera, draw_false_positives(scenario, world.pitch, frames, _rng(figures))
+    )
+    false = detect(projected, noise, world.systematic, scenario.fps, _rngs(figure_errors))
     merged = np.where(false.merged_into >= 0, false.merged_into + persons, -1)
     together = Detections(
         np.concatenate([real.keypoints, false.keypoints], axis=1),
@@ -244,8 +251,8 @@ def _reported(world: _World, camera: Camera, sight: Sight, seeds: list[Seed]) ->
         np.concatenate([real.merged_into, merged], axis=1),
     )
     dropped = bursts(noise.dropped_frames, noise.dropped_time, (frames,), scenario.fps, _rng(loss))
-    size = np.concatenate([sight.size, deceit.size], axis=1)
-    return report(0, together, size, dropped, _rng(order))
+    size = np.concatenate([projections.size, projected.size], axis=1)
+    return report(together, size, dropped, _rng(order))
 
 
 def _identities(given: Report, persons: int) -> Identities:

@@ -1,14 +1,206 @@
-"""Surroundings of the pitch in an image: advertising boards, a track, stands with a crowd."""
+"""Colours of a stadium's surfaces: grass, painted markings, boards, a track, stands with a crowd.
+
+A pixel is cast back to the surface that it sees. The painted share of a pixel of the crowned pitch
+follows from the distance to each marking over the pixel's footprint there: exact for straight
+edges.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Floats
+from data_contracts.pitch import ArcSpec
 from worldpose.compiled import compiled
-from worldpose.simulation.turf import surface_hit
+from worldpose.pitch import PitchTemplate
+
+LINE_WIDTH: Final = 0.12
+"""Width of the painted markings, centred on the template's line [m] (Law 1)."""
+SPOT_RADIUS: Final = 0.11
+"""Radius of the painted centre and penalty marks [m]."""
+_SPOTS: Final = ("center_mark", "penalty_mark_left", "penalty_mark_right")
+_STRIPE: Final = 5.5
+"""Width of a mown stripe: a third of the penalty area's depth [m]."""
+
+_LINE, _ARC, _SPOT = 0.0, 1.0, 2.0
+_HALF = 0.5 * LINE_WIDTH
+
+
+def paint_rows(pitch: PitchTemplate) -> Floats:
+    """Return the painted markings, a row (8,) each for `paint_cover`.
+
+    Kind, then for a line x y of its start, its direction, length, and both ends' heights above the
+    crown; for an arc center x y, radius, start angle, span, height; for a spot x y, radius, and
+    height last but one, as for an arc [m, rad].
+    """
+
+    def above(name: str) -> tuple[float, float, float]:
+        x, y, z = (float(value) for value in pitch.points[name])
+        return x, y, z - float(pitch.height(x, y))
+
+    rows: list[tuple[float, ...]] = []
+    for line in pitch.lines.values():
+        (x0, y0, h0), (x1, y1, h1) = above(line.start), above(line.end)
+        length = math.hypot(x1 - x0, y1 - y0)
+        rows.append((_LINE, x0, y0, (x1 - x0) / length, (y1 - y0) / length, length, h0, h1))
+    rows += [_arc_row(arc, above(arc.center)) for arc in pitch.arcs.values()]
+    for name in _SPOTS:
+        x, y, h = above(name)
+        rows.append((_SPOT, x, y, SPOT_RADIUS, 0.0, 0.0, h, 0.0))
+    return np.array(rows, dtype=np.float64)
+
+
+def _arc_row(arc: ArcSpec, center: tuple[float, float, float]) -> tuple[float, ...]:
+    x, y, h = center
+    return (_ARC, x, y, arc.radius, arc.start_angle, arc.end_angle - arc.start_angle, h, 0.0)
+
+
+@compiled
+def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> float:
+    """Return the steps (dx, dy, dz) from `o` to the surface z = -bend y^2; inf if none."""
+    a = bend * dy * dy
+    b = dz + 2.0 * bend * o[1] * dy
+    c = o[2] + bend * o[1] * o[1]
+    root = b * b - 4.0 * a * c
+    if root < 0.0:
+        return np.inf
+    below = -b + np.sqrt(root)
+    return 2.0 * c / below if below > 0.0 else np.inf
+
+
+@compiled
+def _below(t: float, wide: float, narrow: float) -> float:
+    """Return the share of a pixel below t, in the middle of widths |du|, |dv| of a ramp."""
+    sum_half, diff_half = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
+    if t <= -sum_half:
+        return 0.0
+    if t >= sum_half:
+        return 1.0
+    if abs(t) <= diff_half:
+        return 0.5 + t / wide
+    rest = sum_half - abs(t)
+    corner = 0.5 * rest * rest / (wide * narrow)
+    return 1.0 - corner if t > 0.0 else corner
+
+
+@compiled
+def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
+    """Return the share of a pixel with low < t < high, where t changes by du and dv per pixel."""
+    a, b = abs(du), abs(dv)
+    wide, narrow = max(a, b, 1e-9), max(min(a, b), 1e-9)
+    return _below(high - t, wide, narrow) - _below(low - t, wide, narrow)
+
+
+@compiled
+def paint_cover(paint: Floats, place: Floats) -> float:
+    """Return the painted share of a pixel.
+
+    Args:
+        paint: (n, 8) of `paint_rows`.
+        place: (8,) x y on the surface, their changes by a pixel to the right and one down, and by
+            a metre of height.
+    """
+    bare = 1.0
+    reach = _HALF + 0.5 * (abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5]))
+    for row in range(len(paint)):
+        if paint[row, 0] == _LINE:
+            ex, ey, length = paint[row, 3], paint[row, 4], paint[row, 5]
+            x, y = place[0] - paint[row, 1], place[1] - paint[row, 2]
+            if abs(ex * y - ey * x) > reach + 0.2:
+                continue
+            along = min(max((ex * x + ey * y) / length, 0.0), 1.0)
+            height = (1.0 - along) * paint[row, 6] + along * paint[row, 7]
+            x, y = x + height * place[6], y + height * place[7]
+            cover = _share(
+                ex * y - ey * x,
+                ex * place[3] - ey * place[2],
+                ex * place[5] - ey * place[4],
+                -_HALF,
+                _HALF,
+            )
+            if cover > 0.0:
+                cover *= _share(
+                    ex * x + ey * y,
+                    ex * place[2] + ey * place[3],
+                    ex * place[4] + ey * place[5],
+                    -_HALF,
+                    length + _HALF,
+                )
+            bare *= 1.0 - cover
+            continue
+        x = place[0] + paint[row, 6] * place[6] - paint[row, 1]
+        y = place[1] + paint[row, 6] * place[7] - paint[row, 2]
+        radius = x * x + y * y
+        inner = paint[row, 3] - _HALF if paint[row, 0] == _ARC else -1.0
+        outer = paint[row, 3] + _HALF if paint[row, 0] == _ARC else paint[row, 3]
+        if radius > (outer + reach) ** 2 or radius < max(inner - reach, 0.0) ** 2:
+            continue
+        radius = np.sqrt(radius)
+        nx, ny = (x / radius, y / radius) if radius > 1e-9 else (1.0, 0.0)
+        du, dv = nx * place[2] + ny * place[3], nx * place[4] + ny * place[5]
+        cover = _share(radius, du, dv, inner, outer)
+        if cover > 0.0 and paint[row, 0] == _ARC and paint[row, 5] < 2.0 * math.pi - 1e-6:
+            turn = (np.arctan2(y, x) - paint[row, 4]) % (2.0 * math.pi)
+            past = turn - paint[row, 5]
+            if past > 0.5 * (2.0 * math.pi - paint[row, 5]):
+                turn -= 2.0 * math.pi
+            du, dv = nx * place[3] - ny * place[2], nx * place[5] - ny * place[4]
+            cover *= _share(turn * paint[row, 3], du, dv, 0.0, paint[row, 5] * paint[row, 3])
+        bare *= 1.0 - cover
+    return 1.0 - bare
+
+
+@compiled
+def texture(table: Floats, x: float, y: float) -> float:
+    """Return a smooth periodic pattern at (x, y), one cell of the (64, 64) table per unit."""
+    ix, iy = int(np.floor(x)), int(np.floor(y))
+    fx, fy = x - ix, y - iy
+    fx, fy = fx * fx * (3.0 - 2.0 * fx), fy * fy * (3.0 - 2.0 * fy)
+    i0, i1, j0, j1 = ix & 63, (ix + 1) & 63, iy & 63, (iy + 1) & 63
+    top = (1.0 - fx) * table[j0, i0] + fx * table[j0, i1]
+    bottom = (1.0 - fx) * table[j1, i0] + fx * table[j1, i1]
+    return float((1.0 - fy) * top + fy * bottom)
+
+
+@compiled
+def grass(
+    table: Floats, place: Floats, length: float, width: float, stripes: float
+) -> tuple[float, float]:
+    """Return brightness (1 on average) and yellowness of the grass.
+
+    Args:
+        table: (64, 64) of numbers about 0 with spread 1.
+        place: as in `paint_cover`.
+        length: of the pitch [m].
+        width: of the pitch [m].
+        stripes: brightness of a stripe against its neighbour [1].
+    """
+    x, y = place[0], place[1]
+    size = abs(place[2]) + abs(place[3]) + abs(place[4]) + abs(place[5])
+    # A steep triangle wave: 0.15 m of half-turned grass between stripes, or a pixel.
+    phase = ((x + 0.5 * length) / _STRIPE + 0.5) % 2.0
+    ramp = (0.5 - abs(phase - 1.0)) * 2.0 * _STRIPE / max(0.3, size)
+    bright = 1.0 + 0.5 * stripes * min(max(ramp, -1.0), 1.0)
+    broad = texture(table, x / 6.3, y / 6.3)
+    bright += 0.022 * broad + 0.02 * texture(table, x / 1.1 + 17.0, y / 1.1)
+    fine = min(0.12 / size, 1.0)
+    bright += 0.05 * fine * texture(table, x / 0.13, y / 0.13 + 31.0)
+    yellow = 0.5 * broad + texture(table, x / 14.0 + 40.0, y / 9.0)
+    if abs(x) > 0.5 * length + 2.0 or abs(y) > 0.5 * width + 2.0:
+        bright = 0.5 * bright + 0.42
+    return bright, yellow
+
+
+@compiled
+def wear(table: Floats, place: Floats) -> float:
+    """Return the wear of paint at a place: about 0 with spread of about a half."""
+    x, y = place[0], place[1]
+    fine = texture(table, x / 0.9, y / 0.9 + 9.0)
+    return 0.5 * fine + 0.5 * texture(table, x / 4.0, y / 4.0)
+
 
 BOARD_SETBACK: Final = (5.0, 4.0)
 """From the goal lines and from the touch lines [m]."""

@@ -26,7 +26,7 @@ from worldpose.body_fitting.monocular import (
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
-from worldpose.simulation.monocular import MonocularErrors, estimate_bodies
+from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))
 MATRICES = Rigid.from_rotvec(VECTORS, np.zeros(3)).rotation

@@ -5,8 +5,8 @@ import pytest
 
 from worldpose.broadcast_calibration import BroadcastClip, MovingCamera, People, calibrate_broadcast
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.broadcast_rendering import render_broadcast
-from worldpose.simulation.key_frames import click_key_frames
+from worldpose.simulation.annotations import click_key_frames
+from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import ClickSettings

@@ -21,7 +21,7 @@ from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry import Camera
 from worldpose.ingest import MatchAnnotations, write_match
-from worldpose.simulation.broadcast_rendering import render_broadcast
+from worldpose.simulation.renderer import render_broadcast
 from worldpose.store import Store
 from worldpose.video import write_video
 

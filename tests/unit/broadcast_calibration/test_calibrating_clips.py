@@ -23,8 +23,8 @@ from worldpose.broadcast_calibration import (
     moving_from_arrays,
 )
 from worldpose.errors import InputError
-from worldpose.simulation.broadcast_rendering import render_broadcast
-from worldpose.simulation.rendering import RenderingSettings
+from worldpose.simulation.renderer import render_broadcast
+from worldpose.simulation.settings import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
 LOOK = RenderingSettings(light="floodlights", stand_shadow=0.0)

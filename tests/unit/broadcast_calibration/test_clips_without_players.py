@@ -12,7 +12,7 @@ from worldpose.broadcast_calibration import (
     broadcast_attributes,
     calibrate_broadcast,
 )
-from worldpose.simulation.broadcast_rendering import render_broadcast
+from worldpose.simulation.renderer import render_broadcast
 
 FRAMES = 6
 

@@ -8,8 +8,8 @@ from worldpose.broadcast_calibration.shots import find_shots, grass_and_people
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.broadcast_rendering import render_broadcast
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
+from worldpose.simulation.renderer import render_broadcast
 from worldpose.video import VideoReader, index_frames, write_video
 from worldpose.video.cutting import cut_video
 
@@ -19,7 +19,7 @@ FPS = 10.0
 
 def filmed(center, aims, focal):
     """Pictures of an empty pitch from a tripod."""
-    poses = [looking(np.array(center), np.array([*aim, 0.0]), 0.0) for aim in aims]
+    poses = [look_at(np.array(center), np.array([*aim, 0.0]), 0.0) for aim in aims]
     count = len(poses)
     cameras = Camera(
         focal=np.full((count, 2), focal),

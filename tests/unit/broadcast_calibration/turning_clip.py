@@ -10,7 +10,7 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 
 PITCH = PitchTemplate.standard()
 SIZE = (960, 540)
@@ -23,7 +23,7 @@ def moving(frames=40, pan=(-3.0, 4.0), zoom=(1900.0, 2100.0), size=SIZE):
     aims = pan[0] + (pan[1] - pan[0]) * share
     focal = zoom[0] + (zoom[1] - zoom[0]) * share
     grown = focal / 2100.0
-    poses = [looking(CENTER, np.array([x, -2.0, 0.0]), 0.002) for x in aims]
+    poses = [look_at(CENTER, np.array([x, -2.0, 0.0]), 0.002) for x in aims]
     return MovingCamera(
         center=CENTER,
         principal_point=np.array([0.5 * size[0] - 2.0, 0.5 * size[1] - 14.0]),

@@ -4,7 +4,7 @@ import pytest
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.geometry import Camera, Rigid
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 from worldpose.static_calibration import PARAMETERS, stepped
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -13,7 +13,7 @@ def rig(count, rng):
     """Cameras around the origin, 50 m away."""
     angles = 2.0 * np.pi * np.arange(count) / count + 0.3
     centers = np.stack([50.0 * np.cos(angles), 50.0 * np.sin(angles), np.full(count, 15.0)], axis=1)
-    poses = [looking(center, np.array([0.0, 0.0, 1.0]), 0.01) for center in centers]
+    poses = [look_at(center, np.array([0.0, 0.0, 1.0]), 0.01) for center in centers]
     return Camera(
         focal=np.repeat(rng.uniform(1800.0, 2400.0, (count, 1)), 2, axis=1),
         principal_point=np.array([959.5, 539.5]) + rng.normal(0.0, 5.0, (count, 2)),

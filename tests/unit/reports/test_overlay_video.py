@@ -9,13 +9,13 @@ from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.overlay_video import overlay_frames
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 
 SIZE = (322, 182)
 
 
 def camera(frames, focal=600.0):
-    pose = looking(np.array([0.0, -60.0, 20.0]), np.array([0.0, 0.0, 0.0]), 0.0)
+    pose = look_at(np.array([0.0, -60.0, 20.0]), np.array([0.0, 0.0, 0.0]), 0.0)
     one = Camera(
         focal=np.array([focal, focal]),
         principal_point=np.array([160.5, 90.5]),

@@ -17,9 +17,14 @@ from worldpose.simulation.foreign import (
     simulate_foreign_scene,
 )
 from worldpose.simulation.foreign import rigs as foreign_rigs
-from worldpose.simulation.foreign.detectors import defined_joints, detect_people, draw_detector
-from worldpose.simulation.foreign.profiles import PROFILES, DetectorProfile
-from worldpose.simulation.foreign.visibility import view_people
+from worldpose.simulation.foreign.detectors import (
+    PROFILES,
+    DetectorProfile,
+    defined_joints,
+    detect_people,
+    draw_detector,
+)
+from worldpose.simulation.foreign.rigs import view_people
 
 SOURCES = Path(foreign_rigs.__file__).parent
 LAB, MIXED = FOREIGN_SCENARIOS["foreign-lab"], FOREIGN_SCENARIOS["foreign-mixed"]

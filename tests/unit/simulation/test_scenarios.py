@@ -4,7 +4,13 @@ import pytest
 from worldpose.geometry import Camera, Rigid
 from worldpose.ingest import read_match, read_unit
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, ObservationNoise, simulate_match, simulate_scene
+from worldpose.simulation import (
+    SCENARIOS,
+    MatchOptions,
+    ObservationNoise,
+    simulate_match,
+    simulate_scene,
+)
 from worldpose.simulation.settings import ActionRates, CrowdSettings
 
 SHORT = 0.4
@@ -32,7 +38,9 @@ def moving(folder):
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_scenario_makes_a_match(name, tmp_path):
     scenario = short(name)
-    spec = simulate_match(scenario, 2, tmp_path / name, duration=SHORT, cameras=4, stills=False)
+    spec = simulate_match(
+        scenario, 2, tmp_path / name, MatchOptions(duration=SHORT, cameras=4, stills=False)
+    )
     read = read_match(tmp_path / name)
     assert read.spec == spec
     frames = round(SHORT * scenario.fps)
@@ -83,7 +91,7 @@ def test_one_in_five_cameras_of_the_match_has_one_wrong_click(seed):
 def test_the_same_seed_gives_the_same_bytes_with_everything_switched_on(tmp_path):
     contents = []
     for name in ("a", "b"):
-        simulate_match(short("hard"), 3, tmp_path / name, cameras=3, stills=False)
+        simulate_match(short("hard"), 3, tmp_path / name, MatchOptions(cameras=3, stills=False))
         contents.append(
             {
                 path.relative_to(tmp_path / name).as_posix(): path.read_bytes()
@@ -106,7 +114,7 @@ def test_the_match_has_two_teams_officials_and_16_cameras(match):
 
 def test_the_moving_camera_is_written_as_it_filmed(tmp_path):
     scenario = short("broadcast-zoom", noise=ObservationNoise.none())
-    simulate_match(scenario, 1, tmp_path / "m", cameras=1, stills=False)
+    simulate_match(scenario, 1, tmp_path / "m", MatchOptions(cameras=1, stills=False))
     scene = simulate_scene(
         scenario.model_copy(update={"rig": scenario.rig.model_copy(update={"cameras": 1})}), 1
     )
@@ -176,7 +184,7 @@ def test_the_hard_match_is_hard_in_every_way(hard):
 
 
 def test_nothing_of_the_truth_is_where_the_factory_looks(tmp_path):
-    simulate_match(short("hard"), 1, tmp_path / "m", cameras=3, stills=False)
+    simulate_match(short("hard"), 1, tmp_path / "m", MatchOptions(cameras=3, stills=False))
     for file in (tmp_path / "m" / "detections").iterdir():
         with np.load(file) as content:
             assert set(content) == {"frame", "keypoints", "confidence", "boxes", "score"}

@@ -49,7 +49,7 @@ def test_the_trial_starts_where_the_papers_does_and_true_cameras_show_what_can_b
         true.append(reconstructed(scene, exact, scenario.fps))
         plain.append(reconstructed(scene, from_clicks(scene), scenario.fps))
     # The paper has 83.5 / 70.8 mm from its base calibration; the detector's own part, left with
-    # true cameras, is pinned at 62 to 72 mm (docs/explanation/synthetic.md).
+    # true cameras, is pinned at 62 to 72 mm (docs/explanation/simulation.md).
     assert 62.0 < mean(each.g_mpjpe_mm for each in true) < 72.0
     assert 54.0 < mean(each.pa_mpjpe_mm for each in true) < 66.0
     assert 80.0 < mean(each.g_mpjpe_mm for each in plain) < 90.0

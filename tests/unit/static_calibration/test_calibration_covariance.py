@@ -7,12 +7,11 @@ from scipy.stats import chi2
 
 from data_contracts.pitch import PitchSpec
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.clicking import click
-from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.annotations import click, survey
+from worldpose.simulation.cameras import place_camera
+from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.settings import ClickSettings
-from worldpose.simulation.stadium import place_camera
-from worldpose.simulation.surveying import survey
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 
 SPREAD_OUT = ClickSettings()

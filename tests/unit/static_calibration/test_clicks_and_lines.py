@@ -4,7 +4,7 @@ import clicking_people as people
 import numpy as np
 import pytest
 
-from worldpose.simulation.rendering import render_pitch
+from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 
 PITCH, SIZE = people.PITCH, people.SIZE

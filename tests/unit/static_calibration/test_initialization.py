@@ -8,7 +8,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.initialization import (
     camera_from_homography,
@@ -26,7 +26,7 @@ def pinhole(focal=2100.0, center=(10.0, -60.0, 22.0), aim=(15.0, 0.0, 0.0), roll
         focal=np.array([focal, focal]),
         principal_point=MIDDLE,
         distortion=np.zeros(5),
-        cam_from_world=looking(np.array(center), np.array(aim), roll),
+        cam_from_world=look_at(np.array(center), np.array(aim), roll),
         image_size=np.array(SIZE),
     )
 

@@ -10,8 +10,9 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.rendering import RenderingSettings, render_pitch
-from worldpose.simulation.stadium import looking
+from worldpose.simulation.cameras import look_at
+from worldpose.simulation.renderer import render_pitch
+from worldpose.simulation.settings import RenderingSettings
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.line_samples import (
@@ -35,7 +36,7 @@ def camera(aim=(-33.0, -2.0, 0.0), focal=1000.0):
         focal=np.array([focal, focal]),
         principal_point=np.array([482.0, 268.0]),
         distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0]),
-        cam_from_world=looking(np.array([-24.0, -60.0, 22.0]), np.array(aim), 0.005),
+        cam_from_world=look_at(np.array([-24.0, -60.0, 22.0]), np.array(aim), 0.005),
         image_size=np.array([960, 540]),
     )
 
@@ -245,7 +246,7 @@ def test_samples_near_other_markings_and_the_goal_are_left_out():
     # From behind the goal the crossbar crosses the goal area's front in the picture only.
     view = replace(
         camera(),
-        cam_from_world=looking(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),
+        cam_from_world=look_at(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),
     )
     samples = sample_markings(PITCH, 0.2)
     seen = project_lines(view, samples, 0.12, 0.0, 0.0)

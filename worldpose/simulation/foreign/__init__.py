@@ -5,10 +5,13 @@ Outputs: a match folder with its ground truth. Nothing here is shared with the f
 motion, no noise, no camera placement; estimators are measured on it and never tuned on it.
 """
 
-from worldpose.simulation.foreign.matches import simulate_foreign_match
+from worldpose.simulation.foreign.matches import (
+    ForeignScene,
+    simulate_foreign_match,
+    simulate_foreign_scene,
+)
 from worldpose.simulation.foreign.recordings import Recordings, read_recordings
 from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS, ForeignScenario
-from worldpose.simulation.foreign.scenes import ForeignScene, simulate_foreign_scene
 
 __all__ = [
     "FOREIGN_SCENARIOS",

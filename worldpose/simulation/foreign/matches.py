@@ -1,20 +1,370 @@
-"""Match folders of the second simulator, with their ground truth."""
+"""Matches of the second simulator: people, rig, detections, user inputs, and match folders."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
+from data_contracts.arrays import Floats
+from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
+from data_contracts.static_calibration import ClickedMarkings
 from worldpose.formats import JointTracks, write_archive, write_joints, write_static_camera
 from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
-from worldpose.simulation.foreign.recordings import read_recordings
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation.foreign.detectors import (
+    PROFILES,
+    Report,
+    defined_joints,
+    detect_people,
+    draw_detector,
+)
+from worldpose.simulation.foreign.gait import draw_gestures, draw_manner, walk_posture
+from worldpose.simulation.foreign.recordings import (
+    Recordings,
+    Tracking,
+    play_motion,
+    read_recordings,
+)
+from worldpose.simulation.foreign.rigs import (
+    Layout,
+    Pitch,
+    RigCamera,
+    click_points,
+    draw_pitch,
+    draw_rig,
+    measure_camera,
+    view_people,
+    visible_points,
+)
 from worldpose.simulation.foreign.scenarios import ForeignScenario
-from worldpose.simulation.foreign.scenes import ForeignScene, simulate_foreign_scene
+from worldpose.simulation.foreign.skeletons import (
+    STATURE,
+    Ground,
+    Kind,
+    Skeleton,
+    draw_skeleton,
+    place_joints,
+)
+from worldpose.simulation.foreign.trajectories import LEAD, Role, Trajectory, follow_tracks, wander
+
+MOTION_RATE: Final = 100.0
+"""Minimum rate of the motion's computation [1/s], a multiple of the frame rate."""
+REPLAYED: Final = 0.3
+"""Share of people who replay motion capture if there is any [1]."""
+TRACKED: Final = 0.75
+"""Share of matches on a pitch whose people follow tracking data if there is any [1]."""
+_OFFSETS: Final = ((0, 1), (0, 1), (-40, 41), (0, 90000))
+"""Ranges of a camera's frame number at the match's first frame, one of which is drawn [frame]."""
+ENOUGH_POINTS: Final = 6
+"""Minimum number of named points in the image of a camera to be calibrated from clicks [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One person: bones, and joints over time.
+
+    Attributes:
+        skeleton: the bones.
+        joints: (samples, 17, 3) [m], world, at `ForeignScene.times`.
+        motion: its origin.
+    """
+
+    skeleton: Skeleton
+    joints: Floats
+    motion: str
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignScene:
+    """A match of the second simulator in memory.
+
+    Attributes:
+        fps: frame rate [1/s].
+        truth: anatomical joints; `views` counts the cameras that see the joint.
+        defined: joints as the detector defines them.
+        people: bones, motion and joints of each person.
+        cameras: by id.
+        given: cameras of calibration.toml, by id; empty if they are to be clicked.
+        clicked: by id of a camera without calibration.
+        misnamed: by camera, by wrong name, the name of the point under it.
+        reports: detections, by camera.
+        offsets: of the cameras' frame numbers, as stated [frame].
+        clock_offsets: clock offset of a camera's exposure, by id [frame].
+        pitch: None in a hall.
+        record: all other drawn values, for world.json.
+    """
+
+    fps: float
+    truth: JointTracks
+    defined: Floats
+    people: tuple[Person, ...]
+    cameras: dict[str, RigCamera]
+    given: dict[str, CameraCalibration]
+    clicked: dict[str, ClickedMarkings]
+    misnamed: dict[str, dict[str, str]]
+    reports: dict[str, Report]
+    offsets: dict[str, int]
+    clock_offsets: dict[str, float]
+    pitch: Pitch | None
+    record: dict[str, Any]
+
+
+def simulate_foreign_scene(
+    scenario: ForeignScenario,
+    seed: int,
+    *,
+    duration: float | None = None,
+    cameras: int | None = None,
+    people: int | None = None,
+    recordings: Recordings | None = None,
+    calibrated: bool = False,
+) -> ForeignScene:
+    """Return a match of the second simulator; the same arguments give the same numbers.
+
+    Args:
+        scenario: ranges.
+        seed: from 0.
+        duration: [s], instead of the scenario's.
+        cameras: number of them, instead of the scenario's.
+        people: number of them, instead of the scenario's.
+        recordings: motion capture and tracking data to replay; None = all motion is computed.
+        calibrated: return the exact cameras.
+    """
+    streams = np.random.SeedSequence([seed, *scenario.name.encode()]).spawn(6)
+    rng = np.random.default_rng(streams[0])
+    on_pitch = bool(rng.random() < scenario.pitch)
+    pitch = draw_pitch(rng) if on_pitch else None
+    given = bool(rng.random() < scenario.given) or not on_pitch or calibrated
+    fps = float(rng.choice(scenario.rates))
+    count = int(rng.integers(scenario.people[0], scenario.people[1] + 1))
+    mounted = int(rng.integers(scenario.cameras[0], scenario.cameras[1] + 1))
+    unsynchronised = bool(rng.random() < scenario.unsynchronised)
+    drawn = scenario.layouts[rng.integers(len(scenario.layouts))]
+    layout: Layout = drawn if on_pitch else "hall"
+    side = rng.uniform(*scenario.hall, 2)
+    part = rng.uniform(*scenario.area, 2)
+    count, mounted = people or count, cameras or mounted
+
+    frames = round((duration or scenario.duration) * fps)
+    multiple = int(np.ceil(MOTION_RATE / fps))
+    step = 1.0 / (fps * multiple)
+    lead = round(LEAD / step)
+    ticks = np.arange((frames - 1) * multiple + 1 + 2 * lead) - lead
+    times = np.asarray(ticks * step, dtype=np.float64)
+    if pitch is None:
+        center, size, painted = np.zeros(2), side, None
+    else:
+        painted = PitchTemplate.from_spec(pitch.painted)
+        field = np.array([pitch.painted.length, pitch.painted.width])
+        size = part * field
+        center = 0.5 * (1.0 - part) * field * rng.uniform(-1.0, 1.0, 2)
+    ground: Ground = _flat_ground if painted is None else painted.height
+    persons = _draw_people(
+        scenario, count, times, _Space(center, size, pitch, ground), recordings, streams[1]
+    )
+    on_frames = lead + multiple * np.arange(frames)
+    joints = np.stack([person.joints[on_frames] for person in persons], axis=1)
+
+    # Heads, hips and feet at intervals.
+    action = joints[:: max(1, frames // 15)][:, :, [0, 11, 15]].reshape(-1, 3)
+    rng = np.random.default_rng(streams[2])
+    space = (
+        (pitch.painted.length, pitch.painted.width) if pitch else (float(size[0]), float(size[1]))
+    )
+    rig = draw_rig(mounted, layout, space, action, rng)
+    if painted is not None and not given:
+        rig = _remount_cameras(rig, painted, layout, space, action, rng)
+    named = {f"view{index:02d}": camera for index, camera in enumerate(rig)}
+
+    rng = np.random.default_rng(streams[3])
+    profile = PROFILES[list(PROFILES)[rng.integers(len(PROFILES))]]
+    detector = draw_detector(profile, rng)
+    personal = rng.standard_normal((count, 17, 3))
+    statures = np.array([person.skeleton.stature for person in persons])
+    motion = make_interp_spline(times, np.stack([p.joints for p in persons], axis=1), k=3)
+    reports, clock_offsets, offsets, pillars = {}, {}, {}, {}
+    views = np.zeros(joints.shape[:3], np.int64)
+    for (name, camera), own in zip(named.items(), streams[4].spawn(mounted), strict=True):
+        rng = np.random.default_rng(own)
+        clock_offsets[name] = float(rng.uniform(-0.5, 0.5)) if unsynchronised else 0.0
+        offsets[name] = int(rng.integers(*_OFFSETS[rng.integers(len(_OFFSETS))]))
+        width = float(camera.camera.image_size[0])
+        pillar = None
+        if rng.random() < 0.12:
+            left = rng.uniform(0.0, 0.95) * width
+            pillar = (left, left + rng.uniform(0.02, 0.06) * width)
+            pillars[name] = pillar
+        lost = float(rng.choice([0.0, 0.0, 0.0, 0.01, 0.03]))
+        then = joints
+        if clock_offsets[name]:
+            then = np.asarray(motion(times[on_frames] + clock_offsets[name] / fps))
+        view = view_people(camera, then, statures, pillar)
+        taken = camera.project(defined_joints(then, detector, personal))
+        reports[name] = detect_people(
+            detector, view, taken, camera.camera.image_size, fps, lost, rng
+        )
+        views += view.seen
+
+    rng = np.random.default_rng(streams[5])
+    accuracy = 0.0 if calibrated else float(rng.uniform(0.3, 2.0)) * (0.2 if pitch is None else 1.0)
+    calibrations, clicked, misnamed = {}, {}, {}
+    for name, camera in named.items():
+        if given:
+            found = measure_camera(camera.camera, accuracy, rng)
+            calibrations[name] = found.to_calibration(name)
+        elif painted is not None:
+            clicked[name], misnamed[name] = click_points(camera, painted, rng)
+    record = {
+        "scenario": scenario.name,
+        "layout": layout,
+        "pitch": None if pitch is None else pitch.how,
+        "calibration": f"given, accuracy {accuracy:.2f}" if given else "clicked",
+        "detector": detector.profile.model_dump(mode="json"),
+        "definition_m": detector.definition.round(5).tolist(),
+        "people": [{"motion": person.motion, **person.skeleton.record()} for person in persons],
+        "cameras": {
+            name: {
+                "lens": camera.lens,
+                "mounting": camera.mounting,
+                "beyond": list(camera.beyond),
+                "pillar": pillars.get(name),
+            }
+            for name, camera in named.items()
+        },
+    }
+    truth = JointTracks(np.arange(frames), np.arange(count), joints, views=views)
+    return ForeignScene(
+        fps=fps,
+        truth=truth,
+        defined=defined_joints(joints, detector, personal),
+        people=tuple(persons),
+        cameras=named,
+        given=calibrations,
+        clicked=clicked,
+        misnamed=misnamed,
+        reports=reports,
+        offsets=offsets,
+        clock_offsets=clock_offsets,
+        pitch=pitch,
+        record=record,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Space:
+    """Where people move.
+
+    Attributes:
+        center: (2,) of their area [m].
+        size: (2,) of their area [m].
+        pitch: None in a hall.
+        ground: height of the ground.
+    """
+
+    center: Floats
+    size: Floats
+    pitch: Pitch | None
+    ground: Ground
+
+
+def _draw_people(
+    scenario: ForeignScenario,
+    count: int,
+    times: Floats,
+    space: _Space,
+    recordings: Recordings | None,
+    stream: np.random.SeedSequence,
+) -> list[Person]:
+    """Return people with their motion: replayed, tracked, or by social forces."""
+    center, size, pitch, ground = space.center, space.size, space.pitch, space.ground
+    common, *own = stream.spawn(1 + count)
+    rng = np.random.default_rng(common)
+    rngs = [np.random.default_rng(one) for one in own]
+    kinds = cast("list[Kind]", list(STATURE))
+    skeletons = [draw_skeleton(kinds[rng.choice(3, p=scenario.kinds)], one) for one in rngs]
+    known: dict[int, Trajectory] = {}
+    replayed = {}
+    tracking = None if pitch is None else _draw_tracking(recordings, times, rng)
+    if tracking is not None and pitch is not None:
+        players = rng.permutation(len(tracking.players))[:count]
+        scale = np.array([pitch.painted.length / 105.0, pitch.painted.width / 68.0])
+        begin = rng.uniform(0.0, max(tracking.clock[-1] - times[-1] + LEAD, 0.0))
+        clock = tracking.clock - begin
+        for person, player in enumerate(players):
+            source = f"tracking {tracking.name}, player {tracking.players[player]}, {begin:.2f} s"
+            xy = tracking.xy[:, player]
+            known[person] = follow_tracks(times, clock, xy, scale, source)
+    if recordings is not None and recordings.motions:
+        for person in np.flatnonzero(rng.random(count) < REPLAYED).tolist():
+            one = recordings.motions[rng.integers(len(recordings.motions))]
+            place = center + size * rng.uniform(-0.4, 0.4, 2)
+            if person in known:
+                place = known[person].root[len(times) // 2]
+            known[person], replayed[person] = play_motion(
+                one, skeletons[person], times, place, rngs[person]
+            )
+    free = [person for person in range(count) if person not in known]
+    roles: list[Role] = [scenario.roles[rng.integers(len(scenario.roles))] for _ in free]
+    trajectories = wander(times, roles, center, size, list(known.values()), rng)
+    known |= dict(zip(free, trajectories, strict=True))
+    fps = 1.0 / (times[1] - times[0])
+    people = []
+    for person, (skeleton, rng) in enumerate(zip(skeletons, rngs, strict=True)):
+        trajectory, posture = known[person], replayed.get(person)
+        if posture is None:
+            manner = draw_manner(rng)
+            gestures = draw_gestures(scenario.gestures, times[0], times[-1], rng)
+            posture = walk_posture(
+                times, trajectory.root, trajectory.heading, skeleton.leg, manner, gestures, rng
+            )
+        joints = place_joints(skeleton, posture, trajectory.root, trajectory.heading, fps, ground)
+        people.append(Person(skeleton, joints, trajectory.source))
+    return people
+
+
+def _draw_tracking(
+    recordings: Recordings | None, times: Floats, rng: np.random.Generator
+) -> Tracking | None:
+    """Return tracking data long enough for the clip, in most matches if there is any."""
+    if recordings is None:
+        return None
+    needed = times[-1] - LEAD
+    long = [track for track in recordings.tracks if track.clock[-1] >= needed]
+    if not long or rng.random() >= TRACKED:
+        return None
+    return long[rng.integers(len(long))]
+
+
+def _remount_cameras(
+    rig: list[RigCamera],
+    pitch: PitchTemplate,
+    layout: Layout,
+    space: tuple[float, float],
+    action: Floats,
+    rng: np.random.Generator,
+) -> list[RigCamera]:
+    """Return the rig, with new cameras for those that see too few markings."""
+    mounted = []
+    for camera in rig:
+        for _ in range(12):
+            if len(visible_points(camera, pitch)) >= ENOUGH_POINTS:
+                break
+            camera = draw_rig(1, layout, space, action, rng)[0]
+        mounted.append(camera)
+    return mounted
+
+
+def _flat_ground(x: Floats, y: Floats) -> Floats:
+    """Return the ground of a hall."""
+    return np.asarray(0.0 * x + 0.0 * y)
+
 
 CLIP_ID: Final = "clip"
 
@@ -129,7 +479,7 @@ def _write_reference(folder: Path, scene: ForeignScene) -> None:
         _write_json(folder / "pitch.json", scene.pitch.painted.model_dump(mode="json"))
         wrong = {name: {"wrong": each} for name, each in scene.misnamed.items()}
         _write_json(folder / "clicks.json", wrong)
-    _write_json(folder / "clocks.json", scene.late)
+    _write_json(folder / "clocks.json", scene.clock_offsets)
     _write_json(folder / "world.json", scene.record)
 
 

@@ -99,7 +99,7 @@ def read_recordings(folder: Path) -> Recordings:
             str(folder),
             expected="a folder with npz files of motion capture or tracking data",
             found="no folder",
-            todo="Name the folder, or leave --recordings out.",
+            todo="Pass an existing folder, or omit --recordings.",
         )
     motions: list[Motion] = []
     tracks: list[Tracking] = []
@@ -114,7 +114,7 @@ def read_recordings(folder: Path) -> Recordings:
             str(folder),
             expected="npz files with joints, joint_names and fps, or with xy and time or fps",
             found="none",
-            todo="See docs/explanation/synthetic.md for the layouts.",
+            todo="See docs/explanation/simulation.md for the layouts.",
         )
     return Recordings(tuple(motions), tuple(tracks))
 
@@ -145,8 +145,8 @@ def _motion(path: Path, content: dict[str, NDArray[np.generic]]) -> Motion:
     if lacking or joints.shape[1:] != (len(names), 3) or len(joints) < 10 or not fps > 0.0:
         raise InputError(
             str(path),
-            expected="joints (frames, joints, 3) with the joint names of the CMU database",
-            found=f"joints {joints.shape}, without {', '.join(lacking) or 'any lacking'}",
+            expected="joints (frames from 10, joints, 3), names of the CMU database, fps above 0",
+            found=f"joints {joints.shape}, fps {fps:g}, missing: {', '.join(lacking) or 'none'}",
             todo="Rename the joints, or take the file out of the folder.",
         )
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(axis=1) * fps
@@ -207,7 +207,7 @@ def play_motion(
         place: (2,) position of the person in the middle of `times` [m].
         rng: draws part, direction, tempo and side.
     """
-    tempo, mirrored = float(rng.uniform(*TEMPO)), bool(rng.random() < 0.5)
+    tempo, mirrored = float(rng.uniform(TEMPO[0], TEMPO[1])), bool(rng.random() < 0.5)
     length = (motion.frames - 1) / motion.fps
     needed = (times[-1] - times[0] - 2.0 * LEAD) * tempo
     begin = float(rng.uniform(0.0, max(length - needed, 0.0)))

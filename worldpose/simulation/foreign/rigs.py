@@ -1,4 +1,8 @@
-"""Rigs of two to forty cameras: halls and stadiums, mixed resolutions, lenses and mountings."""
+"""Rigs of the second simulator: cameras, visibility of people, and what users state.
+
+Rigs have two to forty cameras in halls and stadiums, with mixed resolutions, lenses and mountings.
+Users state clicks in images, cameras from another calibration, and the pitch.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,12 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.distortion import fold_radius
+from worldpose.pitch import PitchTemplate
 
 Layout = Literal["bowl", "one-side", "low", "goals", "mixed", "hall"]
 
@@ -216,3 +223,292 @@ def _look_at(center: Floats, aim: Floats, roll: float) -> Rigid:
     c, s = np.cos(roll), np.sin(roll)
     rotation = np.stack([c * x + s * y, c * y - s * x, z])
     return Rigid(rotation, -rotation @ center)
+
+
+CAPSULES: Final = (
+    *((5, 12, 0.06), (6, 11, 0.06), (5, 6, 0.04), (11, 12, 0.05)),
+    *((5, 7, 0.028), (6, 8, 0.028), (7, 9, 0.024), (8, 10, 0.024)),
+    *((11, 13, 0.045), (12, 14, 0.045), (13, 15, 0.03), (14, 16, 0.03), (3, 4, 0.055)),
+)
+"""Joint pairs of body parts, and their half widths [stature]."""
+_TRUNK: Final = (5, 6, 11, 12)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """People in one camera's image.
+
+    Attributes:
+        pixels: (frames, persons, 17, 2) [px]; NaN behind the camera.
+        inside: (frames, persons, 17) in the image and not behind a pillar.
+        hider: (frames, persons, 17) int16, the person in front of a joint, -1 for none.
+        behind_self: (frames, persons, 17) behind the person's own trunk.
+        size: (frames, persons) height of a standing person there [px].
+        azimuth, elevation: (frames, persons) direction of the camera, seen from the body [rad]: 0
+            in front, growing to the left; 0 level, growing upwards.
+        scale: (frames, persons) pixels per metre there [px/m].
+    """
+
+    pixels: Floats
+    inside: Flags
+    hider: NDArray[np.int16]
+    behind_self: Flags
+    size: Floats
+    azimuth: Floats
+    elevation: Floats
+    scale: Floats
+
+    @property
+    def seen(self) -> Flags:
+        """Return the joints (frames, persons, 17) in the image that no other person occludes."""
+        return np.asarray(self.inside & (self.hider < 0))
+
+
+def view_people(
+    camera: RigCamera, joints: Floats, statures: Floats, pillar: tuple[float, float] | None
+) -> View:
+    """Return positions of people in the image and their occlusions.
+
+    Args:
+        camera: true camera.
+        joints: (frames, persons, 17, 3) [m], world.
+        statures: (persons,) [m].
+        pillar: left and right border of an occluded strip [px], or None.
+    """
+    pixels = camera.project(joints)
+    inside = camera.sees(pixels)
+    if pillar is not None:
+        with np.errstate(invalid="ignore"):
+            inside &= (pixels[..., 0] < pillar[0]) | (pixels[..., 0] > pillar[1])
+    trunk = joints[:, :, _TRUNK].mean(axis=2)
+    depth = camera.camera.cam_from_world.apply(trunk)[..., 2]
+    scale = float(camera.camera.focal.mean()) / np.where(depth > 0.1, depth, np.nan)
+    away = camera.camera.center - trunk
+    forward, left = facing(joints)
+    level = np.linalg.norm(away[..., :2], axis=-1)
+    return View(
+        pixels=pixels,
+        inside=inside,
+        hider=_find_hiders(pixels, depth, scale * statures),
+        behind_self=_is_behind_trunk(camera, joints, pixels, depth, scale * statures),
+        size=scale * statures,
+        azimuth=np.arctan2((away * left).sum(-1), (away * forward).sum(-1)),
+        elevation=np.arctan2(away[..., 2], level),
+        scale=scale,
+    )
+
+
+def facing(joints: Floats) -> tuple[Floats, Floats]:
+    """Return horizontal unit vectors (..., 3) forward and to the left of bodies (..., 17, 3)."""
+    across = joints[..., 5, :] - joints[..., 6, :] + joints[..., 11, :] - joints[..., 12, :]
+    across = across * [1.0, 1.0, 0.0]
+    left = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    return np.stack([left[..., 1], -left[..., 0], 0.0 * left[..., 0]], axis=-1), left
+
+
+def _find_hiders(pixels: Floats, depth: Floats, size: Floats) -> NDArray[np.int16]:
+    persons = depth.shape[1]
+    hider = np.full(pixels.shape[:3], -1, np.int16)
+    nearest = np.full(pixels.shape[:3], np.inf)
+    low, high = pixels.min(axis=2), pixels.max(axis=2)
+    room = 0.06 * size[..., None]
+    for person in range(persons):
+        with np.errstate(invalid="ignore"):
+            meets = np.all(
+                (high >= low[:, [person]] - room[:, [person]])
+                & (low <= high[:, [person]] + room[:, [person]]),
+                axis=-1,
+            )
+            meets &= depth[:, [person]] < depth - 0.15
+        frame, other = np.nonzero(meets)
+        if not len(frame):
+            continue
+        covered = _is_covered(pixels[frame, other], pixels[frame, person], size[frame, person])
+        before = depth[frame, person][:, None]
+        closer = covered & (before < nearest[frame, other])
+        hider[frame, other] = np.where(closer, person, hider[frame, other])
+        nearest[frame, other] = np.where(closer, before, nearest[frame, other])
+    return hider
+
+
+def _is_covered(points: Floats, body: Floats, size: Floats) -> Flags:
+    """Return which points (rows, joints, 2) a body (rows, 17, 2) of a size (rows,) [px] covers."""
+    covered = np.zeros(points.shape[:2], np.bool_)
+    for one, two, width in CAPSULES:
+        begin, line = body[:, [one]], body[:, [two]] - body[:, [one]]
+        length = np.maximum((line**2).sum(-1), 1e-9)
+        share = np.clip(((points - begin) * line).sum(-1) / length, 0.0, 1.0)
+        away = np.linalg.norm(points - begin - share[..., None] * line, axis=-1)
+        covered |= away < width * size[:, None]
+    return covered
+
+
+def _is_behind_trunk(
+    camera: RigCamera, joints: Floats, pixels: Floats, depth: Floats, size: Floats
+) -> Flags:
+    """Return joints (frames, persons, 17) over half a trunk's depth behind the own trunk."""
+    frames, persons = depth.shape
+    own = camera.camera.cam_from_world.apply(joints.reshape(-1, 3))[:, 2].reshape(pixels.shape[:3])
+    behind = own > depth[..., None] + 0.09
+    flat = pixels.reshape(-1, 17, 2)
+    covered = np.zeros((frames * persons, 17), np.bool_)
+    for one, two, width in CAPSULES[:4]:
+        begin, line = flat[:, [one]], flat[:, [two]] - flat[:, [one]]
+        length = np.maximum((line**2).sum(-1), 1e-9)
+        share = np.clip(((flat - begin) * line).sum(-1) / length, 0.0, 1.0)
+        away = np.linalg.norm(flat - begin - share[..., None] * line, axis=-1)
+        covered |= away < width * size.reshape(-1, 1)
+    return np.asarray(covered.reshape(frames, persons, 17) & behind)
+
+
+PAINTING: Final = 0.015
+"""Error of painted points against the Laws of the Game, standard deviation along each axis [m]."""
+SURVEY: Final = 0.005
+"""Of a surveyed point, along each axis [m]."""
+TAPE: Final = 0.02
+"""Of a length measured by tape [m]."""
+CLICK: Final = (0.3, 1.1)
+"""Spread of one person's clicks in an image of 1920 px, minimum and maximum [px]."""
+CLICK_TAIL: Final = 4.0
+"""Degrees of freedom of clicks (Student's t) [1]."""
+MISNAMED: Final = 0.04
+"""Share of cameras with a click under a wrong name [1]."""
+FEW: Final = 9
+"""If an image shows fewer points, lines and arcs are drawn, too [1]."""
+_CONFUSED: Final = (("left", "right"), ("near", "far"), ("front", "back"))
+_MARGIN: Final = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Pitch:
+    """True and stated positions of a pitch.
+
+    Attributes:
+        painted: with the true position of every named point.
+        stated: pitch.json.
+        how: origin of the statement.
+    """
+
+    painted: PitchSpec
+    stated: PitchSpec
+    how: str
+
+
+def draw_pitch(rng: np.random.Generator) -> Pitch:
+    """Return a pitch of 90 to 120 by 45 to 90 m with a crown of up to 0.4 m."""
+    length, width = float(rng.uniform(90.0, 120.0)), float(rng.uniform(45.0, 90.0))
+    if rng.random() < 0.4:
+        length, width = 105.0, 68.0
+    crown = float(rng.uniform(0.0, 0.4)) * float(rng.random() < 0.8)
+    law = PitchTemplate.from_spec(PitchSpec(length=length, width=width, crown=crown)).points
+    painted = {}
+    for name, place in law.items():
+        off = PAINTING * rng.standard_normal(3) * [1.0, 1.0, 0.2]
+        painted[name] = place + (0.0 if name == "center_mark" else off)
+    for name in [name for name in painted if name.endswith("_top")]:
+        foot = painted[name.replace("_top", "_bottom")]
+        painted[name] = foot + np.array(
+            [0.0, 0.0, law[name][2] - law[name.replace("_top", "_bottom")][2]]
+        )
+    true = PitchSpec(length=length, width=width, crown=crown, points=_to_tuples(painted))
+    if rng.random() < 0.5:
+        surveyed = {n: p + SURVEY * rng.standard_normal(3) for n, p in painted.items()}
+        stated = true.model_copy(update={"points": _to_tuples(surveyed)})
+        return Pitch(true, stated, "survey of all points")
+    taped = PitchSpec(
+        length=round(length + TAPE * rng.standard_normal(), 2),
+        width=round(width + TAPE * rng.standard_normal(), 2),
+        crown=max(0.0, round(crown + 0.03 * rng.standard_normal(), 2)),
+    )
+    return Pitch(true, taped, "length, width and crown by tape")
+
+
+def _to_tuples(places: dict[str, Floats]) -> dict[str, tuple[float, float, float]]:
+    return {name: (float(x), float(y), float(z)) for name, (x, y, z) in places.items()}
+
+
+def visible_points(camera: RigCamera, pitch: PitchTemplate) -> list[str]:
+    """Return the named points of the pitch inside a camera's image."""
+    names = list(pitch.points)
+    pixels = camera.project(pitch.positions(names))
+    inside = _is_inside(camera, pixels)
+    return [name for name, there in zip(names, inside, strict=True) if there]
+
+
+def click_points(
+    camera: RigCamera, pitch: PitchTemplate, rng: np.random.Generator
+) -> tuple[ClickedMarkings, dict[str, str]]:
+    """Return a person's clicks, and by wrong name the name of the point under it.
+
+    Args:
+        camera: the true one.
+        pitch: the painted pitch.
+        rng: this camera's own.
+    """
+    spread = rng.uniform(CLICK[0], CLICK[1]) * np.sqrt(camera.camera.image_size[0] / 1920.0)
+    unit = np.sqrt(CLICK_TAIL / (CLICK_TAIL - 2.0))
+    there = visible_points(camera, pitch)
+    chosen = list(rng.permutation(there)[: int(rng.integers(8, 18))])
+    pixels = camera.project(pitch.positions(chosen)).reshape(-1, 2)
+    pixels = pixels + spread / unit * rng.standard_t(CLICK_TAIL, pixels.shape)
+    names = {name: name for name in chosen}
+    if chosen and rng.random() < MISNAMED:
+        victim = str(rng.choice(chosen))
+        pairs = [*_CONFUSED, *((two, one) for one, two in _CONFUSED)]
+        other = [victim.replace(one, two) for one, two in pairs if one in victim]
+        other = [name for name in other if name in pitch.points and name not in names]
+        if other:
+            names[victim] = str(rng.choice(other))
+    points = tuple(
+        ClickedPoint(name=names[name], xy=_round_click(camera, xy))
+        for name, xy in zip(chosen, pixels, strict=True)
+    )
+    drawn: list[DrawnMarking] = []
+    if len(there) < FEW:
+        for name in pitch.marking_names:
+            course = camera.project(pitch.marking_points(name, 0.3))
+            course = course[_is_inside(camera, course)]
+            if len(course) < 8 or np.ptp(course, axis=0).max() < 80.0:
+                continue
+            rows = np.sort(
+                rng.choice(len(course), min(len(course), int(rng.integers(4, 11))), False)
+            )
+            line = course[rows] + 1.3 * spread / unit * rng.standard_t(CLICK_TAIL, (len(rows), 2))
+            drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(camera, xy) for xy in line)))
+    markings = ClickedMarkings(points=points, drawn=tuple(drawn))
+    return markings, {new: name for name, new in names.items() if new != name}
+
+
+def _is_inside(camera: RigCamera, pixels: Floats) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        inside = (pixels > _MARGIN) & (pixels < camera.camera.image_size - 1.0 - _MARGIN)
+    return np.asarray(inside.all(axis=-1))
+
+
+def _round_click(camera: RigCamera, xy: Floats) -> tuple[float, float]:
+    x, y = np.clip(xy, 0.0, camera.camera.image_size - 1.0)
+    return round(float(x), 1), round(float(y), 1)
+
+
+def measure_camera(camera: Camera, accuracy: float, rng: np.random.Generator) -> Camera:
+    """Return a camera with the errors of another calibration.
+
+    Args:
+        camera: the true one.
+        accuracy: 1 = 0.3 mrad, 2 cm, 0.05 % and a thousandth of k1; in proportion.
+        rng: this camera's own.
+    """
+    turn = accuracy * 3e-4 * rng.standard_normal(3)
+    center = camera.center + accuracy * 0.02 * rng.standard_normal(3)
+    cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    u, _, vt = np.linalg.svd((np.eye(3) + cross) @ camera.cam_from_world.rotation)
+    rotation = u @ vt
+    distortion = camera.distortion.copy()
+    distortion[0] += accuracy * 1e-3 * rng.standard_normal()
+    return Camera(
+        focal=camera.focal * (1.0 + accuracy * 5e-4 * rng.standard_normal()),
+        principal_point=camera.principal_point,
+        distortion=distortion,
+        cam_from_world=Rigid(rotation, -rotation @ center),
+        image_size=camera.image_size,
+    )

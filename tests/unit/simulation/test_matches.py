@@ -1,0 +1,167 @@
+import json
+
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from worldpose.errors import InputError
+from worldpose.formats import read_joints
+from worldpose.geometry import Camera
+from worldpose.ingest import read_calibration, read_match, read_unit
+from worldpose.ingest.footage import read_still
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, MatchOptions, Scenario, simulate_match, simulate_scene
+
+TINY = SCENARIOS["tiny"]
+
+
+def content(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def match(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("matches") / "tiny"
+    simulate_match(TINY, 1, folder, MatchOptions(stills=False))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return simulate_scene(TINY, 1)
+
+
+def test_scenarios_are_found_by_their_name():
+    assert SCENARIOS
+    for name, scenario in SCENARIOS.items():
+        assert isinstance(scenario, Scenario)
+        assert scenario.name == name
+        assert scenario.about
+
+
+def test_the_folder_is_a_match_with_clicks_detections_and_a_surveyed_pitch(match, scene):
+    read = read_match(match)
+    assert read.spec.match_id == "tiny-1"
+    assert read.calibrations == {}
+    assert not (match / "stills").exists()
+    assert read.pitch == scene.surveyed
+    for name, observations in scene.observations.items():
+        people, _ = read_unit(read, name)
+        np.testing.assert_array_equal(people.keypoints, observations.keypoints)
+    assert read.clicked == {name: clicks.markings for name, clicks in scene.clicks.items()}
+
+
+def test_cameras_are_given_exactly_when_asked_for(tmp_path, scene):
+    spec = simulate_match(
+        TINY, 1, tmp_path / "m", MatchOptions(duration=0.4, calibrated=True, stills=False)
+    )
+    assert spec.match_id == "tiny-1-0.4s-calibrated"
+    read = read_match(tmp_path / "m")
+    assert list(read.calibrations) == list(scene.cameras)
+    for name, camera in scene.cameras.items():
+        center = Camera.from_calibration(read.calibrations[name]).center
+        # The calibration file holds all digits of a rotation vector: rounding at 60 m.
+        np.testing.assert_allclose(center, camera.center, atol=1e-9)
+
+
+def test_stills_are_of_the_first_frame_and_the_same_seed_gives_the_same_bytes(tmp_path):
+    rig = TINY.rig.model_copy(update={"image_size": (320, 180), "person_height": 16.0})
+    small = TINY.model_copy(update={"rig": rig})
+    for name, seed in (("a", 1), ("b", 1), ("other", 2)):
+        simulate_match(small, seed, tmp_path / name, MatchOptions(duration=0.4, cameras=2))
+    spec = read_match(tmp_path / "a").spec
+    for camera in spec.static_cameras:
+        assert camera.still == f"stills/{camera.id}.png"
+        picture = read_still(tmp_path / "a" / camera.still, (320, 180))
+        assert picture.std() > 5.0  # not one colour
+    assert spec.camera("broadcast").still is None
+    one, again, other = (content(tmp_path / name) for name in ("a", "b", "other"))
+    assert one == again
+    assert other.keys() == one.keys()
+    for file in ("detections/cam00.npz", "pitch.json", "stills/cam00.png", "match.yaml"):
+        assert other[file] != one[file]
+
+
+def test_the_surveyed_pitch_is_a_centimetre_off_the_painted_one(match):
+    surveyed = PitchTemplate.from_spec(read_match(match).pitch)
+    text = (match / "reference" / "pitch.json").read_text(encoding="utf-8")
+    painted = PitchTemplate.from_spec(PitchSpec.model_validate_json(text))
+    standard = PitchTemplate.standard()
+    off = surveyed.positions(list(painted.points)) - painted.positions(list(painted.points))
+    for name, place in painted.points.items():
+        np.testing.assert_array_equal(place, standard.points[name])
+    # 6 mm an axis; some 110 numbers, known to 7 %.
+    assert off.std() == pytest.approx(0.006, rel=0.25)
+    assert surveyed.crown == painted.crown
+
+
+def test_wrong_clicks_are_where_the_truth_says(match, scene):
+    truth = json.loads((match / "reference" / "clicks.json").read_text(encoding="utf-8"))
+    painted = PitchTemplate.standard()
+    assert list(truth) == list(scene.cameras)
+    found = 0
+    for name, clicks in read_match(match).clicked.items():
+        for point in clicks.points:
+            true_pixel = scene.cameras[name].project(painted.positions([point.name]))[0]
+            far = np.linalg.norm(point.xy - true_pixel)
+            # Honest clicks err by 1 px an axis, wrong ones by 20 px and more.
+            assert (far > 6.0) == (point.name in truth[name]["wrong"])
+            found += point.name in truth[name]["wrong"]
+    assert found in (1, 2)  # one camera in five of six
+
+
+def test_the_truth_is_beside_it(match, scene):
+    truth = read_joints(match / "reference" / "joints.npz")
+    np.testing.assert_array_equal(truth.joints, scene.truth.joints)
+    np.testing.assert_array_equal(truth.views, scene.truth.views)
+    assert truth.person_ids.tolist() == [0, 1, 2, 3, 4]
+    for name, camera in scene.cameras.items():
+        with np.load(match / "reference" / "cameras" / f"{name}.npz") as file:
+            np.testing.assert_array_equal(file["R"][0], camera.cam_from_world.rotation)
+            np.testing.assert_array_equal(file["t"][0], camera.cam_from_world.translation)
+        with np.load(match / "reference" / "identities" / f"{name}.npz") as file:
+            np.testing.assert_array_equal(file["frame"], np.arange(100))
+            np.testing.assert_array_equal(file["person"], scene.identities[name].person)
+            assert file["person"].dtype == np.int16
+
+
+def test_the_true_cameras_are_beside_it_as_toml_too(match, scene):
+    truth = read_calibration(match / "reference" / "calibration.toml")
+    for name, camera in scene.cameras.items():
+        np.testing.assert_allclose(
+            Camera.from_calibration(truth[name]).center, camera.center, atol=1e-9
+        )
+
+
+def test_detections_hold_no_identity(match):
+    with np.load(match / "detections" / "cam00.npz") as file:
+        assert set(file) == {"frame", "keypoints", "confidence", "boxes", "score"}
+
+
+def test_what_differs_from_the_scenario_is_in_the_id(tmp_path):
+    spec = simulate_match(
+        TINY, 3, tmp_path / "m", MatchOptions(duration=0.4, cameras=2, players=1, stills=False)
+    )
+    assert spec.match_id == "tiny-3-0.4s-2cameras-1players"
+    assert [camera.id for camera in spec.static_cameras] == ["cam00", "cam01"]
+    assert spec.clips[0].frame_count == 10
+    assert read_joints(tmp_path / "m" / "reference" / "joints.npz").joints.shape == (10, 1, 17, 3)
+    assert read_match(tmp_path / "m").spec == spec
+
+
+def test_an_empty_pitch_is_a_match(tmp_path):
+    simulate_match(
+        TINY, 0, tmp_path / "m", MatchOptions(duration=0.4, cameras=2, players=0, stills=False)
+    )
+    assert read_joints(tmp_path / "m" / "reference" / "joints.npz").joints.shape == (10, 0, 17, 3)
+
+
+def test_a_folder_with_files_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="left as it was"):
+        simulate_match(TINY, 0, tmp_path, MatchOptions(duration=0.4, cameras=1, players=1))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

@@ -1,0 +1,300 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigid_bones import RIGID_BONES
+
+from worldpose.errors import InputError
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, MatchOptions, read_trajectories, simulate_match
+from worldpose.simulation.bvh import read_bvh
+from worldpose.simulation.crowd import gather
+from worldpose.simulation.gait import walk
+from worldpose.simulation.paths import MARGIN, STEP, GroundPath
+from worldpose.simulation.recordings import NAMES, clip_path, read_clip
+from worldpose.simulation.skeletons import draw_body
+
+CHANNELS = "CHANNELS 3 Zrotation Yrotation Xrotation"
+TREE = {
+    # name: parent, offset from it [cm], y up, facing z, left is x
+    "hip": (None, (0, 0, 0)),
+    "lThigh": ("hip", (9, 0, 0)),
+    "lShin": ("lThigh", (0, -40, 0)),
+    "lFoot": ("lShin", (0, -41, 0)),
+    "rThigh": ("hip", (-9, 0, 0)),
+    "rShin": ("rThigh", (0, -40, 0)),
+    "rFoot": ("rShin", (0, -41, 0)),
+    "neck": ("hip", (0, 50, 0)),
+    "head": ("neck", (0, 15, 0)),
+    "lShldr": ("neck", (18, 0, 0)),
+    "lForeArm": ("lShldr", (0, -28, 0)),
+    "lHand": ("lForeArm", (0, -26, 0)),
+    "rShldr": ("neck", (-18, 0, 0)),
+    "rForeArm": ("rShldr", (0, -28, 0)),
+    "rHand": ("rForeArm", (0, -26, 0)),
+}
+FRAMES = 120
+
+
+def text(scale=1.0):
+    """A person who walks along z, bends knees and elbows, leans and turns; one of `TREE`."""
+
+    def joint(name, depth):
+        parent, offset = TREE[name]
+        pad = "  " * depth
+        kind = "ROOT" if parent is None else "JOINT"
+        channels = (
+            CHANNELS if parent else CHANNELS.replace("3 ", "6 Xposition Yposition Zposition ")
+        )
+        children = [other for other, (above, _) in TREE.items() if above == name]
+        end = "" if children else f"{pad}End Site {{ OFFSET 0 {-scale} 0 }}\n"
+        inner = "".join(joint(child, depth + 1) for child in children)
+        place = " ".join(str(scale * value) for value in offset)
+        opened = f"{pad}{kind} {name}\n{pad}{{\n{pad}OFFSET {place}\n{pad}{channels}\n"
+        return f"{opened}{inner}{end}{pad}}}\n"
+
+    order = []
+
+    def visit(name):
+        order.append(name)
+        for child, (above, _) in TREE.items():
+            if above == name:
+                visit(child)
+
+    visit("hip")
+    time = np.arange(FRAMES) / 60.0
+    rows = np.zeros((FRAMES, 3 + 3 * len(order)))
+    rows[:, 1] = scale * (85.0 - 3.0 * np.sin(3.0 * time) ** 2)
+    rows[:, 2] = scale * 120.0 * time
+
+    def turn(name, axis, degrees):
+        rows[:, 3 + 3 * order.index(name) + "ZYX".index(axis)] = degrees
+
+    turn("hip", "Y", 20.0 * time)
+    turn("lThigh", "X", -30.0 * np.sin(5.0 * time))
+    turn("lShin", "X", 40.0 * np.sin(5.0 * time) ** 2)
+    turn("rThigh", "X", 30.0 * np.sin(5.0 * time))
+    turn("rShin", "X", 30.0 + 0.0 * time)
+    turn("neck", "X", 10.0 * np.cos(time))
+    turn("lShldr", "Z", 30.0 + 20.0 * np.sin(time))
+    turn("lForeArm", "X", -70.0 * np.sin(4.0 * time) ** 2)
+    turn("rForeArm", "Y", 15.0 * time)
+    motion = "\n".join(" ".join(f"{value:.9f}" for value in row) for row in rows)
+    head = f"MOTION\nFrames: {FRAMES}\nFrame Time: {1 / 60:.12f}\n"
+    return "HIERARCHY\n" + joint("hip", 0) + head + motion + "\n"
+
+
+def stood(heading=0.0, x=0.0, y=0.0):
+    time = np.arange(round((4.0 + 2 * MARGIN) / STEP) + 1) * STEP - MARGIN
+    return GroundPath(
+        time, np.tile([x, y], (len(time), 1)), np.full(len(time), heading), np.zeros(len(time))
+    )
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "walk.bvh"
+    path.write_text(text())
+    return path
+
+
+def same_build():
+    """A body with the skeleton's own lengths [m]."""
+    body = draw_body((1.8, 1.8), np.random.default_rng(0))
+    lengths = {"thigh": 0.40, "shank": 0.41, "upper_arm": 0.28, "forearm": 0.26, "trunk": 0.50}
+    return replace(body, **lengths, hip_half_width=0.09, shoulder_half_width=0.18)
+
+
+def test_a_played_clip_is_the_files_forward_kinematics(file):
+    capture, clip, body = read_bvh(file), read_clip(file), same_build()
+    path = clip_path(clip, stood(), body)
+    times = np.arange(60) / 60.0
+    joints = walk(body, path, times, lambda x, y: 0.0 * x, np.random.default_rng(0))
+    order = [spelling for spellings in NAMES.values() for spelling in spellings[:1]][:12]
+    expected = capture.positions[:60, [capture.names.index(name) for name in order]]
+    # y up, facing z, in centimetres, becomes z up, facing x, in metres.
+    expected = 0.01 * expected[..., [2, 0, 1]]
+    shift = joints[:, 5:] - expected
+    # One shift for all: the start is at the origin and the floor at the ground; nine decimals of
+    # degrees and centimetres over a chain of a metre.
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-8)
+    np.testing.assert_allclose(shift[0, 0, :2], 0.0, atol=1e-8)
+    lowest = read_bvh(file).positions[:, [capture.names.index("lFoot")], 1].min()
+    assert joints[:, 15:, 2].min() == pytest.approx(0.08, abs=0.02), lowest
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.393701, 10.0, 0.177165])
+def test_units_are_told_by_the_length_of_legs(scale, file, tmp_path):
+    (tmp_path / "other.bvh").write_text(text(scale))
+    # Inches and the CMU unit are given here to six digits.
+    np.testing.assert_allclose(
+        read_clip(tmp_path / "other.bvh").points, read_clip(file).points, atol=1e-4
+    )
+
+
+def test_other_people_keep_their_bones_and_the_clips_directions(file):
+    body = draw_body((1.7, 1.7), np.random.default_rng(3))
+    clip = read_clip(file)
+    path = clip_path(clip, stood(heading=1.2, x=7.0, y=-3.0), body)
+    times = np.arange(0.0, 3.5, 0.01)
+    joints = walk(body, path, times, lambda x, y: 0.0 * x + 0.2, np.random.default_rng(0))
+    for a, b in RIGID_BONES:
+        assert np.ptp(np.linalg.norm(joints[:, a] - joints[:, b], axis=-1)) < 1e-12
+    middle = joints[:, 11:13].mean(axis=1)
+    np.testing.assert_allclose(middle[0, :2], [7.0, -3.0], atol=1e-9)
+    ahead = middle[100, :2] - middle[0, :2]
+    # 1.2 m in a second with the clip's legs of 0.81 m; he turns a little on the way.
+    assert ahead @ [np.cos(1.2), np.sin(1.2)] == pytest.approx(1.2 * body.leg / 0.81, rel=0.01)
+    shin = joints[30, 15] - joints[30, 13]
+    clip_shin = path.clip.points[18, 10] - path.clip.points[18, 8]
+    np.testing.assert_allclose(
+        shin / np.linalg.norm(shin), clip_shin / np.linalg.norm(clip_shin), atol=1e-9
+    )
+
+
+def test_after_the_clip_the_person_stands_without_a_jump(file):
+    body = draw_body((1.8, 1.8), np.random.default_rng(1))
+    path = clip_path(read_clip(file), stood(), body)
+    times = np.arange(0.0, 4.0, 0.01)
+    joints = walk(body, path, times, lambda x, y: 0.0 * x, np.random.default_rng(0))
+    assert np.ptp(joints[250:, 5:], axis=0).max() < 1e-9
+    # From the clip's last pose to standing within half a second: a metre at most.
+    assert np.abs(np.diff(joints, axis=0)).max() < 0.05
+
+
+def test_joints_in_an_npz_are_played_too(file, tmp_path):
+    capture = read_bvh(file)
+    np.savez(
+        tmp_path / "clip.npz",
+        joints=capture.positions,
+        joint_names=np.array(capture.names),
+        fps=60.0,
+    )
+    clip = read_clip(tmp_path / "clip.npz")
+    np.testing.assert_allclose(clip.points, read_clip(file).points, atol=1e-12)
+    np.savez(tmp_path / "bad.npz", joints=capture.positions)
+    with pytest.raises(InputError, match="fps"):
+        read_clip(tmp_path / "bad.npz")
+
+
+def test_a_joint_that_is_missing_is_named(tmp_path):
+    (tmp_path / "clip.bvh").write_text(text().replace("lForeArm", "elbow"))
+    with pytest.raises(InputError, match="left elbow"):
+        read_clip(tmp_path / "clip.bvh")
+
+
+def test_one_person_of_a_crowd_plays_the_clip(file):
+    scenario = SCENARIOS["tiny"].model_copy(update={"duration": 1.0})
+    pitch = PitchTemplate.from_spec(scenario.pitch)
+    crowds = [
+        gather(scenario, pitch, np.random.SeedSequence(1), clip=clip)
+        for clip in (None, read_clip(file))
+    ]
+    assert [path.clip is not None for path in crowds[1].paths] == [False, False, True, False, False]
+    for person in (0, 1, 3, 4):
+        np.testing.assert_array_equal(
+            crowds[0].paths[person].position, crowds[1].paths[person].position
+        )
+    actors = [crowd.paths[2] for crowd in crowds]
+    begin = [[np.interp(0.0, path.time, axis) for axis in path.position.T] for path in actors]
+    # The path of a clip is smoothed over 0.05 s, in which 2 cm are gone.
+    np.testing.assert_allclose(begin[0], begin[1], atol=0.05)
+
+
+TIME = np.arange(0.0, 6.0, 0.1)
+
+
+def tracked(path, **changes):
+    """Somebody who runs along x at 4 m/s, and somebody who stands."""
+    runner = np.stack([4.0 * TIME - 10.0, 0.0 * TIME + 5.0], axis=-1)
+    keeper = np.tile([-50.0, 1.0], (len(TIME), 1))
+    content = {"xy": np.stack([runner, keeper], axis=1), "time": TIME + 100.0, **changes}
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+    return path
+
+
+def test_paths_follow_the_data(tmp_path):
+    (runner, keeper), length = read_trajectories(tracked(tmp_path / "t.npz"), 60.0)
+    assert length == pytest.approx(5.9, abs=1e-9)
+    assert runner.time[0] == pytest.approx(-MARGIN)
+    assert runner.time[-1] == pytest.approx(length + MARGIN, abs=0.01)
+    inner = (runner.time >= 0.5) & (runner.time <= 5.4)
+    # Smoothing leaves a straight run as it is; its ends are coasted half a second further in.
+    np.testing.assert_allclose(
+        runner.position[inner],
+        np.stack([4 * runner.time - 10, 0 * runner.time + 5], -1)[inner],
+        atol=1e-3,
+    )
+    np.testing.assert_allclose(runner.speed[inner], 4.0, atol=0.01)
+    np.testing.assert_allclose(runner.heading, 0.0, atol=1e-9)
+    np.testing.assert_allclose(keeper.position, np.tile([-50.0, 1.0], (len(keeper.time), 1)))
+    assert keeper.speed.max() < 1e-9
+
+
+def test_people_come_to_a_stop_before_and_after_the_data(tmp_path):
+    (runner, _), _ = read_trajectories(tracked(tmp_path / "t.npz"), 60.0)
+    assert runner.speed[0] < 0.6
+    assert runner.speed[-1] < 0.6
+    assert np.abs(np.diff(runner.speed)).max() / 0.01 < 8.0  # [m/s^2]
+
+
+def test_the_clip_is_no_longer_than_asked_and_people_no_more(tmp_path):
+    paths, length = read_trajectories(tracked(tmp_path / "t.npz"), 2.0, max_people=1)
+    assert length == pytest.approx(2.0, abs=1e-6)
+    assert len(paths) == 1
+
+
+def test_fps_stands_for_time(tmp_path):
+    paths, length = read_trajectories(
+        tracked(tmp_path / "t.npz", time=None, fps=np.array(10.0)), 60.0
+    )
+    assert (len(paths), round(length, 6)) == (2, 5.9)
+
+
+def test_the_longest_stretch_is_used_and_who_is_in_all_of_it(tmp_path):
+    xy = np.load(tracked(tmp_path / "t.npz"))["xy"]
+    xy[40, 1] = np.nan
+    segment = np.where(TIME < 1.95, 1, 2)
+    paths, length = read_trajectories(tracked(tmp_path / "gap.npz", xy=xy, segment=segment), 60.0)
+    assert len(paths) == 1
+    assert length == pytest.approx(3.9, abs=1e-6)
+    start = np.interp(0.0, paths[0].time, paths[0].position[:, 0])
+    assert start == pytest.approx(-2.0, abs=0.3)  # where the runner is after 2 s
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"xy": np.zeros((60, 2))}, "xy of shape"),
+        ({"xy": np.full((60, 2, 2), np.nan)}, "0 people"),
+        ({"time": None}, "neither time nor fps"),
+        ({"time": np.zeros(3)}, r"time \(3,\)"),
+        ({"xy": np.zeros((2, 2, 2)), "time": np.arange(2.0)}, "2 samples"),
+        ({"time": np.zeros(60)}, "1 samples"),
+        ({"xy": np.array([None])}, "allow_pickle"),
+    ],
+)
+def test_unusable_files_are_refused(tmp_path, changes, found):
+    with pytest.raises(InputError, match=found):
+        read_trajectories(tracked(tmp_path / "t.npz", **changes), 60.0)
+
+
+def test_no_file_and_no_npz_are_refused(tmp_path):
+    (tmp_path / "t.npz").write_text("hello")
+    for name in ("t.npz", "absent.npz"):
+        with pytest.raises(InputError):
+            read_trajectories(tmp_path / name, 60.0)
+
+
+def test_a_match_is_driven_by_them_and_its_id_names_the_file(tmp_path):
+    file = tracked(tmp_path / "t.npz")
+    spec = simulate_match(
+        SCENARIOS["match"],
+        1,
+        tmp_path / "m",
+        MatchOptions(duration=0.4, cameras=2, trajectories=file),
+    )
+    assert spec.match_id.startswith("match-1-0.4s-2cameras-tracks")
+    assert spec.clips[0].frame_count == 20
+    with np.load(tmp_path / "m" / "reference" / "joints.npz") as truth:
+        assert truth["joints"].shape == (20, 2, 17, 3)

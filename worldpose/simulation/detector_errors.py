@@ -1,0 +1,441 @@
+"""Simulated results of image-based methods: keypoint detections and monocular bodies.
+
+A camera reports the detections of all people and of false positives with a detector's errors, in
+shuffled order, with boxes and scores. A monocular method estimates bodies in the broadcast images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17, COCO17_SIGMAS
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.records import Record
+from worldpose.body import BodyModel, BodyParameters, load_open_body
+from worldpose.formats import write_archive
+from worldpose.geometry import Camera, Rigid
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation.gait import walk
+from worldpose.simulation.occlusion import Bodies, Projections, facing
+from worldpose.simulation.paths import wander
+from worldpose.simulation.random_processes import bursts, drift
+from worldpose.simulation.settings import CrowdSettings, ObservationNoise, Scenario
+from worldpose.simulation.skeletons import draw_body
+
+DIFFICULTY: Final = np.array(COCO17_SIGMAS) / 0.08
+"""Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
+MIRRORED: Final = np.array(
+    [
+        COCO17.index(name.replace("left", "*").replace("right", "left").replace("*", "right"))
+        for name in COCO17
+    ]
+)
+"""The same joint on the other side."""
+MOSTLY_HIDDEN: Final = 0.7
+"""Share of hidden joints above which a person is mostly hidden."""
+DISPLACED: Final = (4.0, 10.0)
+"""Offset of displaced joints, in standard deviations of their error."""
+_SIDE: Final = np.array([("left" in name) - ("right" in name) for name in COCO17], dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class SystematicErrors:
+    """Systematic errors of one detector.
+
+    Attributes:
+        joint_bias: (17, 3) forward, left, up [standard deviations], a mirror image of itself.
+        view_bias: (17, 2, 2) of the cosine and the sine of twice the azimuth, along the image
+            axes [standard deviations].
+    """
+
+    joint_bias: Floats
+    view_bias: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Detections of every body, in the bodies' order.
+
+    Attributes:
+        keypoints: (frames, persons, 17, 2) [px]; NaN where not found.
+        confidence: (frames, persons, 17); NaN where not found.
+        displaced: (frames, persons, 17), joints with gross errors.
+        merged_into: (frames, persons) int16, the person whose box includes this lost one; -1 =
+            none.
+    """
+
+    keypoints: Floats
+    confidence: Floats
+    displaced: Flags
+    merged_into: NDArray[np.int16]
+
+
+def draw_systematic_errors(rng: np.random.Generator) -> SystematicErrors:
+    """Return a detector, drawn once per match for all cameras and people."""
+    joint_bias = rng.standard_normal((17, 3))
+    for joint, mirror in enumerate(MIRRORED):
+        if _SIDE[joint] < 0.0:
+            joint_bias[joint] = joint_bias[mirror] * [1.0, -1.0, 1.0]
+    joint_bias[_SIDE == 0.0, 1] = 0.0
+    return SystematicErrors(joint_bias, rng.standard_normal((17, 2, 2)))
+
+
+def perceived_bias(
+    joints: Floats, systematic: SystematicErrors, noise: ObservationNoise, own: Floats
+) -> Floats:
+    """Return offsets (frames, persons, 17, 3) [m], world, from joints to the detector's joints.
+
+    Args:
+        joints: (frames, persons, 17, 3) [m], world.
+        systematic: the detector's systematic errors.
+        noise: spreads.
+        own: (persons, 17, 3) person-specific offsets [standard deviations].
+    """
+    front, left = facing(joints)
+    up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
+    offsets = noise.shared_bias * systematic.joint_bias + noise.own_bias * own
+    turned: Floats = offsets @ np.stack([front, left, up], axis=-2)
+    return turned
+
+
+def detect(
+    projections: Projections,
+    noise: ObservationNoise,
+    systematic: SystematicErrors,
+    fps: float,
+    rngs: list[np.random.Generator],
+) -> Detections:
+    """Return a detector's reports.
+
+    Args:
+        projections: true keypoints and occlusions in the image.
+        noise: rates and spreads.
+        systematic: the detector's systematic errors.
+        fps: [1/s].
+        rngs: one per person; one person's draws never change another's errors.
+    """
+    shape = projections.hidden.shape
+    keypoints, confidence = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
+    displaced, merged = np.zeros(shape, dtype=bool), np.full(shape[:2], -1, dtype=np.int16)
+    for person, rng in enumerate(rngs):
+        if np.isfinite(projections.keypoints[:, person]).any():
+            one = _detect_one(projections, person, noise, systematic, fps, rng)
+            keypoints[:, person], confidence[:, person] = one.keypoints, one.confidence
+            displaced[:, person], merged[:, person] = one.displaced, one.merged_into
+    return Detections(keypoints, confidence, displaced, merged)
+
+
+def _detect_one(
+    projections: Projections,
+    person: int,
+    noise: ObservationNoise,
+    systematic: SystematicErrors,
+    fps: float,
+    rng: np.random.Generator,
+) -> Detections:
+    pixels, size = projections.keypoints[:, person], projections.size[:, person]
+    hider = projections.hider[:, person]
+    hidden, frames = hider >= 0, len(pixels)
+    small = size < noise.small
+    spread = size[:, None] * DIFFICULTY
+
+    error = _draw_errors(pixels, spread, noise, fps, rng)
+    error *= (1.0 + noise.hidden_spread * hidden)[..., None]
+    far = np.linalg.norm(error, axis=-1) / size[:, None]
+    doubt = 1.0 + noise.confidence_spread * rng.standard_normal((frames, 17))
+    confidence = np.exp(-noise.confidence_drop * far) * doubt
+    confidence = np.clip(confidence * (1.0 - noise.hidden_doubt * hidden), 0.01, 1.0)
+    twice = 2.0 * projections.azimuth[:, person]
+    waves = np.stack([np.cos(twice), np.sin(twice)], axis=-1)
+    view = np.einsum("fw,jwa->fja", waves, systematic.view_bias)
+    error = error + projections.bias[:, person] + noise.view_bias * spread[..., None] * view
+
+    thrown = rng.random((frames, 17)) < noise.displaced
+    angle = 2.0 * np.pi * rng.random((frames, 17))
+    reach = rng.uniform(DISPLACED[0], DISPLACED[1], (frames, 17))
+    sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor)
+    throw = (reach * sigma)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    keypoints = pixels + error + np.where(thrown[..., None], throw, 0.0)
+
+    stolen = bursts(noise.stolen, noise.stolen_time, (frames, 17), fps, rng) & hidden
+    frame, joint = np.nonzero(stolen)
+    theirs = projections.keypoints[frame, hider[frame, joint], joint]
+    there = np.isfinite(theirs[:, 0])
+    keypoints[frame[there], joint[there]] = theirs[there] + error[frame[there], joint[there]]
+
+    luck = rng.random((frames, 17))
+    lost = luck < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
+    missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time, small, fps, rng)
+    overlapped = hidden.mean(axis=-1) >= MOSTLY_HIDDEN
+    overlapped &= rng.random(frames) < noise.hidden_person_missed
+    merges = overlapped & (rng.random(frames) < noise.merged)
+    lost |= (missed | overlapped)[:, None]
+    outside = np.isnan(pixels[..., 0])
+    lost |= outside | ((~outside).sum(axis=-1) < noise.fewest_joints)[:, None]
+    swapped = _draw_bursts_by_size(noise.swapped, noise.swapped_time, small, fps, rng)
+    for array in (keypoints, lost, confidence, thrown):
+        array[swapped] = array[swapped][:, MIRRORED]
+    keypoints[lost], confidence[lost] = np.nan, np.nan
+    return Detections(
+        keypoints, confidence, thrown & ~lost, np.where(merges, hider.max(axis=-1), -1)
+    )
+
+
+def _draw_errors(
+    pixels: Floats, spread: Floats, noise: ObservationNoise, fps: float, rng: np.random.Generator
+) -> Floats:
+    """Return errors of zero mean (frames, 17, 2) [px]: white, slow and by motion."""
+    white = rng.standard_normal(pixels.shape)
+    slow = drift(pixels.shape, noise.slow_time, fps, rng)
+    along = rng.standard_normal((*spread.shape, 1))
+    error: Floats = np.hypot(noise.white * spread, noise.floor)[..., None] * white
+    error += (noise.slow * spread)[..., None] * slow
+    if len(pixels) > 1 and noise.blur > 0.0:
+        motion = np.gradient(pixels, axis=0) * fps
+        # At the image border the motion is unknown; blur is negligible there.
+        error += noise.blur * np.where(np.isfinite(motion), motion, 0.0) * along
+    return error
+
+
+def _draw_bursts_by_size(
+    share: float, time: float, small: Flags, fps: float, rng: np.random.Generator
+) -> Flags:
+    """Return bursts (frames,); small people have them from two sources."""
+    both = bursts(share, time, (len(small), 2), fps, rng)
+    on: Flags = both[:, 0] | (both[:, 1] & small)
+    return on
+
+
+ROOM: Final = 0.06
+"""Margin of a box around the keypoints, for head, hands and feet [person height]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A camera's detections and their persons.
+
+    Attributes:
+        observations: input of the factory.
+        person: (frames, detections) int16, the body of every detection, -1 for padding.
+        displaced: (frames, detections, 17), joints with gross errors.
+    """
+
+    observations: KeypointDetections
+    person: NDArray[np.int16]
+    displaced: Flags
+
+
+def report(
+    detections: Detections,
+    size: Floats,
+    dropped: Flags,
+    rng: np.random.Generator,
+) -> Report:
+    """Return detections in shuffled order, and the body of each.
+
+    Args:
+        detections: of all bodies, including false positives.
+        size: (frames, bodies) [px]; scales the margins of boxes.
+        dropped: (frames,), frames without any detection.
+        rng: shuffles every frame independently.
+    """
+    found = np.isfinite(detections.confidence).any(-1) & ~dropped[:, None]
+    boxes = _bounding_boxes(detections, size, found)
+    order = np.argsort(np.where(found, rng.random(found.shape), np.inf), axis=1)
+    order = order[:, : int(found.sum(axis=1).max(initial=0))]
+    found = np.take_along_axis(found, order, axis=1)
+    keypoints = np.take_along_axis(detections.keypoints, order[..., None, None], axis=1)
+    confidence = np.take_along_axis(detections.confidence, order[..., None], axis=1)
+    displaced = np.take_along_axis(detections.displaced, order[..., None], axis=1)
+    # Padding has neither box nor score: reports omit detections without keypoints.
+    keypoints[~found], confidence[~found] = np.nan, np.nan
+    boxes = np.take_along_axis(boxes, order[..., None], axis=1)
+    joints = np.maximum(np.isfinite(confidence).sum(-1), 1)
+    score = np.where(found, np.nansum(confidence, axis=-1) / joints, np.nan)
+    observations = KeypointDetections(
+        frame=np.arange(len(found), dtype=np.int64),
+        keypoints=keypoints.astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        boxes=boxes.astype(np.float32),
+        score=score.astype(np.float32),
+    )
+    person = np.where(found, order, -1).astype(np.int16)
+    return Report(observations, person, displaced & found[..., None])
+
+
+def _bounding_boxes(detections: Detections, size: Floats, found: Flags) -> Floats:
+    """Return boxes (frames, bodies, 4) [px]; a merged one includes the lost person's width."""
+    room = ROOM * size[..., None]
+    missing = np.isnan(detections.keypoints)
+    low = np.where(missing, np.inf, detections.keypoints).min(axis=2) - room
+    high = np.where(missing, -np.inf, detections.keypoints).max(axis=2) + room
+    frame, lost = np.nonzero(detections.merged_into >= 0)
+    into = detections.merged_into[frame, lost].astype(np.intp)
+    # Most of the lost person is hidden: half the person's width shows on the far side.
+    half = 0.2 * size[frame, lost]
+    side = np.where(lost % 2 == 0, 1.0, -1.0)
+    low[frame, into, 0] -= np.where(side < 0.0, half, 0.0)
+    high[frame, into, 0] += np.where(side > 0.0, half, 0.0)
+    return np.where(found[..., None], np.concatenate([low, high], axis=-1), np.nan)
+
+
+MAX_FALSE_POSITIVES: Final = 2
+"""Maximum number of false positives at a time in one camera."""
+POSTURES: Final = 12.0
+"""Length of the walk that supplies postures [s]."""
+
+
+def draw_false_positives(
+    scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
+) -> Bodies:
+    """Return still human figures that appear and vanish at random places on and around the area.
+
+    Args:
+        scenario: area and the rates of false positives.
+        pitch: the ground under them.
+        frames: number of frames.
+        rng: this camera's own: false positives of cameras are independent.
+    """
+    noise, crowd = scenario.noise, scenario.crowd
+    share = noise.false_people / MAX_FALSE_POSITIVES
+    shape = (frames, MAX_FALSE_POSITIVES)
+    on = bursts(share, noise.false_people_time, shape, scenario.fps, rng)
+    body = draw_body(crowd.height, rng)
+    # Any moment of a walk serves as a posture; every appearance draws another.
+    path = wander(CrowdSettings(height=crowd.height), POSTURES, (), rng)
+    appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
+    times = rng.uniform(0.0, POSTURES, appeared.shape)
+    joints = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
+    joints = joints.reshape(*appeared.shape, 17, 3)
+    joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
+    place = np.array(crowd.area_center) + np.array(crowd.area_size) * rng.uniform(
+        -1.0, 1.0, (*appeared.shape, 2)
+    )
+    joints[..., :2] += place[:, :, None]
+    joints[..., 2] += pitch.height(place[..., 0], place[..., 1])[..., None]
+    # A figure keeps the posture of its appearance.
+    since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
+    joints = np.take_along_axis(joints, since[..., None, None], axis=0)
+    joints[~on] = np.nan
+    return Bodies(joints, np.full(MAX_FALSE_POSITIVES, body.height))
+
+
+class MonocularErrors(Record):
+    """Errors of such methods; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
+
+    turn: float = Field(default=0.135, ge=0, le=100)
+    """Error of every joint's rotation, standard deviation about each axis [rad]."""
+    facing: float = Field(default=0.2, ge=0, le=100)
+    """Error of the pelvis' rotation, about each axis [rad]."""
+    time: float = Field(default=0.4, gt=0, le=100)
+    """Time constant of the errors' correlation [s]: images hardly change."""
+    white: float = Field(default=0.3, ge=0, le=1)
+    """Share of the errors' variance that is independent per frame [1]."""
+    size: float = Field(default=0.1, ge=0, le=10)
+    """Error of the scale in the crop, relative [1]: children look like adults far away."""
+    place: float = Field(default=0.03, ge=0, le=10)
+    """Error of a box's centre, along each image axis [box side]."""
+    missed: float = Field(default=0.1, ge=0, lt=1)
+    """Share of bodies in the image that are not found [1]."""
+
+
+def estimate_bodies(
+    model: BodyModel,
+    bodies: BodyParameters,
+    camera: Camera,
+    fps: float,
+    errors: MonocularErrors,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[np.generic]]:
+    """Return estimates of a clip's bodies in 4DHumans' format, a row for each found body.
+
+    Arrays: `frame`, `global_orient` (rows, 1, 3, 3) relative to a camera that looks at the crop's
+    middle, `body_pose` (rows, 23, 3, 3), `betas` (rows, shapes) without person-specific shape,
+    `pred_cam` (rows, 3), the crop's weak perspective: scale and offset [1], `box_center` (rows, 2)
+    [px], `box_size` (rows,) [px], `img_size` (rows, 2) [px]. The order of a frame's rows does not
+    identify persons.
+
+    Args:
+        model: the bodies'.
+        bodies: (frames, persons), world; NaN where missing.
+        camera: batch (frames,).
+        fps: [1/s].
+        errors: of the method.
+        rng: draws the same numbers for any people in the image.
+    """
+    frames, persons = bodies.batch_shape
+    given = np.concatenate([bodies.global_orient, bodies.body_pose], axis=-1)
+    turns = Rigid.from_rotvec(given.reshape(frames, persons, -1, 3), np.zeros(3)).rotation
+    slow = drift((frames, persons, *turns.shape[2:3], 3), errors.time, fps, rng)
+    white = rng.standard_normal(slow.shape)
+    off = np.sqrt(1.0 - errors.white) * slow + np.sqrt(errors.white) * white
+    off[:, :, 0] *= errors.facing
+    off[:, :, 1:] *= errors.turn
+    size = 1.0 + errors.size * drift((frames, persons), errors.time, fps, rng)
+    shifted = errors.place * drift((frames, persons, 2), errors.time, fps, rng)
+    missed = rng.random((frames, persons)) < errors.missed
+    order = rng.permuted(np.broadcast_to(np.arange(persons), (frames, persons)), axis=1)
+
+    joints = model.articulate(bodies).joints + bodies.transl[..., None, :]
+    image = camera.project(joints.reshape(frames, -1, 3)).reshape(frames, persons, -1, 2)
+    low, high = image.min(axis=2), image.max(axis=2)
+    side = 1.2 * (high - low).max(axis=-1)
+    center = 0.5 * (low + high) + shifted * side[..., None]
+    inside = (center >= 0.0).all(-1) & (center < camera.image_size[:, None] - 1.0).all(-1)
+    there = inside & ~missed & np.isfinite(side)
+    frame, place = np.nonzero(np.take_along_axis(there, order, axis=1))
+    person = order[frame, place]
+
+    found = turns[frame, person] @ Rigid.from_rotvec(off[frame, person], np.zeros(3)).rotation
+    seen_at = camera[frame].normalize(center[frame, person][:, None])[:, 0]
+    ray = np.concatenate([seen_at, np.ones((len(frame), 1))], axis=-1)
+    to_crop = _rotations_to_front(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+    found[:, 0] = to_crop @ camera.cam_from_world.rotation[frame] @ found[:, 0]
+    # Scale 2 / (1.7 m) is a crop as high as an adult of 1.7 m.
+    scale = 2.0 * size[frame, person] / (1.2 * 1.7)
+    offset = (image[frame, person, 0] - center[frame, person]) / (0.5 * side[frame, person, None])
+    pelvis = model.joint_template[0, :2] * [1.0, -1.0]
+    return {
+        "frame": frame,
+        "global_orient": found[:, :1],
+        "body_pose": found[:, 1:],
+        "betas": np.zeros((len(frame), model.shapes)),
+        "pred_cam": np.concatenate([scale[:, None], offset / scale[:, None] - pelvis], axis=-1),
+        "box_center": center[frame, person],
+        "box_size": side[frame, person],
+        "img_size": camera.image_size[frame],
+    }
+
+
+def write_estimates(
+    path: Path, poses: BodyParameters, camera: Camera, fps: float, seed: int
+) -> None:
+    """Write the results of `estimate_bodies` for a scene's open bodies.
+
+    Args:
+        path: the npz file.
+        poses: (persons, frames), world.
+        camera: batch (frames,).
+        fps: [1/s].
+        seed: of the scene.
+    """
+    given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
+    bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))
+    rng = np.random.default_rng([seed, 5])
+    estimates = estimate_bodies(load_open_body(), bodies, camera, fps, MonocularErrors(), rng)
+    write_archive(path, estimates)
+
+
+def _rotations_to_front(ahead: Floats) -> Floats:
+    """Return the smallest rotations (n, 3, 3) from directions (n, 3) to straight ahead."""
+    across = np.cross(ahead, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, ahead[:, 2:])
+    return Rigid.from_rotvec(across / np.maximum(sine, 1e-12) * angle, np.zeros(3)).rotation
