@@ -50,8 +50,8 @@ def test_the_distance_covered_is_that_of_a_match(speeds):
 def test_time_is_spent_as_in_match_analyses(speeds):
     shares = np.diff([(speeds < limit).mean() for limit in (-1.0, 0.25, 2.0, 4.2, 5.5, 20.0)])
     standing, walking, jogging, running, sprinting = shares
-    # docs/explanation/simulation.md: a sixth standing, two fifths walking, a third jogging, the rest
-    # fast.
+    # docs/explanation/simulation.md: a sixth standing, two fifths walking, a third jogging, the
+    # rest fast.
     assert 0.08 < standing < 0.28
     assert 0.25 < walking < 0.50
     assert 0.20 < jogging < 0.45
@@ -133,8 +133,8 @@ def test_strides_are_as_long_as_people_of_that_speed_make_them(minute):
         speed.append(path.speed[::10])
         rate.append(np.gradient(stride_cycle(path, 0.0), STEP)[::10])
     speed, rate = np.concatenate(speed), np.concatenate(rate)
-    # Published (docs/explanation/simulation.md): a walker of 1.4 m/s makes 1.35 to 1.6 m, runners of
-    # 3 m/s 75 to 95 strides a minute, sprinters at 7 to 9 m/s 1.8 to 2.3 a second.
+    # Published (docs/explanation/simulation.md): a walker of 1.4 m/s makes 1.35 to 1.6 m, runners
+    # of 3 m/s 75 to 95 strides a minute, sprinters at 7 to 9 m/s 1.8 to 2.3 a second.
     for at, shortest, longest in ((1.4, 1.35, 1.6), (3.0, 1.9, 2.4), (6.0, 3.2, 4.0)):
         near = np.abs(speed - at) < 0.1
         assert near.sum() > 20
