@@ -63,7 +63,7 @@ def write(folder: Path, clips: int, frames: int, people: int):
 
 def check(folder: Path):
     """Check the data set."""
-    from flows.results.checking import check as check_data_set
+    from flows.results.dataset import check as check_data_set
 
     report = check_data_set(folder)
     faults = sorted({finding.fault for finding in report.findings})
@@ -72,7 +72,7 @@ def check(folder: Path):
 
 def count(folder: Path):
     """Count the data set."""
-    from flows.results.statistics import count as count_data_set
+    from flows.results.dataset import count as count_data_set
 
     found = count_data_set([folder])
     print(f"  {found.frames} frames, {found.poses} poses, {found.distance_km:.1f} km")

@@ -28,6 +28,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -36,12 +37,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.run import RunRecord
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.registering import find_match
 from flows.results.best_results import joint_tracks
-from flows.review.clock_advice import clock_advice
+from flows.review.advice import clock_advice
+from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
+from flows.stage import Stage
 from worldpose.evaluation import evaluate_joints
 from worldpose.evaluation.matching import joint_distances, match_people
 from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
@@ -68,21 +71,19 @@ def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
     match = find_match(store, str(folder))
     stages = selected_stages(None, None)
     log = RunLog.begin(store, match, stages, {}, "never", iteration)
-    for stage in stages:
-        plan = log.plan(stage)
-        log.blocked += plan.blocked
-        log.reuse(unit for unit in plan.units if unit.published)
-        for unit in plan.units:
-            if unit.published:
-                continue
+
+    def compute(
+        stage: Stage, units: list[PlannedUnit]
+    ) -> Iterator[tuple[PlannedUnit, Exception | None]]:
+        for unit in (each for each in units if not each.published):
             try:
                 task_of(stage).fn(unit.work(store.url, match, log.run_id))
             except Exception as failure:  # the run continues, as on workers
-                log.finished(unit, failure)
+                yield unit, failure
             else:
-                log.finished(unit, None)
-        log.hold(stage)
-    return log.close()
+                yield unit, None
+
+    return log.run_stages(compute)
 
 
 def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:

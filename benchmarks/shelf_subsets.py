@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from shelf import load_scorer
 
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.method import METHOD
-from flows.planning import plan_run
 from flows.registering import register
+from flows.run_plan import plan_run
 from worldpose.errors import WorldposeError
 from worldpose.ingest import import_match
 from worldpose.store import Store

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.method import METHOD
-from flows.planning import PlannedUnit, plan_run
 from flows.registering import register
+from flows.run_plan import PlannedUnit, plan_run
 from flows.stages import refitting
 from worldpose.formats import read_joints, write_archive
 from worldpose.simulation import SCENARIOS

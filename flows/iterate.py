@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from data_contracts.run import RunRecord
-from flows.basis import basis_of
-from flows.gatekeeping import Gatekeeper
+from flows.gates import Gatekeeper
 from flows.method import METHOD
-from flows.outlook import Outlook, look_ahead
-from flows.planning import PlannedUnit
 from flows.progress import reporter
 from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
+from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match, shared_machines
 from flows.stage import Match
@@ -95,19 +93,19 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
             "--iterations",
             expected="the whole method",
             found="--from or --until",
-            todo="Leave these out, or --iterations.",
+            todo="Omit --from and --until, or omit --iterations.",
         )
     while True:
         try:
             return _iterate(store, match, request, most)
         except EditedMeanwhileError:
-            reporter().say("the match was edited meanwhile: its iterations begin again")
+            reporter().say("the match was edited meanwhile: its iterations restart")
             match = open_match(store, match.match_id)
 
 
 def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) -> Iterations:
     passes: list[Iteration] = []
-    ended = "that many were asked for"
+    ended = "that many were requested"
     with shared_machines(store, request) as machines_for:
         for number in range(1, (most or MOST) + 1):
             iteration = _pass(store, match, replace(request, iteration=number), machines_for)
@@ -119,7 +117,7 @@ def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) 
                 ended = f"iteration {number} is no better"
                 break
         if len(passes) > 1 and passes[-1].held_out_error is None:
-            ended = "left-out cameras cannot judge which iteration is better"
+            ended = "held-out cameras cannot tell which iteration is better"
         kept = _best(passes)
         latest = latest_run(store, match.match_id)
         record = kept.record
@@ -135,28 +133,27 @@ def _pass(
     machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
 ) -> Iteration:
     """Return the run that has all results of an iteration, or a new run."""
-    outlook = _outlook(store, match, request)
-    record = _recorded(store, match, outlook)
+    plan = _plan(store, match, request)
+    record = _recorded_run(store, match, plan)
     if record is None:
         reporter().say(f"iteration {request.iteration}")
-        machines = machines_for(outlook.missing)
+        machines = machines_for(plan.missing)
         record = run_match(store, match, replace(machines, iteration=request.iteration))
     return Iteration(request.iteration, record, held_out_error(record))
 
 
-def _outlook(store: Store, match: Match, request: RunRequest) -> Outlook:
+def _plan(store: Store, match: Match, request: RunRequest) -> RunPlan:
     latest = latest_run(store, match.match_id)
     waits = latest is not None and latest.state == "waiting"
     policy = request.gates or (latest.gates if latest is not None and waits else "never")
     gatekeeper = Gatekeeper(store, match, policy)
-    basis = basis_of(store, match, METHOD, request.settings, latest, request.iteration)
-    return look_ahead(gatekeeper, request.settings, METHOD, basis)
+    return plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
 
 
-def _recorded(store: Store, match: Match, outlook: Outlook) -> RunRecord | None:
+def _recorded_run(store: Store, match: Match, plan: RunPlan) -> RunRecord | None:
     """Return the newest run that has all results of an iteration, if any."""
     runs = (store.run(match.match_id, run_id) for run_id in reversed(store.runs(match.match_id)))
-    found = next((run for run in runs if outlook.is_recorded_by(run)), None)
+    found = next((run for run in runs if plan.is_recorded_by(run)), None)
     if found is None:
         return None
     return found.model_copy(update={"executed": (), "reused": tuple(sorted(found.results))})

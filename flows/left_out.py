@@ -51,8 +51,9 @@ def left_out_cameras(
         stage, _, unit = name.partition("/")
         if stage in judging:
             place = (match.match_id, stage, unit, key)
+            load = partial(store.manifest, match.match_id, stage, unit, key)
             try:
-                said = {**match.once(place, partial(store.manifest, *place)).left_out, **said}
+                said = {**match.once(place, load).left_out, **said}
             except StoreError:  # not computed yet, or damaged: then its reader reports it
                 continue
     return {each.id: said[each.id] for each in match.folder.spec.static_cameras if each.id in said}

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from data_contracts.run import RunRecord
-from data_contracts.work import Recipe
 from flows.method import METHOD
-from flows.planning import PlannedUnit, plan_run
 from flows.registering import open_match
+from flows.run_plan import plan_run
 from flows.run_record import latest_run
+from flows.run_status import recorded_differences, recorded_recipe, unit_status
 from flows.settings import Overrides
 from worldpose.errors import InputError
-from worldpose.store import Store, explain_difference, list_pins
+from worldpose.store import Store, list_pins
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class UnitChange:
 
 @dataclass(frozen=True)
 class Explanation:
-    """State of a unit (`unit_state`), its current key, and the reasons."""
+    """State of a unit (`UnitState`), its current key, and the reasons as lines for people."""
 
     unit: str
     state: str
@@ -57,7 +57,7 @@ def find_run(store: Store, name: str) -> RunRecord:
             name,
             expected=f"MATCH/NUMBER or MATCH/NAME, of {', '.join(store.matches()) or '(none)'}",
             found=f"runs {', '.join((*runs, *names))}" if runs else "no run of that match",
-            todo="See worldpose status.",
+            todo="List the runs: worldpose status.",
         )
     return store.run(match_id, run_id)
 
@@ -73,7 +73,8 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
         elif a.results[unit] == b.results[unit]:
             changes.append(UnitChange(unit, "same", (), ()))
         else:
-            reasons = _why_differs(store, a, unit, _recipe(store, b, unit))
+            differences = recorded_differences(store, a, unit, recorded_recipe(store, b, unit))
+            reasons = tuple(str(each) for each in differences)
             old, new = (run.figures.get(unit, {}) for run in (a, b))
             figures = tuple(
                 (name, old[name], new[name])
@@ -82,18 +83,6 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
             )
             changes.append(UnitChange(unit, "changed", reasons, figures))
     return changes
-
-
-def unit_state(unit: PlannedUnit, latest: RunRecord | None) -> str:
-    """Return the state of a unit.
-
-    current: the latest run has the result of the current recipe. ready: the store has it, the
-        latest run has not. stale: the latest run has another. missing: there is none.
-    """
-    theirs = None if latest is None else latest.results.get(unit.name)
-    if unit.published:
-        return "current" if theirs == unit.key else "ready"
-    return "missing" if theirs in (None, unit.key) else "stale"
 
 
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
@@ -120,34 +109,8 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
             found=repr(unit_name),
             todo="Write it as MATCH/STAGE/UNIT.",
         )
-    unit = planned[unit_name]
-    return Explanation(name, unit_state(unit, latest), unit.key, unit_reasons(store, unit, latest))
-
-
-def unit_reasons(store: Store, unit: PlannedUnit, latest: RunRecord | None) -> tuple[str, ...]:
-    """Return the reasons for the state in `unit_state`."""
-    if latest is None or unit.name not in latest.results:
-        return ("no run has computed it",)
-    if latest.results[unit.name] == unit.key:
-        lost = () if unit.published else ("its result was withdrawn or removed",)
-        return (f"run {latest.run_id} has it", *lost)
-    reasons = _why_differs(store, latest, unit.name, unit.recipe)
-    return (f"since run {latest.run_id}:", *reasons)
-
-
-def _why_differs(store: Store, run: RunRecord, unit: str, recipe: Recipe | None) -> tuple[str, ...]:
-    """Return the differences between a recipe and that of a run's result."""
-    before = _recipe(store, run, unit)
-    if before is None or recipe is None:
-        return ("its result was withdrawn or removed, and with it what it was made from",)
-    return tuple(explain_difference(before, recipe))
-
-
-def _recipe(store: Store, run: RunRecord, unit: str) -> Recipe | None:
-    """Return the recipe of a run's result; None if the result was withdrawn or removed."""
-    stage, _, name = unit.partition("/")
-    place = (run.match_id, stage, name, run.results[unit])
-    return store.manifest(*place).recipe if store.has(*place) else None
+    status = unit_status(store, planned[unit_name], latest)
+    return Explanation(name, status.state.value, status.planned.key, status.describe())
 
 
 def _method_order(unit: str) -> tuple[int, str]:

@@ -6,26 +6,39 @@ essential state: after a kill, the next run finds the finished results in the st
 
 from __future__ import annotations
 
+import importlib
 import logging
+import math
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Final
 
-from prefect import flow
+import dask
+from distributed import Client
+from prefect import Task, flow
+from prefect.context import FlowRunContext
+from prefect.futures import as_completed
 from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
-from flows.basis import basis_of
-from flows.fan_out import compute
-from flows.gatekeeping import Gatekeeper, undecided
+from data_contracts.work import Work
+from flows.gates import Gatekeeper, undecided
+from flows.orchestration.cluster_errors import require_workers
 from flows.orchestration.suspension import is_deployed, take_verdict
 from flows.orchestration.time_limits import TimeLimits, seconds_of
-from flows.outlook import look_ahead
 from flows.progress import reporter
 from flows.registering import open_match
+from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, latest_run
-from flows.settings import Overrides, selected_stages
-from flows.stage import Match, Stage
+from flows.settings import selected_stages
+from flows.stage import Stage
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
+
+MOST_TASKS: Final = 200
+"""Tasks per stage; more units share tasks. Prefect needs 0.1 s of CPU time per task."""
+TASKS_EACH: Final = 20
+"""Tasks per worker if units share tasks, so that no worker waits long for the last task [1]."""
 
 
 class IncompleteRunError(WorldposeError):
@@ -77,20 +90,15 @@ def process_match(
         match = open_match(store, match_id)
         if is_deployed():
             latest = latest_run(store, match_id)
-            outlook = look_ahead(
-                Gatekeeper(store, match, policy),
-                settings,
-                stages,
-                basis_of(store, match, stages, settings, latest, iteration),
-            )
-            open_questions = undecided(outlook.waiting)
-            if open_questions and outlook.is_recorded_by(latest):
+            gatekeeper = Gatekeeper(store, match, policy)
+            plan = plan_ahead(gatekeeper, stages, settings, latest, iteration)
+            open_questions = undecided(plan.waiting)
+            if open_questions and plan.is_recorded_by(latest):
                 take_verdict(store, match_id, open_questions)
                 continue
-        with _shown(store, match_id) if is_deployed() else nullcontext():
-            record = _run_stages(
-                store, match, stages, settings, policy, iteration, time_limits or {}
-            )
+        with _status_at_prefect(store, match_id) if is_deployed() else nullcontext():
+            log = RunLog.begin(store, match, stages, settings, policy, iteration)
+            record = _run_stages(log, time_limits or {})
         if record.failed or not (is_deployed() and undecided(record.waiting)):
             break
     if record.state != "complete":
@@ -98,35 +106,112 @@ def process_match(
     return record.run_id
 
 
-def _shown(store: Store, match_id: str) -> AbstractContextManager[None]:
+def _status_at_prefect(store: Store, match_id: str) -> AbstractContextManager[None]:
     from flows.service.artifacts import shown_at_prefect  # only deployments use it
 
     return shown_at_prefect(store, match_id)
 
 
-def _run_stages(
-    store: Store,
-    match: Match,
-    stages: tuple[Stage, ...],
-    settings: Overrides,
-    policy: GatePolicy,
-    iteration: int,
-    time_limits: TimeLimits,
-) -> RunRecord:
-    log = RunLog.begin(store, match, stages, settings, policy, iteration)
-    for stage in stages:
-        plan = log.plan(stage)
-        missing = [unit for unit in plan.units if not unit.published]
-        log.blocked += plan.blocked
-        log.reuse(unit for unit in plan.units if unit.published)
-        reporter().stage_started(
-            stage.name, stage.about, units=len(plan.units), missing=len(missing)
-        )
-        work = [
-            unit.work(store.url, match, log.run_id, seconds_of(stage.name, time_limits))
-            for unit in missing
-        ]
-        for unit, failure in compute(stage, missing, work):
-            log.finished(unit, failure)
-        log.hold(stage)
-    return log.close()
+def _run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
+    """Compute the missing units of a run on Dask workers, and return its record."""
+
+    def compute_missing(
+        stage: Stage, units: list[PlannedUnit]
+    ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+        missing = [unit for unit in units if not unit.published]
+        reporter().stage_started(stage.name, stage.about, units=len(units), missing=len(missing))
+        seconds = seconds_of(stage.name, time_limits)
+        work = [unit.work(log.store.url, log.match, log.run_id, seconds) for unit in missing]
+        yield from compute(stage, missing, work)
+
+    return log.run_stages(compute_missing)
+
+
+def compute(
+    stage: Stage, units: list[PlannedUnit], work: list[Work]
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    """Yield each unit when its task ends, with its exception if it failed.
+
+    Raises:
+        LostWorkersError: the Prefect server or Dask scheduler is gone.
+    """
+    with _placed(stage) if units else nullcontext():
+        if len(units) <= MOST_TASKS:
+            yield from _each_alone(stage, units, work)
+        else:
+            yield from _in_batches(units, work, task_count(len(_workers(_client()))))
+
+
+def task_count(workers: int) -> int:
+    """Return the number of tasks for a stage with more than MOST_TASKS units."""
+    return min(max(1, workers) * TASKS_EACH, MOST_TASKS)
+
+
+def _each_alone(
+    stage: Stage, units: list[PlannedUnit], work: list[Work]
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    task = task_of(stage)
+    submitted = {task.submit(each): unit for unit, each in zip(units, work, strict=True)}
+    for future in as_completed(list(submitted)):
+        try:
+            future.result()
+        except Exception as failure:  # recorded with the run; other units continue
+            require_workers(failure)
+            yield submitted[future], failure
+        else:
+            yield submitted[future], None
+
+
+def _in_batches(
+    units: list[PlannedUnit], work: list[Work], count: int
+) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    from tasks.batch import batch  # imported here, as all tasks are
+
+    size = math.ceil(len(units) / count)
+    submitted = {}
+    for first in range(0, len(units), size):
+        some = units[first : first + size]
+        name = f"{some[0].name} and {len(some) - 1} more"
+        texts = [each.model_dump_json() for each in work[first : first + size]]
+        submitted[batch.submit(name, texts)] = some
+    for future in as_completed(list(submitted)):
+        some = submitted[future]
+        failures: list[Exception | None]
+        try:
+            failures = future.result()
+        except Exception as failure:
+            failures = [failure] * len(some)
+        for unit, each in zip(some, failures, strict=True):
+            if each is not None:
+                require_workers(each)
+            yield unit, each
+
+
+def task_of(stage: Stage) -> Task[..., Any]:
+    """Return the task that computes one unit of a stage: the function of its name in `tasks`."""
+    task: Task[..., Any] = getattr(importlib.import_module(f"tasks.{stage.name}"), stage.name)
+    return task
+
+
+def _placed(stage: Stage) -> AbstractContextManager[Any]:
+    client = _client()
+    return nullcontext() if client is None else on_workers_with(stage.worker_tag, client)
+
+
+def _client() -> Client | None:
+    """Return the flow's client of its Dask scheduler; None if its tasks use no scheduler."""
+    context = FlowRunContext.get()
+    return getattr(context and context.task_runner, "client", None)
+
+
+def _workers(client: Client | None) -> dict[str, Any]:
+    """Return the current workers, by address."""
+    return {} if client is None else dict(client.scheduler_info(n_workers=-1)["workers"])
+
+
+def on_workers_with(tag: str | None, client: Client) -> AbstractContextManager[Any]:
+    """Return a context that sends tasks to workers with a tag, if any: `--resources TAG=1`."""
+    if tag and any(worker["resources"].get(tag) for worker in _workers(client).values()):
+        block: AbstractContextManager[Any] = dask.annotate(resources={tag: 1})
+        return block
+    return nullcontext()

@@ -1,4 +1,4 @@
-"""The method: its stages in the paper's order, and its review gates.
+"""The method: its stages in the paper's order. Its review gates are in `flows.gates`.
 
 See docs/explanation/architecture.md. Only the stages of this tuple exist; the comments mark the
 places of planned ones, with their units and checklist ids.
@@ -6,8 +6,6 @@ places of planned ones, with their units and checklist ids.
 
 from __future__ import annotations
 
-from flows import gates
-from flows.gates import Gate
 from flows.stage import Stage
 from flows.stages import (
     body_fitting,
@@ -43,15 +41,3 @@ METHOD: tuple[Stage, ...] = (
     filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iterate.py)
     # release, evaluation               X1-X3, E1-E6
 )
-
-GATES: tuple[Gate, ...] = (
-    gates.CAMERAS,
-    gates.PEOPLE,
-    gates.CONSISTENCY,
-    gates.IDENTITIES,
-    gates.JOINTS,
-    gates.ADJUSTMENT,
-    gates.ACCEPTANCE,
-    gates.BROADCAST,
-)
-"""Review gates, with `--gates auto` or `always`; each follows the stage that it names."""

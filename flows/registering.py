@@ -47,7 +47,7 @@ def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[M
                 f"{folder}: match.yaml: match_id",
                 expected=f"the videos, detections and pitch that {match_id} was registered with",
                 found=_changes(previous.files, registration.files),
-                todo="Restore the files, or give the changed match an id of its own.",
+                todo="Restore the files, or give the changed match a new id.",
             )
         if previous == registration:
             return match, False
@@ -90,7 +90,7 @@ def find_registration(store: Store, name: str) -> Registration:
             f"match {name}",
             expected=f"a match folder or one of {', '.join(known) or '(none registered)'}",
             found=repr(name),
-            todo="Register it: worldpose ingest FOLDER.",
+            todo="Register the match: worldpose ingest FOLDER.",
         )
     return registration
 

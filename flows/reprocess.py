@@ -1,54 +1,106 @@
-"""Scheduled flow that recomputes all results that edits made stale."""
+"""Recomputation of all results that edits made stale, match by match."""
 
 from __future__ import annotations
 
-from prefect import flow
-from pydantic import JsonValue
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
-from flows.reprocessing import reprocess_matches
-from flows.running import RunRequest
-from worldpose.errors import WorldposeError
+from data_contracts.run import RunRecord
+from flows.iterate import iterate_match
+from flows.progress import reporter
+from flows.run_plan import PlannedUnit
+from flows.run_status import RunStatus, run_status
+from flows.running import RunRequest, run_match, shared_machines
+from worldpose.errors import InternalError, WorldposeError
 from worldpose.store import Store
 
-
-class UnprocessedError(WorldposeError):
-    """Some matches could not be recomputed; the others are current."""
+State = Literal["never run", "current", "stale", "complete", "waiting", "partial", "failed"]
 
 
-@flow(name="reprocess", validate_parameters=False)
-def reprocess(
-    project: str,
-    matches: tuple[str, ...] | list[str] = (),
-    settings: dict[str, dict[str, JsonValue]] | None = None,
+@dataclass(frozen=True)
+class Reprocessed:
+    """Outcome for one match.
+
+    Attributes:
+        match_id: the match.
+        state: never run and current: nothing to do; stale: not run, since only the check was
+            requested; otherwise the new run's state, or failed if there is none.
+        status: what its latest run would recompute; None if that could not be determined.
+        record: record of the current run.
+        problem: why the check failed or no run was recorded.
+    """
+
+    match_id: str
+    state: State
+    status: RunStatus | None = None
+    record: RunRecord | None = None
+    problem: str | None = None
+
+
+def reprocess_matches(
+    store: Store,
+    match_ids: Sequence[str],
+    request: RunRequest,
+    *,
     retry: bool = False,
-    dask: str | None = None,
-    workers: int | None = None,
-    time_limits: dict[str, float] | None = None,
-) -> dict[str, str]:
-    """Run every match of a project with stale results; return each match's state.
+    is_rehearsal: bool = False,
+) -> list[Reprocessed]:
+    """Run every match with stale results, up to the last stage of its latest run.
 
-    Nothing is started if nothing is stale. A match that waits for review is no failure; its run
-    continues when this flow is called again after the verdict.
+    A match is run with the settings, gates and iterations of its latest run. A failure is reported
+    for its match, and does not stop the others.
 
     Args:
-        project: folder or URL of the store.
-        matches: ids of registered matches; none = all.
-        settings: stage to settings that override those of each match's latest run.
+        store: the project.
+        match_ids: registered matches; empty = all.
+        request: further settings for each, and the machines.
         retry: retry failed units, even without an edit.
-        dask: address of a running Dask scheduler; None starts workers on this machine.
-        workers: number of worker processes on this machine; None = one per core.
-        time_limits: stage to the time limit of a unit [min], if not the default.
-
-    Raises:
-        UnprocessedError: some matches failed or are partial; the others are done.
+        is_rehearsal: only determine what would be done.
     """
-    request = RunRequest(settings or {}, dask=dask, workers=workers, time_limits=time_limits or {})
-    found = reprocess_matches(Store.open(project), tuple(matches), request, retry=retry)
-    unprocessed = [
-        f"{each.match_id} is {each.state}" + (f": {each.problem}" if each.problem else "")
-        for each in found
-        if each.state in ("failed", "partial")
-    ]
-    if unprocessed:
-        raise UnprocessedError("; ".join(unprocessed))
-    return {each.match_id: each.state for each in found}
+    with shared_machines(store, request) as machines_for:
+        return [
+            _reprocess(store, match_id, request, machines_for, retry, is_rehearsal)
+            for match_id in match_ids or store.matches()
+        ]
+
+
+def _reprocess(
+    store: Store,
+    match_id: str,
+    request: RunRequest,
+    machines_for: Callable[[Iterable[PlannedUnit]], RunRequest],
+    retry: bool,
+    is_rehearsal: bool,
+) -> Reprocessed:
+    status = None
+    try:
+        status = run_status(store, match_id, request.settings, retry=retry)
+        if status is None:
+            return Reprocessed(match_id, "never run")
+        if not status.is_stale:
+            return Reprocessed(match_id, "current", status, status.latest)
+        if is_rehearsal:
+            return Reprocessed(match_id, "stale", status, status.latest)
+        reporter().say(f"{match_id}: {len(status.to_compute)} units to compute")
+        record = _run(store, status, machines_for(status.to_compute))
+    except Exception as failure:  # any error, so that the other matches continue
+        text = str(failure)
+        if not isinstance(failure, WorldposeError | OSError):
+            text = str(InternalError.wrapping(match_id, failure))
+        reporter().say(f"{match_id} failed: {text}")
+        return Reprocessed(match_id, "failed", status, problem=text)
+    return Reprocessed(match_id, record.state, status, record)
+
+
+def _run(store: Store, status: RunStatus, request: RunRequest) -> RunRecord:
+    latest = status.latest
+    request = replace(
+        request,
+        settings=status.settings,
+        until_stage=status.until_stage,
+        gates=latest.gates,
+    )
+    if latest.iteration == 1:
+        return run_match(store, status.match, request)
+    return iterate_match(store, status.match, request, latest.iteration).record

@@ -1,26 +1,31 @@
-"""Record of a run in progress."""
+"""Run in progress, and the record that it leaves."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Self
 
-from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure, WaitingUnit
-from flows.basis import basis_of
-from flows.gatekeeping import Gatekeeper, passed
+from data_contracts.run import GatePolicy, RunRecord, RunState, UnitFailure
+from flows.gates import GATES, Gatekeeper
 from flows.left_out import left_out_cameras, left_out_warnings
-from flows.method import GATES, METHOD
-from flows.planning import PlannedUnit, StagePlan, plan_stage
+from flows.method import METHOD
 from flows.progress import reporter
 from flows.renames import rename_settings
 from flows.review.edit_conflicts import EditedMeanwhileError
+from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, tracking, triangulation
 from worldpose.store import Store, libraries
+
+ComputeUnits = Callable[
+    [Stage, list[PlannedUnit]], Iterable[tuple[PlannedUnit, BaseException | None]]
+]
+"""Computes those of a stage's planned units that have no result, and yields each unit when it ends,
+with its exception if it failed."""
 
 
 def latest_run(store: Store, match_id: str) -> RunRecord | None:
@@ -36,29 +41,33 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
 
 @dataclass
 class RunLog:
-    """Results that a run has reused, computed and failed to compute so far.
+    """What a run has reused, computed and failed to compute so far.
 
     `close` turns it into the stored record; until then the run counts as unfinished.
+
+    Attributes:
+        plan: the run's plan with its results.
+        gatekeeper: decides which results need review.
+        run_id: the run's number.
+        latest: the match's latest run before this one.
+        started_at: start of the run.
+        started: the same by the monotonic clock [s].
+        executed: units that the run computed, as `stage/unit`.
+        reused: units whose results existed.
+        failed: units that failed.
+        figures: metrics by unit.
+        warnings: warnings by unit.
     """
 
-    store: Store
-    match: Match
-    stages: tuple[Stage, ...]
-    overrides: Overrides
+    plan: RunPlan
+    gatekeeper: Gatekeeper
     run_id: str
     latest: RunRecord | None
-    results: dict[str, str]
-    gatekeeper: Gatekeeper
-    iteration: int = 1
-    before: Mapping[str, str] | None = None
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     started: float = field(default_factory=time.monotonic)
     executed: list[str] = field(default_factory=list)
     reused: list[str] = field(default_factory=list)
     failed: list[UnitFailure] = field(default_factory=list)
-    blocked: list[str] = field(default_factory=list)
-    lacks_cameras: bool = False
-    waiting: list[WaitingUnit] = field(default_factory=list)
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
     warnings: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -78,51 +87,59 @@ class RunLog:
             EditedMeanwhileError: the previous iteration lacks the inputs of this one.
         """
         latest = latest_run(store, match.match_id)
-        basis = basis_of(store, match, stages, overrides, latest, iteration)
-        if basis.before is not None:
-            _require_there(store, match, stages, basis.before)
-        standing = dict(basis.results)
-        run_id = store.reserve_run(match.match_id)
         gatekeeper = Gatekeeper(store, match, gates)
-        log = cls(
-            *(store, match, stages, overrides, run_id, latest, standing, gatekeeper),
-            iteration=basis.iteration,
-            before=basis.before,
-            reused=list(standing),
-        )
-        for stage in METHOD[: METHOD.index(stages[0])]:
-            log.hold(stage)
-        return log
+        plan = RunPlan.begin(gatekeeper, stages, overrides, latest, iteration)
+        if plan.before is not None:
+            _require_inputs(store, match, stages, plan.before)
+        run_id = store.reserve_run(match.match_id)
+        for unit in plan.waiting:
+            reporter().unit_waits(unit.unit, unit.reasons)
+        return cls(plan, gatekeeper, run_id, latest, reused=list(plan.results))
 
     @property
-    def passed(self) -> dict[str, str]:
-        """The results that later stages can use."""
-        return passed(self.results, self.waiting)
+    def store(self) -> Store:
+        """The store of the results."""
+        return self.plan.store
 
-    def plan(self, stage: Stage) -> StagePlan:
-        """Plan a stage, now that those before it have run."""
-        given = (self.store, self.match, stage, self.overrides)
-        plan = plan_stage(*given, self.passed, self.before)
-        self.lacks_cameras = self.lacks_cameras or plan.lacks_cameras
-        return plan
+    @property
+    def match(self) -> Match:
+        """The match as it was when the run began."""
+        return self.plan.match
+
+    @property
+    def results(self) -> dict[str, str]:
+        """`stage/unit` to key of all results of the run so far."""
+        return self.plan.results
+
+    def run_stages(self, compute: ComputeUnits) -> RunRecord:
+        """Plan and compute the stages of the run in order; return its stored record.
+
+        Args:
+            compute: computes the units of a stage that have no result.
+        """
+        for stage in self.plan.stages:
+            units = self.plan.plan_stage(stage)
+            self.reuse(unit for unit in units if unit.published)
+            for unit, failure in compute(stage, units):
+                self.finish_unit(unit, failure)
+            self.hold(stage)
+        return self.close()
 
     def hold(self, stage: Stage) -> None:
         """Hold back results of a finished stage that need review."""
-        held = self.gatekeeper.held(stage.name, self.results)
-        self.waiting += held
-        for unit in held:
+        for unit in self.plan.hold(stage, self.results):
             reporter().unit_waits(unit.unit, unit.reasons)
 
     def reuse(self, units: Iterable[PlannedUnit]) -> None:
         """Take over results that the store already holds."""
         for unit in units:
-            self.results[unit.name] = unit.key
+            self.plan.add_results([unit])
             self.reused.append(unit.name)
 
-    def finished(self, unit: PlannedUnit, failure: BaseException | None) -> None:
+    def finish_unit(self, unit: PlannedUnit, failure: BaseException | None) -> None:
         """Record that a unit's task has ended."""
         if failure is None:
-            self.results[unit.name] = unit.key
+            self.plan.add_results([unit])
             self.executed.append(unit.name)
             recipe = unit.recipe
             manifest = self.store.manifest(recipe.match_id, recipe.stage, recipe.unit, unit.key)
@@ -140,19 +157,20 @@ class RunLog:
 
     def close(self) -> RunRecord:
         """Store the record: the run is then finished, and its review requests are created."""
+        blocked = tuple(sorted(self.plan.blocked))  # without those of stages not asked for
         self._carry_over()
         for name in self.results.keys() - self.figures.keys():
             stage, _, unit = name.partition("/")
             manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
             self.figures[name] = manifest.figures
             self.warnings[name] = manifest.warnings
-        left_out = left_out_cameras(self.store, self.match, METHOD, self.passed)
+        left_out = left_out_cameras(self.store, self.match, METHOD, self.plan.usable_results)
         settings, overrides = self._settings()
         record = RunRecord(
             run_id=self.run_id,
             match_id=self.match.match_id,
             parent=None if self.latest is None else self.latest.run_id,
-            iteration=self.iteration,
+            iteration=self.plan.iteration,
             state=self._state(),
             results=dict(sorted(self.results.items())),
             settings=settings,
@@ -160,9 +178,9 @@ class RunLog:
             executed=tuple(sorted(self.executed)),
             reused=tuple(sorted(self.reused)),
             failed=tuple(sorted(self.failed, key=lambda failure: failure.unit)),
-            blocked=tuple(sorted(self.blocked)),
+            blocked=blocked,
             gates=self.gatekeeper.policy,
-            waiting=tuple(self.waiting),
+            waiting=tuple(self.plan.waiting),
             figures=dict(sorted(self.figures.items())),
             left_out=left_out,
             warnings=(
@@ -175,7 +193,7 @@ class RunLog:
             finished_at=datetime.now(UTC),
             seconds=round(time.monotonic() - self.started, 3),
         )
-        self.gatekeeper.ask(self.run_id, self.waiting, self.results)
+        self.gatekeeper.ask(self.run_id, self.plan.waiting, self.results)
         self.store.finish_run(record)
         return record
 
@@ -189,8 +207,8 @@ class RunLog:
             lines = gate.warnings(self.figures[name]) if gate is not None else ()
             if lines:
                 yield (
-                    f"{name} may be wrong: {'; '.join(lines)}. Look at it on the pages: "
-                    "worldpose run with --gates auto asks for that."
+                    f"{name} may be wrong: {'; '.join(lines)}. Check it on the pages: "
+                    "worldpose run --gates auto requests that."
                 )
 
     def _in_order(self) -> list[str]:
@@ -200,21 +218,21 @@ class RunLog:
 
     def _carry_over(self) -> None:
         """Keep results of later stages that are still current and need no review."""
-        for stage in METHOD[METHOD.index(self.stages[-1]) + 1 :]:
-            plan = self.plan(stage)
-            current = {unit.name: unit for unit in plan.units if unit.published}
+        for stage in METHOD[METHOD.index(self.plan.stages[-1]) + 1 :]:
+            units = self.plan.plan_stage(stage)
+            current = {unit.name: unit for unit in units if unit.published}
             keys = {name: unit.key for name, unit in current.items()}
-            let_pass = passed(keys, self.gatekeeper.held(stage.name, keys))
-            self.reuse(current[name] for name in let_pass)
+            passing = without_waiting(keys, self.gatekeeper.held(stage.name, keys))
+            self.reuse(current[name] for name in passing)
 
     def _settings(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
         """Return all settings and the overrides, by stage; stages that did not run keep theirs."""
-        first = METHOD.index(self.stages[0])
+        first = METHOD.index(self.plan.stages[0])
         settings = {
-            stage.name: settings_of(stage, self.overrides).model_dump(mode="json")
+            stage.name: settings_of(stage, self.plan.overrides).model_dump(mode="json")
             for stage in METHOD
         }
-        overrides = {name: dict(values) for name, values in self.overrides.items()}
+        overrides = {name: dict(values) for name, values in self.plan.overrides.items()}
         if self.latest is not None:
             for stage in METHOD[:first]:
                 if stage.name in self.latest.settings:  # else that run is older than the stage
@@ -228,23 +246,23 @@ class RunLog:
         for stage, figure in ((tracking.STAGE, "people"), (triangulation.STAGE, "joints")):
             clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]
             found = [self.figures.get(clip, {}).get(figure) for clip in clips]
-            if stage in self.stages and found and all(count == 0 for count in found):
+            if stage in self.plan.stages and found and all(count == 0 for count in found):
                 return True
         return False
 
     def _state(self) -> RunState:
         if not self.failed:
-            if self.waiting:
+            if self.plan.waiting:
                 return "waiting"
-            return "partial" if self.lacks_cameras or self._lacks_people() else "complete"
-        asked = [stage.name for stage in self.stages if stage.units(self.match)]
+            return "partial" if self.plan.lacks_cameras or self._lacks_people() else "complete"
+        asked = [stage.name for stage in self.plan.stages if stage.units(self.match)]
         through = [stage.name for stage in METHOD[: METHOD.index(body_fitting.STAGE) + 1]]
         last = next((name for name in reversed(asked) if name in through), asked[-1])
         there = any(name.startswith(f"{last}/") for name in self.results)
         return "partial" if there else "failed"
 
 
-def _require_there(
+def _require_inputs(
     store: Store, match: Match, stages: tuple[Stage, ...], before: Mapping[str, str]
 ) -> None:
     """Refuse an iteration if the previous one has other results than its inputs."""
@@ -262,7 +280,7 @@ def _require_there(
     if lost:
         raise EditedMeanwhileError(
             f"another iteration of {match.match_id}",
-            expected="the results of the one before",
+            expected="the results of the previous iteration",
             found=f"none of {', '.join(lost)}",
-            todo=f"Run: worldpose run {match.match_id} --iterations N.",
+            todo=f"Restart the iterations: worldpose run {match.match_id} --iterations N.",
         )

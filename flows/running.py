@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -13,18 +14,16 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
-from flows.basis import basis_of
-from flows.gatekeeping import Gatekeeper
+from flows.gates import Gatekeeper
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import kept_complete, starting_cluster, workers_for
 from flows.orchestration.prefect_environment import START_SECONDS, has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
-from flows.outlook import look_ahead
-from flows.planning import PlannedUnit
 from flows.progress import reporter
+from flows.run_plan import PlannedUnit, plan_ahead
 from flows.run_record import RunLog, latest_run
 from flows.settings import Overrides, selected_stages
-from flows.stage import Match, Stage
+from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store import Store
 
@@ -80,39 +79,25 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
-    basis = basis_of(store, match, stages, request.settings, latest, request.iteration)
     policy: GatePolicy = request.gates or "never"
     if request.gates is None and latest is not None and latest.state == "waiting":
         policy = latest.gates
     gatekeeper = Gatekeeper(store, match, policy)
-    outlook = look_ahead(gatekeeper, request.settings, stages, basis)
-    if outlook.missing:
-        return _with_prefect(store, match, replace(request, gates=policy), outlook.missing)
-    if latest is not None and outlook.is_recorded_by(latest):
-        reused = tuple(sorted(outlook.results))
+    plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
+    if plan.missing:
+        return _with_prefect(store, match, replace(request, gates=policy), plan.missing)
+    if latest is not None and plan.is_recorded_by(latest):
+        reused = tuple(sorted(plan.results))
         return latest.model_copy(
             update={
                 "executed": (),
                 "reused": reused,
                 "gates": policy,
-                "waiting": outlook.waiting,
+                "waiting": tuple(plan.waiting),
             }
         )
-    return _without_work(gatekeeper, stages, request)
-
-
-def _without_work(
-    gatekeeper: Gatekeeper, stages: tuple[Stage, ...], request: RunRequest
-) -> RunRecord:
-    """Record a run whose results all exist: from an earlier setting, or after a verdict."""
-    store, match, policy = gatekeeper.store, gatekeeper.match, gatekeeper.policy
     log = RunLog.begin(store, match, stages, request.settings, policy, request.iteration)
-    for stage in stages:
-        plan = log.plan(stage)
-        log.blocked += plan.blocked
-        log.reuse(plan.units)
-        log.hold(stage)
-    return log.close()
+    return log.run_stages(compute=lambda stage, units: ())  # all results exist
 
 
 def _with_prefect(
@@ -197,7 +182,7 @@ def _machines(
         else:
             _require_scheduler(request.dask, request.security)
         # Imported here: it takes seconds, while server and workers start.
-        import flows.match  # noqa: F401
+        importlib.import_module("flows.match")
 
         if not is_watched:
             stack.enter_context(_without_heartbeats())
@@ -227,7 +212,7 @@ def _ending_at_once() -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        sys.stderr.write("\ninterrupted: run again to go on from what is finished\n")
+        sys.stderr.write("\ninterrupted: run again to resume from the finished results\n")
         sys.stderr.flush()
         os._exit(128 + number)
 
@@ -259,5 +244,5 @@ def _require_scheduler(address: str, security: Security | None) -> None:
             f"--dask {address}",
             expected="a running Dask scheduler, as tcp://host:port",
             found=str(error).splitlines()[0],
-            todo="Start one with: dask scheduler.",
+            todo="Start a scheduler: dask scheduler.",
         ) from None

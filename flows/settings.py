@@ -32,7 +32,7 @@ def selected_stages(from_stage: str | None, until_stage: str | None) -> tuple[St
             f"--from {from_stage} --until {until_stage}",
             expected=f"stages in the order {', '.join(names)}",
             found=f"{from_stage} after {until_stage}",
-            todo="Swap them.",
+            todo="Swap the two stages.",
         )
     return METHOD[first : last + 1]
 
@@ -57,7 +57,7 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
                 f"--set {assignment}",
                 expected="stage.name=value",
                 found=repr(assignment),
-                todo="For example: --set triangulation.min_views=3.",
+                todo="Write it as in: --set triangulation.min_views=3.",
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
         _refuse_former_name(assignment, stage_name, field)
@@ -86,7 +86,7 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             f"--set {stage.name}.{'.'.join(map(str, first['loc']))}",
             expected=first["msg"],
             found=repr(first["input"]),
-            todo="See worldpose run MATCH --set list.",
+            todo="List all settings: worldpose run MATCH --set list.",
         ) from None
 
 

@@ -17,10 +17,10 @@ commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_mar
 def install(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="SMPL's .pkl or .npz.")],
     name: Annotated[
-        str | None, typer.Option(help="What results call it; from the file's name by default.")
+        str | None, typer.Option(help="Name of the body; from the file's name by default.")
     ] = None,
     body_folder: Annotated[
-        Path, typer.Option(envvar="WORLDPOSE_BODY_FOLDER", help="Where bodies are kept.")
+        Path, typer.Option(envvar="WORLDPOSE_BODY_FOLDER", help="Folder of installed bodies.")
     ] = BODY_FOLDER,
     as_json: JsonOption = False,
 ) -> None:

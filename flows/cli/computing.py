@@ -11,14 +11,14 @@ DaskOption = Annotated[
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Worker processes of a run on this machine; by default one a core."),
+    typer.Option(min=1, help="Worker processes on this machine; one per core by default."),
 ]
 TimeLimitOption = Annotated[
     list[str] | None,
     typer.Option(
         "--time-limit",
         metavar="[STAGE=]MINUTES",
-        help="A unit that is at work for longer is stopped, begun once more, and then given up; "
-        "may be repeated; by default 360 in every stage.",
+        help="Time limit of a unit [min]: a slower unit is stopped, retried once, and then given "
+        "up. Repeatable; 360 in every stage by default.",
     ),
 ]

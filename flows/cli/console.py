@@ -27,13 +27,13 @@ ProjectOption = Annotated[
         help="Folder or s3:// URL that holds all results.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
 RunOption = Annotated[str, typer.Option("--run", help="A run's number or name; latest by default.")]
 StageOption = Annotated[
-    str | None, typer.Option("--stage", help="Take this stage's joints; the latest by default.")
+    str | None, typer.Option("--stage", help="Stage of the joints; the last by default.")
 ]
 
 DEFAULT_PROJECT = "worldpose-data"

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
+import numpy as np
 import typer
 
-from flows.cli.ablation import print_ablation
+from data_contracts.evaluation import MethodScore
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
     RunOption,
     StageOption,
+    errors,
     line,
     print_json,
     print_table,
 )
 from worldpose.errors import UsageError
+
+if TYPE_CHECKING:
+    from flows.results.ablation import Score
 
 
 def evaluate(
@@ -50,7 +57,7 @@ def evaluate(
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option("--fps", min=0.001, help="Frames in a second; the match's by default."),
+        typer.Option("--fps", min=0.001, help="Frames per second; the match's by default."),
     ] = None,
     ablation: Annotated[
         int,
@@ -58,7 +65,7 @@ def evaluate(
             "--ablation",
             metavar="SEEDS",
             min=0,
-            help="Simulate so many penalty-box trials and print the paper's ablation instead.",
+            help="Simulate N penalty-box trials and print the paper's ablation instead.",
         ),
     ] = 0,
     method: Annotated[
@@ -72,22 +79,22 @@ def evaluate(
     ] = None,
     body: Annotated[
         str | None,
-        typer.Option("--body", help="Body that methods' poses are put on; the open body."),
+        typer.Option("--body", help="Body model for the methods' poses; the open body by default."),
     ] = None,
     markers: Annotated[
         Path | None,
-        typer.Option("--markers", help="YAML: which markers make which joints of a reference."),
+        typer.Option("--markers", help="YAML file that maps markers of a reference to joints."),
     ] = None,
     first_frame: Annotated[
         int | None,
-        typer.Option("--first-frame", help="Match frame of methods' first picture."),
+        typer.Option("--first-frame", help="Match frame of the methods' first image."),
     ] = None,
     method_fps: Annotated[
         list[str] | None,
         typer.Option(
             "--method-fps",
             metavar="NAME=FPS",
-            help="Frames in a second of the video that a method saw, where not the clip's.",
+            help="Frames per second of a method's input video, if not the clip's.",
         ),
     ] = None,
     table: Annotated[
@@ -104,7 +111,6 @@ def evaluate(
         print_ablation(ablation, as_json=as_json)
         return
     if method and reference is not None and prediction is None:
-        from flows.cli.methods import named_rates, print_methods
         from flows.results.baselines import score_methods
 
         found = score_methods(
@@ -123,7 +129,7 @@ def evaluate(
             "worldpose evaluate",
             expected="--prediction or --method, and --reference",
             found="others",
-            todo="Name what is scored and the truth, or ask for --ablation 10.",
+            todo="Name prediction and ground truth, or use --ablation 10.",
         )
     from flows.results.evaluation import score
     from worldpose.reports.run_report import score_rows
@@ -191,3 +197,120 @@ def _print_rows(kind: str, columns: Mapping[str, str], rows: Mapping[str, object
         values = (getattr(record, column) for column in columns)
         shown.append((name, *("-" if value is None else f"{value:.3g}" for value in values)))
     print_table("", (kind, *(f">{title}" for title in columns.values())), shown)
+
+
+def print_ablation(seeds: int, *, as_json: bool) -> None:
+    """Simulate trials and print every row's mean and standard deviation over them.
+
+    Args:
+        seeds: number of trials, with seeds from 0.
+        as_json: print every trial's metrics instead of a table.
+    """
+    from flows.results.ablation import PAPER, TRIANGULATIONS, Score, ablation
+
+    trials = ablation(
+        range(seeds), lambda clicks, seed: line(f"{clicks}: trial {seed} done", to=errors)
+    )
+    names = [field.name for field in fields(Score)]
+    if as_json:
+        print_json(
+            {
+                clicks: {
+                    row: {name: [getattr(trial[row], name) for trial in found] for name in names}
+                    for row in found[0]
+                }
+                for clicks, found in trials.items()
+            }
+        )
+        return
+    columns = ("", ">G-MPJPE", ">PA-MPJPE", ">ground m", ">clicks px", ">paper G / PA")
+    for clicks, found in trials.items():
+        for how in TRIANGULATIONS:
+            names = [row.removesuffix(how) for row in found[0] if _is_of(row, how)]
+            names += [row for row in PAPER if row not in names]
+            rows = [
+                _row(name, [t[name + how] for t in found if name + how in t], PAPER.get(name))
+                for name in names
+            ]
+            print_table(f"{clicks}{how}: {seeds} trials, mm, mean ± spread", columns, rows)
+
+
+def _is_of(row: str, how: str) -> bool:
+    """Return whether a row is triangulated this way; the first way has no name."""
+    from flows.results.ablation import TRIANGULATIONS
+
+    return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how
+
+
+def _row(
+    name: str, scores: list[Score], paper: tuple[float, float] | None
+) -> tuple[str, str, str, str, str, str]:
+    def values(figure: str) -> list[float]:
+        return [getattr(score, figure) for score in scores]
+
+    def mean(figure: str, digits: int) -> str:
+        return f"{np.mean(values(figure)):.{digits}f}" if scores else "-"
+
+    def told(figure: str, digits: int) -> str:
+        return f"{mean(figure, digits)} ± {np.std(values(figure)):.{digits}f}" if scores else "-"
+
+    return (
+        name,
+        told("g_mpjpe_mm", 1),
+        told("pa_mpjpe_mm", 1),
+        mean("ground_error_m", 3),
+        mean("marking_error_px", 2),
+        "-" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}",
+    )
+
+
+FORMS: Final = ("text", "csv", "latex")
+
+
+def named_rates(given: Sequence[str]) -> dict[str, float]:
+    """Parse NAME=FPS arguments into numbers by name.
+
+    Raises:
+        UsageError: an argument has another form.
+    """
+    rates = {}
+    for item in given:
+        name, _, text = item.partition("=")
+        try:
+            rates[name] = float(text)
+        except ValueError:
+            rates[name] = 0.0
+        if not 0.0 < rates[name] < math.inf:
+            raise UsageError(
+                f"--method-fps {item}",
+                expected="NAME=FPS, such as gvhmr=30",
+                found=repr(text),
+                todo="Give the frames per second of the method's input video.",
+            )
+    return rates
+
+
+def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) -> None:
+    """Print scores of methods as text, CSV or LaTeX, or in full as JSON.
+
+    Raises:
+        UsageError: an unknown format.
+    """
+    from worldpose.evaluation.method_table import COLUMNS, table_csv, table_latex, table_rows
+
+    if form not in FORMS:
+        raise UsageError(
+            f"--table {form}",
+            expected=", ".join(FORMS),
+            found=repr(form),
+            todo="Choose one of these.",
+        )
+    if as_json:
+        rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
+        print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})
+    elif form == "text":
+        # Brackets would be parsed as markup.
+        titles = (f">{title.replace('[', '').replace(']', '')}" for title in COLUMNS.values())
+        print_table("", ("method", *titles), table_rows(scores))
+    else:
+        line((table_csv if form == "csv" else table_latex)(scores).rstrip())

@@ -38,13 +38,13 @@ class _Lines(logging.Handler):
 
 def label(
     videos: Annotated[list[Path], typer.Argument(metavar="VIDEO...", help="Videos of one size.")],
-    out: Annotated[Path, typer.Option(help="Folder to write; absent or empty.")],
-    every: Annotated[int, typer.Option(min=1, help="Frames from one label to the next.")] = 50,
+    out: Annotated[Path, typer.Option(help="Output folder; absent or empty.")],
+    every: Annotated[int, typer.Option(min=1, help="Step between labelled frames.")] = 50,
     detectors: Annotated[
         list[str] | None,
-        typer.Option("--detector", help="As in detection.detector; several are an ensemble."),
+        typer.Option("--detector", help="Value of detection.detector; repeated for an ensemble."),
     ] = None,
-    pose: Annotated[str, typer.Option(help="As in detection.pose.")] = "embedded",
+    pose: Annotated[str, typer.Option(help="Value of detection.pose.")] = "embedded",
     as_json: JsonOption = False,
 ) -> None:
     """Propose labels of every so many frames, for people to correct.
@@ -67,14 +67,16 @@ def finetune(
         Path, typer.Argument(metavar="LABELS", help="Reviewed labels: COCO keypoints, a JSON file.")
     ],
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder of the pictures; that of LABELS by default.")
+        Path | None, typer.Option(help="Folder of the images; that of LABELS by default.")
     ] = None,
     nets: Annotated[
         list[str] | None, typer.Option("--net", help="people or keypoints; both by default.")
     ] = None,
     starts: Annotated[
         list[str] | None,
-        typer.Option("--start", metavar="NET=FILE", help="Begin from a version; else the shipped."),
+        typer.Option(
+            "--start", metavar="NET=FILE", help="Initial weights; the shipped ones by default."
+        ),
     ] = None,
     assignments: Annotated[
         list[str] | None,
@@ -94,7 +96,7 @@ def finetune(
             f"--project {project}",
             expected="a folder",
             found="a URL",
-            todo="Train in a local project; weights are named by their file.",
+            todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or get_args(NetKind))
     begin = {_kind(name, "--start"): Path(file) for name, file in map(_parted, starts or [])}
@@ -158,7 +160,7 @@ def _parted(assignment: str) -> tuple[str, str]:
     name, equals, value = assignment.partition("=")
     if not equals:
         raise UsageError(
-            assignment, expected="NAME=VALUE", found="no =", todo="For example: training.steps=800."
+            assignment, expected="NAME=VALUE", found="no =", todo="Write training.steps=800."
         )
     return name, value
 
@@ -189,5 +191,5 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
             f"--set {'.'.join(map(str, first['loc']))}",
             expected=first["msg"],
             found=repr(first["input"]),
-            todo="Its settings are those of FineTuningSettings.",
+            todo="Use a setting of FineTuningSettings.",
         ) from None

@@ -16,8 +16,13 @@ from flows.cli.console import (
     print_table,
 )
 from flows.lineage import explain_unit, find_run, run_difference
-from flows.results.comparison import KINDS, SubjectChange, compare_runs, count_marks
-from flows.results.pose_diff import largest_pose_changes
+from flows.results.comparison import (
+    KINDS,
+    SubjectChange,
+    compare_runs,
+    count_marks,
+    largest_pose_changes,
+)
 from flows.settings import parse_overrides
 from worldpose.store import Store
 
@@ -105,13 +110,13 @@ def why(
         typer.Option(
             "--set",
             metavar="STAGE.NAME=VALUE",
-            help="Ask for these settings; those of the latest run by default.",
+            help="Settings; those of the latest run by default.",
         ),
     ] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Say whether a unit's result is current, and if not, what made it stale.
+    """Show whether a unit's result is current, and if not, what made it stale.
 
     current: the latest run has what a run would give now; ready: the store has it, the latest
     run has not; stale: the latest run has another; missing: there is none.

@@ -31,33 +31,35 @@ def simulate(
     scenario: Annotated[
         str, typer.Option("--scenario", help="Name of a scenario, or `list` to see them.")
     ],
-    out: Annotated[Path | None, typer.Option("--out", help="Match folder to make.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Same seed, same bytes.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Match folder to create.")] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Random seed; equal seeds give equal bytes.")
+    ] = 0,
     duration: Annotated[float | None, typer.Option(min=0.2, help="Length [s].")] = None,
     cameras: Annotated[int | None, typer.Option(min=1, help="Number of static cameras.")] = None,
     players: Annotated[int | None, typer.Option(min=0, help="Number of people.")] = None,
     trajectories: Annotated[
-        Path | None, typer.Option(help="Tracking data (npz) that drives the people.")
+        Path | None, typer.Option(help="Tracking data (npz) that people follow.")
     ] = None,
     mocap: Annotated[
-        Path | None, typer.Option(help="Motion capture (BVH) that one of the people plays.")
+        Path | None, typer.Option(help="Motion capture (BVH) that one person performs.")
     ] = None,
     calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="Give the exact static cameras too.")
+        bool, typer.Option("--calibrated", help="Also write the exact static cameras.")
     ] = False,
     stills: Annotated[
-        bool, typer.Option(help="Draw one picture of every static camera, about 1 s each.")
+        bool, typer.Option(help="Draw one image per static camera, about 1 s each.")
     ] = True,
     video: Annotated[
         bool,
-        typer.Option(help="Film the broadcast camera where the scenario says so: 0.1 s a frame."),
+        typer.Option(help="Render the scenario's broadcast video: 0.1 s per frame."),
     ] = True,
     render: Annotated[
         bool,
-        typer.Option("--render", help="Film all cameras, and give no detections: pixels only."),
+        typer.Option("--render", help="Render videos of all cameras instead of detections."),
     ] = False,
     masks: Annotated[
-        bool, typer.Option("--masks", help="With --render, add who is where in every pixel.")
+        bool, typer.Option("--masks", help="With --render, add the person of each pixel.")
     ] = False,
     recordings: Annotated[
         Path | None,
@@ -86,11 +88,11 @@ def simulate(
             f"--scenario {scenario}",
             expected=f"one of {', '.join(about)}",
             found=repr(scenario),
-            todo="See worldpose simulate --scenario list.",
+            todo="List the scenarios: worldpose simulate --scenario list.",
         )
     if out is None:
         raise UsageError(
-            "--out", expected="the folder to make", found="nothing", todo="Add --out FOLDER."
+            "--out", expected="a folder to create", found="none", todo="Add --out FOLDER."
         )
     if masks and not render:
         raise UsageError(
@@ -149,7 +151,7 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
                 option,
                 expected=f"an option of {what}",
                 found=f"{option}, which it does not have",
-                todo="Leave the option out; docs/explanation/simulation.md says what replaces it.",
+                todo="Omit the option; docs/explanation/simulation.md describes the alternatives.",
             )
 
 
@@ -178,7 +180,7 @@ def _filming() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def import_command(
-    out: Annotated[Path, typer.Option("--out", help="Match folder to make, or to add to.")],
+    out: Annotated[Path, typer.Option("--out", help="Match folder to create or to extend.")],
     calibration: Annotated[
         Path | None,
         typer.Option(help="Cameras: Anipose, Pose2Sim or caliscope TOML, or Qualisys XML."),
@@ -189,13 +191,13 @@ def import_command(
     videos: Annotated[
         Path | None, typer.Option(help="Videos instead of 2D poses, <camera>.mp4.")
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     match_id: Annotated[
         str | None, typer.Option(help="Id of the match; the folder's name by default.")
     ] = None,
     pitch: Annotated[
         Path | None,
-        typer.Option(help="Survey of the markings, CSV: writes pitch.json, asks for no more."),
+        typer.Option(help="Survey of the markings (CSV); writes only pitch.json."),
     ] = None,
     left_handed: Annotated[
         bool, typer.Option("--left-handed", help="The survey's x, y and height are left-handed.")
@@ -223,7 +225,7 @@ def import_command(
             "worldpose import",
             expected="--calibration with --detections and --fps or with --videos, or --pitch",
             found="some of them missing, or both",
-            todo="See worldpose import --help.",
+            todo="Read the help: worldpose import --help.",
         )
     else:
         spec = import_match(calibration, detections, fps, out, match_id=match_id)
@@ -250,7 +252,7 @@ def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -
             str(file),
             expected="no pitch there yet",
             found="one",
-            todo="Move it away first; another pitch makes another match.",
+            todo="Move the file away first; another pitch makes another match.",
         )
     refuse_unread_pitch(out)
     fit = fit_survey(read_survey(survey), SurveySettings(left_handed=left_handed))

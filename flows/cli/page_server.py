@@ -18,7 +18,7 @@ NamesOption = Annotated[
     typer.Option("--host-name", help="Name of this machine in browsers elsewhere; repeatable."),
 ]
 CertificateOption = Annotated[
-    Path | None, typer.Option("--certificate", help="PEM file; with --key: pages with TLS.")
+    Path | None, typer.Option("--certificate", help="PEM file of the certificate for TLS.")
 ]
 KeyOption = Annotated[Path | None, typer.Option("--key", help="PEM file of its private key.")]
 TokenOption = Annotated[
@@ -26,7 +26,7 @@ TokenOption = Annotated[
     typer.Option(
         envvar="WORLDPOSE_REVIEW_TOKEN",
         show_envvar=True,
-        help="What people log in to the pages with; a new one by default.",
+        help="Token with which people log in; a new one by default.",
     ),
 ]
 
@@ -45,5 +45,5 @@ def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Pat
         "--certificate and --key",
         expected="both or none",
         found="one of them",
-        todo="Give the certificate's file and its private key's.",
+        todo="Give both files: the certificate and its private key.",
     )

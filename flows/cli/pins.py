@@ -17,11 +17,11 @@ from worldpose.store.paths import checked_name
 
 def pin(
     run: Annotated[str, typer.Argument(metavar="RUN", help="MATCH/NUMBER, or MATCH: its latest.")],
-    name: Annotated[str, typer.Argument(metavar="NAME", help="What to call it, such as v1.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the pin, such as v1.")],
     who: Annotated[
-        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; kept with it.")
+        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
     ],
-    why: Annotated[str, typer.Option(help="What it is kept for.")] = "",
+    why: Annotated[str, typer.Option(help="Reason for the pin; it is recorded.")] = "",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -60,7 +60,7 @@ def unpin(
             f"unpin {named}",
             expected="MATCH/NAME",
             found=repr(named),
-            todo="List the names with worldpose status.",
+            todo="List the names: worldpose status.",
         )
     _say(unpin_run(Store.open(project).blobs, match_id, name), "unpinned", as_json)
 

@@ -21,11 +21,11 @@ WIDTH = 320
 def clips(
     programme: Annotated[Path, typer.Argument(metavar="VIDEO", help="The programme feed.")],
     sheet: Annotated[
-        Path | None, typer.Option("--sheet", help="PNG to write: some of every proposed clip.")
+        Path | None, typer.Option("--sheet", help="PNG with sample frames of each proposed clip.")
     ] = None,
     take: Annotated[
         str | None,
-        typer.Option("--take", metavar="FIRST:STOP", help="Cut these pictures out instead."),
+        typer.Option("--take", metavar="FIRST:STOP", help="Cut out this range of frames instead."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="With --take: <match>/broadcast/<clip>.mp4.")
@@ -43,7 +43,7 @@ def clips(
             "worldpose clips",
             expected="--take with --out, or neither",
             found="one of them, or --sheet too",
-            todo="See worldpose clips --help.",
+            todo="Read the help: worldpose clips --help.",
         )
     if take is not None and out is not None:
         _take(programme, take, out, as_json=as_json)
@@ -123,7 +123,7 @@ def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
         )  # fmt: skip
     if out.exists():
         raise UsageError(
-            str(out), expected="no file there yet", found="one", todo="Choose another name."
+            str(out), expected="a new file", found="a file", todo="Choose another name."
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(out) as draft:

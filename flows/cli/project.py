@@ -18,11 +18,11 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.lineage import unit_state
-from flows.planning import plan_run
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
+from flows.run_plan import plan_run
 from flows.run_record import latest_run
+from flows.run_status import UnitState, unit_state
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair
 from worldpose.store import verify as verify_store
@@ -30,10 +30,10 @@ from worldpose.store.paths import damaged_path
 
 
 def init(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder or s3:// URL to make.")],
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder or s3:// URL to create.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Make a project: the place where matches are registered and results are kept.
+    """Create a project: the folder of registered matches and their results.
 
     Example: worldpose init worldpose-data
     """
@@ -41,7 +41,7 @@ def init(
     if as_json:
         print_json({"project": store.url})
     else:
-        line(f"made project {store.url}")
+        line(f"created project {store.url}")
 
 
 def status(
@@ -49,7 +49,7 @@ def status(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Show which results are there, stale or missing, match by match.
+    """Show which results are current, stale or missing, match by match.
 
     Example: worldpose status tiny-1
     """
@@ -60,7 +60,7 @@ def status(
         print_json({"matches": rows})
         return
     if not rows:
-        line("no match registered: worldpose ingest FOLDER")
+        line("No match is registered. Register one: worldpose ingest FOLDER.")
         return
     columns = (
         "match",
@@ -93,15 +93,15 @@ def status(
         for text in row["warnings"]:
             line(f"{row['match']}: {text}")
         if row["waiting"]:
-            line(f"{row['match']}: what waits: worldpose review list {row['match']}")
+            line(f"{row['match']}: pending reviews: worldpose review list {row['match']}")
         for name, run_id in row["pins"].items():
             line(f"{row['match']}: run {run_id} is pinned as {name}")
         if row["settings"]:
             line(f"{row['match']}: judged with the settings of run {row['run']}: {row['settings']}")
 
 
-STATES = ("current", "ready", "stale", "missing")
-"""Of a unit; see `worldpose why --help`."""
+STATES = tuple(state.value for state in UnitState)
+"""States of a unit; see `worldpose why --help`."""
 
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
@@ -139,7 +139,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     else:
         waiting = still_waiting(match, latest)
         for unit in planned:
-            units[unit_state(unit, latest)].append(unit.name)
+            units[unit_state(unit, latest).value].append(unit.name)
     return {
         "match": match_id,
         "run": None if latest is None else latest.run_id,
@@ -198,26 +198,26 @@ def verify(
     if findings:
         raise typer.Exit(1)
     if not as_json:
-        line("every stored byte is as it was published")
+        line("Every stored byte is as it was published.")
 
 
 def gc(
     delete: Annotated[
-        bool, typer.Option("--delete", help="Remove what is listed; without it only list.")
+        bool, typer.Option("--delete", help="Remove the listed items; without it, only list them.")
     ] = False,
     keep_last: Annotated[
-        int | None, typer.Option(min=1, help="Also forget all but this many runs of each match.")
+        int | None, typer.Option(min=1, help="Also forget all but the last N runs of each match.")
     ] = None,
     forget: Annotated[
         list[str] | None, typer.Option(metavar="MATCH/RUN", help="Also forget this run.")
     ] = None,
     older_than: Annotated[
-        float, typer.Option(min=0, help="Spare leftovers younger than this [h].")
+        float, typer.Option(min=0, help="Keep items younger than this [h].")
     ] = 24.0,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List, and with --delete remove, what no run reaches; a pinned run is never forgotten.
+    """List or remove (--delete) data that no run uses; a pinned run is never forgotten.
 
     Example: worldpose gc --keep-last 3 --delete
     """

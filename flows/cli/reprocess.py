@@ -1,9 +1,9 @@
-"""Command reprocess: recompute everything that edits made stale."""
+"""Command reprocess: recompute all results that edits made stale."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from pydantic import JsonValue
@@ -21,33 +21,35 @@ from flows.cli.console import (
 )
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
-from flows.reprocessing import Reprocessed, reprocess_matches
+from flows.reprocess import Reprocessed, reprocess_matches
+from flows.run_status import RunStatus
 from flows.running import RunRequest
 from flows.settings import parse_overrides
-from flows.touched import Touched
 from worldpose.store import Store
 
-SHOWN = 3
+MAX_REASONS: Final = 3
 """Printed reasons per unit; --json has them all."""
+JSON_STATES: Final = {"current": "untouched", "stale": "touched"}
+"""Words of --json for states that have no run of their own, as programs know them."""
 
 
 def reprocess(
     matches: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[MATCH]...", help="Ids or folders; every match by default."),
+        typer.Argument(metavar="[MATCH]...", help="Ids or folders; all matches by default."),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list what would be computed, and why.")
+        bool, typer.Option("--dry-run", help="Only list the units to compute, with reasons.")
     ] = False,
     retry: Annotated[
-        bool, typer.Option("--retry", help="Try again what failed, though nothing was edited.")
+        bool, typer.Option("--retry", help="Retry failed units, even without an edit.")
     ] = False,
     assignments: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="STAGE.NAME=VALUE",
-            help="A setting to ask for, beside those of each match's latest run; may be repeated.",
+            help="A setting beyond those of each match's latest run; repeatable.",
         ),
     ] = None,
     dask: DaskOption = None,
@@ -56,10 +58,11 @@ def reprocess(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute anew what an edit, a setting, a detector or new code made stale, match by match.
+    """Recompute results that an edit, a setting, a detector or new code made stale.
 
-    Each match is run with the settings, gates and iterations of its latest run, to where that went.
-    Exit code 0: all are current; 1: none could be run; 3: some wait for review; 4: some failed.
+    Each match is run with the settings, gates and iterations of its latest run, up to the last
+    stage of that run. Exit code 0: all matches are current; 1: none could be run; 3: some wait for
+    review; 4: some failed.
 
     Example: worldpose reprocess --dry-run
     """
@@ -87,16 +90,16 @@ def exit_code(found: Sequence[Reprocessed]) -> int:
 
 def _print(found: Sequence[Reprocessed]) -> None:
     if not found:
-        line("no match registered: worldpose ingest FOLDER")
+        line("No match is registered. Register one: worldpose ingest FOLDER.")
     for each in found:
-        if each.state in ("never run", "untouched"):
+        if each.state in ("never run", "current"):
             line(f"{each.match_id}: {_nothing_to_do(each)}")
             continue
-        count = 0 if each.touched is None else len(each.touched.to_compute)
+        count = 0 if each.status is None else len(each.status.to_compute)
         run = "" if each.record is None else f", run {each.record.run_id}"
         line(f"{each.match_id}: {each.state}{run}; {count} units to compute")
-        if each.touched is not None:
-            _print_units(each.touched)
+        if each.status is not None:
+            _print_units(each.status)
         if each.problem is not None:
             line(f"error: {each.problem}", to=errors)
 
@@ -104,41 +107,44 @@ def _print(found: Sequence[Reprocessed]) -> None:
 def _nothing_to_do(each: Reprocessed) -> str:
     record = each.record
     if record is None:
-        return f"no run yet: worldpose run {each.match_id}"
+        return f"no run yet; start one: worldpose run {each.match_id}"
     if record.state in ("failed", "partial"):
-        return f"nothing was edited since run {record.run_id} was {record.state}: --retry"
+        return (
+            f"nothing was edited since run {record.run_id}, which is {record.state}; "
+            "--retry repeats its failed units"
+        )
     return "every result is current"
 
 
-def _print_units(touched: Touched) -> None:
+def _print_units(status: RunStatus) -> None:
     rows = []
-    for unit in touched.units:
-        name = unit.unit if touched.latest.iteration == 1 else f"{unit.iteration}: {unit.unit}"
-        own = unit.own_reasons
-        more = [f"and {len(own) - SHOWN} more"] * (len(own) > SHOWN)
-        made_from = [f"made from {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
-        rows.append((name, unit.state, "\n".join([*own[:SHOWN], *more, *made_from])))
-    print_table(f"since run {touched.latest.run_id}", ("unit", "state", "why"), rows)
+    for unit in status.units:
+        name = unit.unit if status.latest.iteration == 1 else f"{unit.iteration}: {unit.unit}"
+        own = [str(reason) for reason in unit.own_reasons]
+        more = [f"and {len(own) - MAX_REASONS} more"] * (len(own) > MAX_REASONS)
+        inputs = [f"changed inputs: {', '.join(unit.changed_inputs)}"] * bool(unit.changed_inputs)
+        rows.append((name, unit.state.value, "\n".join([*own[:MAX_REASONS], *more, *inputs])))
+    print_table(f"since run {status.latest.run_id}", ("unit", "state", "why"), rows)
 
 
 def _as_json(each: Reprocessed) -> dict[str, JsonValue]:
-    touched = each.touched
-    ran = None if each.state in ("untouched", "touched") else each.record
+    status = each.status
+    ran = None if each.state in JSON_STATES else each.record
     return {
         "match": each.match_id,
-        "state": each.state,
+        "state": JSON_STATES.get(each.state, each.state),
         "run": None if each.record is None else each.record.run_id,
         "executed": [] if ran is None else list(ran.executed),
         "problem": each.problem,
-        "to_compute": 0 if touched is None else len(touched.to_compute),
+        "to_compute": 0 if status is None else len(status.to_compute),
         "units": [
             {
                 "unit": unit.unit,
                 "iteration": unit.iteration,
-                "state": unit.state,
+                "state": unit.state.value,
                 "edited": bool(unit.own_reasons),
-                "reasons": list(unit.reasons),
+                "reasons": list(unit.describe()),
             }
-            for unit in (() if touched is None else touched.units)
+            for unit in (() if status is None else status.units)
         ],
     }

@@ -31,16 +31,16 @@ def export(
             "slahmr-cameras or rerun (docs/reference/formats.md); more than one may be given.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write into.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder.")],
     run: RunOption = "latest",
     stage: StageOption = None,
     release: Annotated[
         str | None,
-        typer.Option("--release", metavar="NAME", help="Freeze the run under a name: manifest."),
+        typer.Option("--release", metavar="NAME", help="Freeze the run under this name."),
     ] = None,
     licence: Annotated[
         Path | None,
-        typer.Option("--licence", help="Text under which a release's data may be used."),
+        typer.Option("--licence", help="Text of the data licence of a release."),
     ] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -50,16 +50,16 @@ def export(
     Example: worldpose export tiny-1 --format joints --out exported
     """
     from flows.registering import find_registration
-    from flows.results.formats import Origin
-    from flows.results.releasing import export as export_formats
-    from flows.results.releasing import release as write_release
+    from flows.results.export import Origin
+    from flows.results.export import export as export_formats
+    from flows.results.export import release as write_release
 
     if (release is None) != (licence is None):
         raise UsageError(
             "worldpose export",
             expected="both --release NAME and --licence FILE, or neither",
             found="one of them",
-            todo="A release says under which licence its data may be used.",
+            todo="Give the text of the data licence with --licence.",
         )
     store = Store.open(project)
     registration = find_registration(store, match)
@@ -81,22 +81,22 @@ def export(
 
 def report(
     match: MatchArgument,
-    out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", help="Output page.")] = Path("report.html"),
     reference: Annotated[
         str | None,
-        typer.Option("--reference", help="Truth; reference/ of the match folder by default."),
+        typer.Option("--reference", help="Ground truth; reference/ of the match by default."),
     ] = None,
     videos: Annotated[
         bool,
         typer.Option(
             "--videos/--no-videos",
-            help="Write videos with markings and bodies drawn over them, beside the page.",
+            help="Also write videos with overlaid markings and bodies.",
         ),
     ] = True,
     camera: Annotated[
         str | None,
         typer.Option(
-            "--camera", help="Static camera of a video; the one that sees most by default."
+            "--camera", help="Static camera of a video; the one with most people by default."
         ),
     ] = None,
     run: RunOption = "latest",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,7 +19,16 @@ from flows.cli.console import (
     line,
     print_json,
 )
-from flows.cli.review_serve import serve
+from flows.cli.page_server import (
+    PAGES_PORT,
+    CertificateOption,
+    HostOption,
+    KeyOption,
+    NamesOption,
+    PortOption,
+    TokenOption,
+    certificate_and_key,
+)
 from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
@@ -39,19 +49,18 @@ commands = typer.Typer(
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
 Requests = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[REVIEW...]", help="Ids as `list` shows them; all that wait."),
+    typer.Argument(metavar="[REVIEW...]", help="Ids from `list`; all pending ones by default."),
 ]
 Who = Annotated[
-    str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; kept with it.")
+    str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
 ]
-Why = Annotated[str, typer.Option("--why", help="In your words; kept with it.")]
+Why = Annotated[str, typer.Option("--why", help="Your reason; it is recorded.")]
 Edits = Annotated[
     Path | None,
-    typer.Option("--edits", help="JSON list of corrections, as docs/how-to/review.md shows them."),
+    typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md."),
 ]
 EditsFile = Annotated[
-    Path,
-    typer.Option("--edits", help="JSON list of corrections, as docs/how-to/review.md shows them."),
+    Path, typer.Option("--edits", help="JSON list of corrections; see docs/how-to/review.md.")
 ]
 
 
@@ -59,12 +68,12 @@ EditsFile = Annotated[
 def list_reviews(
     match: Annotated[str | None, typer.Argument(metavar="[MATCH]")] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Also what is decided or superseded.")
+        bool, typer.Option("--all", help="Also list decided and superseded reviews.")
     ] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List what waits for a person, in one match or in all; one unreadable match hides no other.
+    """List pending reviews of one match or of all; an unreadable match does not hide the others.
 
     Example: worldpose review list tiny-1
     """
@@ -97,7 +106,7 @@ def show(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Show one review with all its figures, or a match's corrections and where results come from.
+    """Show one review with its metrics, or a match's corrections and the origins of its results.
 
     Example: worldpose review show tiny-1 static_calibration.cam03.1f2e3d4c5b6a
     """
@@ -149,7 +158,7 @@ def approve(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Let results pass; a verdict holds for their bytes, whatever run gives them again.
+    """Approve results; the verdict applies to their bytes, also in later runs.
 
     Example: worldpose review approve tiny-1 --who Ada --why "checked every overlay"
     """
@@ -166,7 +175,7 @@ def reject(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Refuse results, with the corrections that would mend them; nothing is built upon them.
+    """Reject results, optionally with corrections; no later stage uses rejected results.
 
     Example: worldpose review reject tiny-1 --who Ada --why "wrong corner" --edits edits.json
     """
@@ -182,7 +191,7 @@ def correct(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Correct what people clicked; the next run computes what depends on it, and nothing else.
+    """Correct clicks, detections or identities; the next run recomputes only what depends on them.
 
     Example: worldpose review correct tiny-1 --who Ada --edits edits.json
     """
@@ -199,13 +208,15 @@ def correct(
 @commands.command()
 def withdraw(
     match: MatchId,
-    correction: Annotated[str, typer.Argument(metavar="CORRECTION", help="As `show` lists it.")],
+    correction: Annotated[
+        str, typer.Argument(metavar="CORRECTION", help="Id of the correction, from `show`.")
+    ],
     who: Who,
     why: Why = "",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a correction back; the journal keeps both.
+    """Withdraw a correction; the journal keeps both records.
 
     Example: worldpose review withdraw tiny-1 moved_point.0a1b2c3d4e5f --who Ada
     """
@@ -222,7 +233,7 @@ def withdraw(
 def resume(
     match: MatchId, project: ProjectOption = DEFAULT_PROJECT, as_json: JsonOption = False
 ) -> None:
-    """Let the suspended runs of a deployment go on, once everything is decided.
+    """Resume the suspended runs of a deployment after all reviews are decided.
 
     Example: worldpose review resume tiny-1
     """
@@ -232,6 +243,36 @@ def resume(
         print_json({"resumed": resumed})
         return
     line(f"resumed {len(resumed)} runs of {match}; a serving process takes them up")
+
+
+@commands.command()
+def serve(
+    port: PortOption = PAGES_PORT,
+    host: HostOption = "127.0.0.1",
+    names: NamesOption = None,
+    certificate: CertificateOption = None,
+    key: KeyOption = None,
+    token: TokenOption = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+) -> None:
+    """Serve the review pages to browsers until interrupted.
+
+    Example: worldpose review serve --port 8571
+    """
+    # Imported here: the server takes half a second to import, and no other command needs it.
+    from flows.web.access import access_for
+    from flows.web.serving import address
+    from flows.web.serving import serve as serve_pages
+
+    tls = certificate_and_key(certificate, key)
+    access = access_for(host, token=token, names=names or (), secure=tls is not None)
+    logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
+    logging.getLogger("worldpose.pages").setLevel(logging.INFO)
+    # A token chosen by the operator is not printed: the output can go to a log.
+    where = address(access, host, port)
+    shown = where if token is None else where.partition("#")[0]
+    line(f"review pages of {Store.open(project).url}: {shown}")
+    serve_pages(project, access, host=host, port=port, tls=tls)
 
 
 def _decide(
@@ -275,7 +316,7 @@ def _read_edits(file: Path) -> list[Edit]:
             f"{file}: {place}" if place else str(file),
             expected="a JSON list of corrections",
             found=first["msg"],
-            todo="docs/how-to/review.md shows them; docs/schemas/correction.schema.json has all.",
+            todo="See docs/how-to/review.md and docs/schemas/correction.schema.json.",
         ) from None
 
 
@@ -289,5 +330,4 @@ def _tell_damage(match: Match) -> None:
         line(f"warning: {text}", to=errors)
 
 
-commands.command()(serve)
 review_exchange.add_to(commands)

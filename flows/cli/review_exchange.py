@@ -18,22 +18,24 @@ from worldpose.store import Store
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
 FormatOption = Annotated[str, typer.Option("--format", help=f"{', '.join(FORMATS)}.")]
 AnyFormatOption = Annotated[
-    str | None, typer.Option("--format", help="By default what the file's content says.")
+    str | None, typer.Option("--format", help="Format of the file; detected by default.")
 ]
 
 
 def export_annotations(
     match: MatchId,
-    out: Annotated[Path, typer.Option(help="Folder to write; absent or empty.")],
+    out: Annotated[Path, typer.Option(help="Output folder; absent or empty.")],
     form: FormatOption = "coco",
     cameras: Annotated[
         list[str] | None,
         typer.Option("--camera", help="A static camera, or a clip; all static ones by default."),
     ] = None,
     frames: Annotated[
-        list[int] | None, typer.Option("--frame", help="A match frame; several by repeating it.")
+        list[int] | None, typer.Option("--frame", help="A match frame; repeatable.")
     ] = None,
-    every: Annotated[int, typer.Option(min=1, help="Else frames from one to the next.")] = 50,
+    every: Annotated[
+        int, typer.Option(min=1, help="Step between frames if no --frame is given.")
+    ] = 50,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -65,9 +67,11 @@ def export_annotations(
 
 def import_annotations(
     match: MatchId,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="What the annotator wrote.")],
-    exported: Annotated[Path, typer.Option(help="exported.json of what was exported.")],
-    who: Annotated[str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Who annotated.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File of the annotation tool.")],
+    exported: Annotated[Path, typer.Option(help="The file exported.json of the export.")],
+    who: Annotated[
+        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Name of the annotator.")
+    ],
     form: AnyFormatOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -101,8 +105,8 @@ def import_annotations(
 
 
 def convert_annotations(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="COCO, CVAT or Label Studio.")],
-    out: Annotated[Path, typer.Option(help="File to write; one that is not there.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="COCO, CVAT or Label Studio file.")],
+    out: Annotated[Path, typer.Option(help="Output file; it must not exist.")],
     form: FormatOption = "coco",
 ) -> None:
     """Write annotations in another format, such as labels for CVAT, or what it wrote for finetune.
@@ -114,7 +118,7 @@ def convert_annotations(
     chosen = _format(form)
     if out.exists():
         raise UsageError(
-            str(out), expected="no such file", found="one", todo="Name a file that is not there."
+            str(out), expected="a new file", found="a file", todo="Choose another name."
         )
     pictures = read_annotations(file)
     write_annotations(out, pictures, chosen)
@@ -130,7 +134,7 @@ def _format(name: str) -> Format:
         f"--format {name}",
         expected=" or ".join(FORMATS),
         found=repr(name),
-        todo="Name the format of your annotator.",
+        todo="Name the format with --format.",
     )
 
 
@@ -167,7 +171,7 @@ def _places(
             "--frame",
             expected="frames of a clip",
             found=", ".join(map(str, frames or [])),
-            todo="Frames are those of the match, as match.yaml has its clips.",
+            todo="Choose match frames within a clip of match.yaml.",
         )
     return places
 

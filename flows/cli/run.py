@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
+from itertools import pairwise
+from statistics import median
 from typing import Annotated, get_args
 
 import typer
+from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
@@ -21,14 +25,12 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.cli.iterations import as_json as iterations_as_json
-from flows.cli.iterations import parse_iterations, print_iterations
-from flows.iterate import iterate_match
+from flows.iterate import Iteration, Iterations, iterate_match
 from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
-from flows.review.click_advice import click_advice
-from flows.review.clock_advice import clock_advice
+from flows.results.comparison import KINDS, Mark, compare_runs, count_marks
+from flows.review.advice import click_advice, clock_advice
 from flows.review.verdicts import warnings_of
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
@@ -44,7 +46,7 @@ def run(
     match: MatchArgument,
     from_stage: Annotated[
         str | None,
-        typer.Option("--from", help="First stage; earlier results are taken as they stand."),
+        typer.Option("--from", help="First stage; earlier results come from the latest run."),
     ] = None,
     until_stage: Annotated[str | None, typer.Option("--until", help="Last stage.")] = None,
     assignments: Annotated[
@@ -52,7 +54,7 @@ def run(
         typer.Option(
             "--set",
             metavar="STAGE.NAME=VALUE",
-            help="A setting for this run; may be repeated; `list` shows them all.",
+            help="A setting for this run; repeatable; `list` shows all settings.",
         ),
     ] = None,
     dask: DaskOption = None,
@@ -62,23 +64,23 @@ def run(
         str | None,
         typer.Option(
             metavar="POLICY",
-            help="When results wait for a person: never (default), auto (figures beyond limits) "
-            "or always; while the latest run waits, as in that.",
+            help="When results need review: never (default), auto (metrics beyond limits) or "
+            "always. While the latest run waits for review, its policy is the default.",
         ),
     ] = None,
     iterations: Annotated[
         str,
         typer.Option(
             metavar="N",
-            help="How often to go through the method, each time without the keypoints that the "
-            "bodies of the time before contradict; auto: until left-out cameras are foreseen no "
-            "better.",
+            help="Number of iterations. Each one leaves out the keypoints that the bodies of the "
+            "previous one contradict. auto: until the error in held-out cameras stops "
+            "decreasing.",
         ),
     ] = "1",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute whatever is missing or stale of a match, and nothing else.
+    """Compute the missing and stale results of a match, and nothing else.
 
     Example: worldpose run matches/tiny --set triangulation.min_views=3
     """
@@ -126,7 +128,7 @@ def run(
                 "reviews": [unit.model_dump() for unit in record.waiting],
                 "left_out": record.left_out,
                 "warnings": warned,
-                **({} if passes is None else iterations_as_json(store, passes)),
+                **({} if passes is None else _iterations_json(store, passes)),
             }
         )
     else:
@@ -152,7 +154,7 @@ def _policy(gates: str) -> GatePolicy:
         f"--gates {gates}",
         expected="never, auto or always",
         found=repr(gates),
-        todo="See worldpose run --help.",
+        todo="Read the help: worldpose run --help.",
     )
 
 
@@ -186,7 +188,7 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     )
     _print_waiting(record)
     if not (record.executed or record.failed or record.waiting):
-        line("nothing to do: every result is current")
+        line("Nothing to do: every result is current.")
     line(f"results: {project}/results/{record.match_id}")
 
 
@@ -206,3 +208,112 @@ def _print_waiting(record: RunRecord) -> None:
         f"next: worldpose review list {record.match_id}, then approve or reject what it lists, "
         "and give this command again"
     )
+
+
+UNTIL_BEST = "auto"
+
+
+def parse_iterations(text: str) -> int | None:
+    """Return the number of iterations; None = until one is no better.
+
+    Raises:
+        UsageError: neither a number from 1 nor `auto`.
+    """
+    if text == UNTIL_BEST:
+        return None
+    if text.isascii() and text.isdigit() and int(text) > 0:
+        return int(text)
+    raise UsageError(
+        f"--iterations {text}",
+        expected="a number from 1, or auto",
+        found=repr(text),
+        todo="Read the help: worldpose run --help.",
+    )
+
+
+def figures_of(iteration: Iteration) -> dict[str, float | None]:
+    """Return the metrics by which iterations are compared, over all clips."""
+    record = iteration.record
+    judged = _total(record, "filtering", "judged")
+    rejected = _total(record, "filtering", "keypoints_rejected")
+    reprojection = [
+        value for name, value in _last_bodies(record).items() if ".reprojection_px." in name
+    ]
+    return {
+        "held_out_error": iteration.held_out_error,
+        "rejected_share": rejected / judged if judged else None,
+        "boxes_dropped": _total(record, "filtering", "boxes_dropped"),
+        "boxes_of_others": _total(record, "filtering", "boxes_of_others"),
+        "bodies": _total(record, "body_fitting", "bodies"),
+        "reprojection_px": median(reprojection) if reprojection else None,
+        "computed": float(len(record.executed)),
+        "seconds": record.seconds,
+    }
+
+
+def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
+    """Compare cameras, clips and players of each iteration with the iteration before."""
+    marks: list[dict[str, str]] = [{}]
+    for before, after in pairwise(found.passes):
+        changes = compare_runs(store, before.record, after.record)
+        marks.append({kind: _in_short(count_marks(changes, kind)) for kind in KINDS})
+    return marks
+
+
+def _in_short(marks: Mapping[Mark, int]) -> str:
+    shown: tuple[Mark, ...] = ("better", "worse", "mixed", "unchanged")
+    return " / ".join(str(marks.get(mark, 0)) for mark in shown)
+
+
+def _iterations_json(store: Store, found: Iterations) -> dict[str, JsonValue]:
+    """Return all iterations with their metrics, and the kept one."""
+    return {
+        "iterations": [
+            {
+                "iteration": each.number,
+                "run": each.record.run_id,
+                **figures_of(each),
+                "better_worse_mixed_unchanged": dict(marks),
+            }
+            for each, marks in zip(found.passes, marks_of(store, found), strict=True)
+        ],
+        "kept": found.kept.number,
+        "ended": found.ended,
+    }
+
+
+def print_iterations(store: Store, found: Iterations) -> None:
+    """Print one column per iteration, and the kept one."""
+    columns = [figures_of(each) for each in found.passes]
+    rows = [
+        (name, *("" if column[name] is None else f"{column[name]:.4g}" for column in columns))
+        for name in columns[0]
+    ]
+    marks = marks_of(store, found)
+    rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in KINDS]
+    heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
+    print_table("iterations", ("figure", *heads), rows)
+    line("b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)")
+    line(
+        f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "
+        "a later one is kept only if people are foreseen better in cameras left out"
+    )
+
+
+def _total(record: RunRecord, stage: str, name: str) -> float:
+    return sum(
+        figures.get(name, 0.0)
+        for unit, figures in record.figures.items()
+        if unit.startswith(f"{stage}/")
+    )
+
+
+def _last_bodies(record: RunRecord) -> dict[str, float]:
+    """Return the metrics of the bodies of all clips, `unit.figure`, refitted ones if available."""
+    found: dict[str, float] = {}
+    for stage in ("body_fitting", "refitting"):
+        for unit, figures in record.figures.items():
+            if unit.startswith(f"{stage}/"):
+                clip = unit.partition("/")[2]
+                found |= {f"{clip}.{name}": value for name, value in figures.items()}
+    return found

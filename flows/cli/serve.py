@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 def serve(
     inbox: Annotated[
         Path | None,
-        typer.Option("--inbox", help="Folder in which matches arrive; PROJECT/inbox by default."),
+        typer.Option("--inbox", help="Folder of arriving matches; PROJECT/inbox by default."),
     ] = None,
     bucket: Annotated[
         str | None,
-        typer.Option("--bucket", help="s3:// URL where matches arrive too; copied to the inbox."),
+        typer.Option("--bucket", help="s3:// URL of further arrivals; copied to the inbox."),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Say what is unhealthy and how to mend it, and end.")
+        bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
     ] = False,
     max_concurrent: Annotated[
         int, typer.Option(min=1, help="Matches that run at the same time.")
@@ -46,30 +46,31 @@ def serve(
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
     name: Annotated[
-        str, typer.Option(help="Of the deployments; projects at one Prefect server need their own.")
+        str, typer.Option(help="Name of the deployments, unique at a Prefect server.")
     ] = "worldpose",
     port: PortOption = PAGES_PORT,
     prefect_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Of Prefect's dashboard, on this machine alone.")
+        int, typer.Option(min=1, max=65535, help="Port of Prefect's dashboard on this machine.")
     ] = 4200,
     metrics_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Of the figures for Prometheus.")
+        int, typer.Option(min=1, max=65535, help="Port of the metrics for Prometheus.")
     ] = 8573,
     host: HostOption = "127.0.0.1",
     names: NamesOption = None,
     certificate: CertificateOption = None,
     key: KeyOption = None,
     settle_time: Annotated[
-        float, typer.Option(min=0, help="A match has arrived when unchanged for so long [s].")
+        float,
+        typer.Option(min=0, help="Time without changes until a match counts as complete [s]."),
     ] = 30.0,
     poll_interval: Annotated[
-        float, typer.Option(min=0.1, help="How often the inbox is gone through on schedule [min].")
+        float, typer.Option(min=0.1, help="Interval between scans of the inbox [min].")
     ] = 15.0,
     gate_hours: Annotated[
-        float, typer.Option(min=0.001, help="Waiting for people longer than this alerts [h].")
+        float, typer.Option(min=0.001, help="Age of a pending review that triggers an alert [h].")
     ] = 24.0,
     disk_gb: Annotated[
-        float, typer.Option(min=0, help="Less free space than this alerts [GB].")
+        float, typer.Option(min=0, help="Free disk space below which an alert is sent [GB].")
     ] = 10.0,
     state: Annotated[
         Path | None,
@@ -109,7 +110,7 @@ def serve(
             "--inbox",
             expected="a folder on this machine",
             found="none, and a project on object storage",
-            todo="Name one, as in --inbox /data/arriving.",
+            todo="Name a folder, as in --inbox /data/arriving.",
         )
     given = os.environ.get("PREFECT_API_URL")
     plan = ServePlan(

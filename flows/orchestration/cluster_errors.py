@@ -61,5 +61,5 @@ def require_workers(failure: BaseException) -> None:
         return
     said = str(failure) or type(failure).__name__
     raise LostWorkersError(
-        f"{lost} was lost ({said}). What was finished is kept: run again when it is back."
+        f"{lost} was lost ({said}). Finished results are kept: run again when it is back."
     ) from failure

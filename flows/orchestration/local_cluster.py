@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from flows.orchestration.prefect_environment import START_SECONDS, local_cluster_options
-from flows.planning import PlannedUnit
+from flows.run_plan import PlannedUnit
 
 if TYPE_CHECKING:
     from flows.orchestration.private_cluster import PrivateCluster

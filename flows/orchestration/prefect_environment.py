@@ -316,7 +316,7 @@ def _require_answer(address: str) -> None:
             f"PREFECT_API_URL={address}",
             expected="a running Prefect server",
             found="no answer",
-            todo="Start it, or unset PREFECT_API_URL to run without one.",
+            todo="Start the server, or unset PREFECT_API_URL to run without one.",
         )
     require_login(address)
 
@@ -340,7 +340,7 @@ def require_login(address: str) -> None:
                 CLIENT_LOGIN,
                 expected=f"the login of the Prefect server at {address}",
                 found="another" if headers else "none",
-                todo=f"Set it to what that server has in {SERVER_LOGIN}.",
+                todo=f"Set it to the value of {SERVER_LOGIN} at that server.",
             ) from None
     except (OSError, ValueError):
         return  # the next request reports why it does not answer

@@ -45,7 +45,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
             SERVER_LOGIN,
             expected="the login of Prefect's API, as USER:PASSWORD",
             found="none: every user who reaches it could start runs",
-            todo=f"Set it: export {SERVER_LOGIN}=worldpose:$(openssl rand -hex 16).",
+            todo=f"Set the variable: export {SERVER_LOGIN}=worldpose:$(openssl rand -hex 16).",
         )
     # Garbage collection takes a fifth of the import time, although all modules stay.
     gc.disable()

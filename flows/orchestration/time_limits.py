@@ -40,7 +40,7 @@ def parse_time_limits(given: Sequence[str]) -> TimeLimits:
                 f"--time-limit {text}",
                 expected=f"minutes, or stage=minutes with one of {', '.join(names)}",
                 found=repr(text),
-                todo="For example: --time-limit detection=120.",
+                todo="Write it as in: --time-limit detection=120.",
             )
         limits |= dict.fromkeys([stage] if equals else names, minutes)
     return limits

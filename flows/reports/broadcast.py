@@ -6,10 +6,10 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from flows.reports.flow import flow_pictures
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
@@ -19,8 +19,10 @@ from flows.results.best_results import (
 )
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
-from worldpose.broadcast_calibration import camera_before
+from worldpose.broadcast_calibration import BroadcastCalibrationSettings, camera_before
+from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
 from worldpose.formats import JointTracks, whole_file
+from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import unit_frames
 from worldpose.reports import CaptionedImage
@@ -29,6 +31,7 @@ from worldpose.reports.broadcast import (
     largest_pose_changes,
     plot_before_after,
     plot_camera_course,
+    plot_flow,
 )
 from worldpose.reports.clips import plot_camera_view
 from worldpose.reports.html_page import Table
@@ -240,3 +243,48 @@ def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:
 
 def _numbers(values: list[float]) -> str:
     return ", ".join(f"{value:.2g}" for value in values) or "-"
+
+
+def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[CaptionedImage]:
+    """Draw points tracked between the two frames with the largest camera rotation.
+
+    Args:
+        run: the run.
+        match: the match.
+        clip: a clip with a broadcast camera.
+        camera: the camera, a batch over its frames.
+    """
+    frames = run[f"broadcast_calibration/{clip}"]["frame"].values
+    rotation = camera.cam_from_world.rotation
+    # The angle of R1^T R2 increases as the trace decreases.
+    traces = np.einsum("fab,fab->f", rotation[1:], rotation[:-1])
+    known = np.isfinite(traces) & (np.diff(frames) == 1)
+    if not known.any():
+        return []
+    pair = int(np.argmin(np.where(known, traces, np.inf)))
+    number = int(frames[pair])
+    offset = unit_frames(match.folder.spec, clip).offset
+    with open_video(match.folder.videos[clip]) as video:
+        stills = [video.frame(number + offset + k) for k in (0, 1)]
+    boxes = None
+    for unit in seen_in_broadcast(match, clip):
+        boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)
+    own = run.record.settings.get("broadcast_calibration", {})
+    settings = BroadcastCalibrationSettings.model_validate(own)
+    greys = [np.asarray(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), np.uint8) for still in stills]
+    (followed,) = follow(greys, boxes, settings.flow_points)
+    rays = camera[pair].unproject(followed.start)
+    predicted = camera[pair + 1].project(rays.origins + rays.directions * 100.0)
+    told = np.isfinite(predicted).all(-1)
+    start, end, predicted = followed.start[told], followed.end[told], predicted[told]
+    rejected = modified_z_scores(predicted - end) >= settings.flow_outlier
+    png = plot_flow(stills[0], start, end, rejected, predicted)
+    return [
+        CaptionedImage(
+            f"{clip_title(clip)}, frame {number}, where the camera turns most from one frame to "
+            "the next: points of the background where the next frame has them (arrows), those "
+            "that do not move with the others (orange), and where the found camera puts them "
+            "(yellow).",
+            png,
+        )
+    ]

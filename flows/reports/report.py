@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from data_contracts.evaluation import Evaluation
+from data_contracts.release import DataSetStatistics
+from data_contracts.review import Correction, ReviewDecision, ReviewRequest, Withdrawal
 from data_contracts.run import RunRecord
+from flows.cli.review_text import in_words, when
 from flows.reports.broadcast import (
     broadcast_pictures,
     broadcast_tables,
@@ -15,15 +20,15 @@ from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictu
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, clip_scene, detection_pictures
 from flows.reports.disagreements import disagreement_pictures
-from flows.reports.extents import extent_section, tiles_of
 from flows.reports.people import adjustment_tables, body_tables
-from flows.reports.review import review_table
-from flows.results.best_results import clips_of, static_cameras
+from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
 from flows.results.evaluation import load_reference, score
 from flows.stage import Match
+from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError
 from worldpose.formats import whole_file
-from worldpose.reports import Section, report_page
+from worldpose.reports import Section, Table, report_page
+from worldpose.reports.data_set import counted_section
 from worldpose.reports.run_report import camera_table
 from worldpose.store import Run, Store, open_run
 
@@ -80,7 +85,7 @@ def _check_film(match: Match, camera: str) -> None:
             f"--camera {camera}",
             expected="a static camera that has a video",
             found=f"these have one: {', '.join(sorted(names)) or 'none'}",
-            todo="Name one of them, or leave --camera out.",
+            todo="Name one of them, or omit --camera.",
         )
 
 
@@ -154,3 +159,77 @@ def _seconds(store: Store, record: RunRecord) -> dict[str, float]:
 def _own_reference(match: Match) -> str | None:
     folder = match.folder.folder / "reference"
     return str(folder) if (folder / "joints.npz").is_file() else None
+
+
+def extent_of(run: Run, match: Match) -> DataSetStatistics:
+    """Count clips, frames, poses and distances of a run; a person's position is the mid-hip."""
+    from worldpose.reports.drawing import HIPS
+
+    broadcast = broadcast_cameras(run)
+    clips = {}
+    for clip in clips_of(run.record):
+        places = joint_tracks(run, clip).joints[:, :, HIPS].mean(2)
+        camera = broadcast.get(clip)
+        kind = (
+            "S"
+            if camera is None
+            else kind_of(camera.focal.mean(-1), camera.cam_from_world.rotation)
+        )
+        clips[clip] = clip_statistics(places, match.folder.spec.fps, kind)
+    return data_set_statistics(clips)
+
+
+def extent_section(run: Run, match: Match) -> Section:
+    """Return the data set table row, its histograms, and each clip's share."""
+    return counted_section(extent_of(run, match))
+
+
+def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
+    """Return the key metrics for the top of the report."""
+    found = extent_of(run, match)
+    people = sum(clip.persons for clip in found.clips.values())
+    tiles = [
+        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_counted(found)}"),
+        (f"{people}", "people"),
+        (f"{found.poses:,}", "3D poses"),
+        (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
+        (f"{1000.0 * found.distance_km:,.0f} m", "run and walked by all"),
+    ]
+    if scores is not None and scores.mpjpe_mm is not None and np.isfinite(scores.mpjpe_mm):
+        tiles.append((f"{scores.mpjpe_mm:.0f} mm", "mean error of a joint, against the truth"))
+    return tiles
+
+
+def _counted(found: DataSetStatistics) -> str:
+    return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
+
+
+MOST = 200
+"""Maximum number of rows, the last ones."""
+
+
+def review_table(match: Match) -> list[Table]:
+    """Tabulate verdicts, corrections and withdrawals, first to last; empty without any."""
+    units: dict[str, str] = {}
+    corrections: dict[str, str] = {}
+    rows: list[tuple[str, str, str, str, str]] = []
+    for said in match.journal.records:
+        if isinstance(said, ReviewRequest):
+            units[said.id] = ", ".join(said.keys)
+        elif isinstance(said, ReviewDecision):
+            verdict = {"approve": "approved", "reject": "rejected"}[said.verdict]
+            what = units.get(said.request, said.request)
+            rows.append((when(said.decided_at), said.who, verdict, what, said.why or ""))
+        elif isinstance(said, Correction):
+            corrections[said.id] = in_words(said)
+            rows.append(
+                (when(said.made_at), said.who, "corrected", in_words(said), str(said.note or ""))
+            )
+        elif isinstance(said, Withdrawal):
+            what = corrections.get(said.correction, said.correction)
+            rows.append((when(said.withdrawn_at), said.who, "took back", what, said.why or ""))
+    if not rows:
+        return []
+    left = len(rows) - MOST
+    heading = f"The last {MOST}; {left} came before" if left > 0 else ""
+    return [Table(heading, ("when", "who", "", "what", "why"), tuple(rows[-MOST:]))]

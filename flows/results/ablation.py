@@ -112,9 +112,9 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     }
     names = tuple(calibrations)
     scores = {
-        name + how: _score(scene, clip, names, *row, settings)
+        name + how: _score(scene, clip, names, cameras, changed, settings)
         for how, settings in TRIANGULATIONS.items()
-        for name, row in rows.items()
+        for name, (cameras, changed) in rows.items()
     }
     scores["+ BA + SMPL"] = _score(
         scene, clip, names, both.cameras, both.accepted, _OURS, both.covariance, bodies=True

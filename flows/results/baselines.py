@@ -57,7 +57,7 @@ def score_methods(
             f"--reference {reference}",
             expected="joints.npz" + (f" and cameras/{match_in}.npz" if match_in else ""),
             found=f"cameras {', '.join(cameras)}" if cameras else "no cameras",
-            todo="Name the folder that holds them.",
+            todo="Name the folder that contains these files.",
         )
     camera = None if match_in is None else cameras[match_in]
     frames = truth.joints.frames
@@ -74,7 +74,7 @@ def score_methods(
                 f"--method {item}",
                 expected=f"{name}=PATH of its result",
                 found=f"{path or 'no path'}, which does not exist",
-                todo="Name the file or folder that the method wrote.",
+                todo="Name the file or folder of the method's result.",
             )
         result = method.read(Path(path), model, _image_size(camera))
         if name in (seen_fps or {}):
@@ -82,9 +82,9 @@ def score_methods(
         if result.world != "shared" and (camera is None or result.boxes is None):
             raise UsageError(
                 f"--method {item}",
-                expected="--match-in CAMERA: its people have no common world",
+                expected="--match-in CAMERA, since its people have no common world frame",
                 found=f"--match-in {match_in}",
-                todo="Name the reference's camera that the method saw.",
+                todo="Name the camera of the reference whose video the method used.",
             )
         joints = JointTracks(
             result.joints.frames + first, result.joints.person_ids, result.joints.joints
@@ -123,7 +123,7 @@ def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None
                 f"--method-fps {name}",
                 expected=f"one of {', '.join(names)}",
                 found=repr(name),
-                todo="Name it as --method does.",
+                todo="Use the name from --method.",
             )
 
 
@@ -131,9 +131,9 @@ def _clip_fps(fps: float | None, name: str) -> float:
     if fps is None:
         raise UsageError(
             f"--method-fps {name}",
-            expected="--fps, the clip's own frames in a second",
-            found="neither that nor a match that says it",
-            todo="Give --fps.",
+            expected="--fps, the frames per second of the clip",
+            found="neither --fps nor a match that states it",
+            todo="Add --fps.",
         )
     return fps
 

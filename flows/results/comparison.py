@@ -14,10 +14,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats
 from data_contracts.run import RunRecord
-from flows.results.best_results import BODY_STAGES
-from flows.results.pairing import paired_people
-from worldpose.store import Store
+from flows.registering import find_registration
+from flows.results.best_results import BODY_STAGES, bodies_unit, static_cameras
+from worldpose.geometry import Camera
+from worldpose.store import Run, Store
 
 Kind = Literal["match", "clip", "camera", "player"]
 Mark = Literal["better", "worse", "mixed", "unchanged", "only in A", "only in B"]
@@ -93,15 +98,16 @@ def count_marks(changes: list[SubjectChange], kind: Kind) -> dict[Mark, int]:
 
 
 def _change(subject: Subject, before: Figures | None, after: Figures | None) -> SubjectChange:
+    kind, name = subject
     if before is None or after is None:
-        return SubjectChange(*subject, "only in B" if before is None else "only in A", ())
+        return SubjectChange(kind, name, "only in B" if before is None else "only in A", ())
     figures = tuple(
-        Change(name, before[name], after[name], _mark(name, before[name], after[name]))
-        for name in sorted(before.keys() & after.keys())
+        Change(figure, before[figure], after[figure], _mark(figure, before[figure], after[figure]))
+        for figure in sorted(before.keys() & after.keys())
     )
     marks = {change.mark for change in figures} - {"unchanged"}
     over_all: Mark = "mixed" if len(marks) > 1 else next(iter(marks), "unchanged")
-    return SubjectChange(*subject, over_all, figures)
+    return SubjectChange(kind, name, over_all, figures)
 
 
 def _mark(figure: str, before: float, after: float) -> Mark:
@@ -152,3 +158,169 @@ def _order(subject: Subject) -> tuple[int, list[str | int]]:
     kind, name = subject
     parts = re.split(r"(\d+)", name)
     return KINDS.index(kind), [int(part) if part.isdigit() else part for part in parts]
+
+
+FRAMES: Final = 50
+"""Frames whose positions are compared, spread over a clip, so that briefly close people differ."""
+NEAR: Final = 1.0
+"""Maximum mean joint distance of one person [m]: no two people stay closer for long."""
+
+
+def paired_people(store: Store, a: RunRecord, b: RunRecord) -> dict[tuple[str, str], str]:
+    """Map clip and `person<id>` of B to the name in A, for people whose name in A differs.
+
+    A person of B without a match in A is named `person<id> of B`.
+    """
+    names = {}
+    for bodies in bodies_of_both(Run(store, a), Run(store, b)):
+        pairs = bodies.pairs()
+        for place, person in enumerate(bodies.person_after.tolist()):
+            known = pairs.get(place)
+            name = f"person{person} of B"
+            if known is not None:
+                name = f"person{bodies.person_before[known]}"
+            if name != f"person{person}":
+                names[bodies.clip, f"person{person}"] = name
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class BodiesOfBoth:
+    """Bodies of one clip in two runs, in their common frames.
+
+    Attributes:
+        clip: its id.
+        frame: (frames,) match frames.
+        person_before: (persons,) ids in A.
+        person_after: (others,) ids in B.
+        before: (frames, persons, 17, 3) [m], world, of A.
+        after: (frames, others, 17, 3) [m], world, of B.
+    """
+
+    clip: str
+    frame: NDArray[np.integer]
+    person_before: NDArray[np.integer]
+    person_after: NDArray[np.integer]
+    before: Floats
+    after: Floats
+
+    def pairs(self) -> dict[int, int]:
+        """Map person indices of B to those of A, for matched people."""
+        step = max(len(self.frame) // FRAMES, 1)
+        return pair_people(self.before[::step], self.after[::step])
+
+
+def bodies_of_both(a: Run, b: Run) -> Iterator[BodiesOfBoth]:
+    """Yield the clips whose bodies differ between two runs."""
+    clips = {unit.partition("/")[2] for unit in a if unit.startswith("body_fitting/")}
+    for clip in sorted(clips):
+        one, other = bodies_unit(a, clip), bodies_unit(b, clip)
+        if other not in b or a.record.results[one] == b.record.results[other]:
+            continue
+        frames = np.intersect1d(a[one]["frame"].values, b[other]["frame"].values)
+        before, after = (found.sel(frame=frames) for found in (a[one], b[other]))
+        yield BodiesOfBoth(
+            clip,
+            frames,
+            before["person"].values,
+            after["person"].values,
+            before["joints"].values,
+            after["joints"].values,
+        )
+
+
+def pair_people(before: Floats, after: Floats) -> dict[int, int]:
+    """Map indices of `after` to those of `before`, for mutual nearest neighbours.
+
+    Args:
+        before: (frames, persons, joints, 3) [m].
+        after: (frames, others, joints, 3) [m], in the same frames.
+    """
+    if not before.shape[1] or not after.shape[1]:
+        return {}
+    away = np.linalg.norm(before[:, :, None] - after[:, None], axis=-1)
+    known = np.isfinite(away)
+    count = known.sum(axis=(0, 3))
+    total = np.where(known, away, 0.0).sum(axis=(0, 3))
+    mean = np.divide(total, count, out=np.full(count.shape, np.inf), where=count > 0)
+    nearest = mean.argmin(axis=0)
+    return {
+        other: int(person)
+        for other, person in enumerate(nearest)
+        if mean[person].argmin() == other and mean[person, other] <= NEAR
+    }
+
+
+JOINTS: Final = 9
+"""Minimum number of a person's joints, of 17, inside the image."""
+
+
+@dataclass(frozen=True)
+class PoseChange:
+    """Largest pose change in one camera's image.
+
+    Attributes:
+        clip: its id.
+        camera: its id.
+        frame: match frame.
+        person: id in the first run.
+        moved_px: mean distance between the person's joints in the two runs [px].
+    """
+
+    clip: str
+    camera: str
+    frame: int
+    person: int
+    moved_px: float
+
+
+def largest_pose_changes(
+    store: Store, a: RunRecord, b: RunRecord, most: int = 5
+) -> list[PoseChange]:
+    """Return the images with the largest pose changes, one per camera and clip, largest first.
+
+    Each run's bodies are projected with its own cameras.
+
+    Args:
+        store: with both runs.
+        a: the first run.
+        b: the second run, of the same match.
+        most: maximum number of images.
+    """
+    spec = find_registration(store, a.match_id).spec
+    ours, theirs = Run(store, a), Run(store, b)
+    before, after = static_cameras(ours, spec), static_cameras(theirs, spec)
+    found = []
+    for bodies in bodies_of_both(ours, theirs):
+        for name in sorted(before.keys() & after.keys()):
+            found += _worst(bodies, name, before, after)
+    return sorted(found, key=lambda picture: -picture.moved_px)[:most]
+
+
+def _worst(
+    bodies: BodiesOfBoth, name: str, before: Mapping[str, Camera], after: Mapping[str, Camera]
+) -> list[PoseChange]:
+    """Return a camera's image with the largest change; empty if no person of both runs is in it."""
+    pairs = bodies.pairs()
+    if not pairs or not len(bodies.frame):
+        return []
+    people = list(pairs.values())
+    one = before[name].project(bodies.before[:, people])
+    other = after[name].project(bodies.after[:, list(pairs)])
+    away = np.linalg.norm(one - other, axis=-1)
+    inside = ((one >= 0) & (one < before[name].image_size)).all(axis=-1) & np.isfinite(away)
+    joints = inside.sum(axis=-1)
+    mean = np.where(inside, away, 0.0).sum(axis=-1) / np.maximum(joints, 1)
+    mean[joints < JOINTS] = -1.0
+    frame, place = np.unravel_index(int(mean.argmax()), mean.shape)
+    if mean[frame, place] < 0:
+        return []
+    return [
+        PoseChange(
+            bodies.clip,
+            name,
+            int(bodies.frame[frame]),
+            int(bodies.person_before[people[place]]),
+            float(mean[frame, place]),
+        )
+    ]

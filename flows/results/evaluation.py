@@ -100,7 +100,7 @@ def score(
             f"--match-in {match_in}",
             expected=f"a camera of the reference: {', '.join(true_cameras) or 'it has none'}",
             found=repr(match_in),
-            todo="Name one of these, or leave the option out.",
+            todo="Name one of these, or omit the option.",
         )
     evaluation = Evaluation()
     people: tuple[PersonScore, ...] = ()
@@ -117,7 +117,7 @@ def score(
             f"--prediction {prediction} --reference {reference}",
             expected="joints on both sides, or cameras of the same names",
             found=f"{_contents(estimate)} against {_contents(truth)}",
-            todo="Name files or folders that hold the same things.",
+            todo="Name files or folders with the same kind of data.",
         )
     return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras, laid)
 
@@ -129,9 +129,9 @@ def _laid_over(
     if prediction is None or fps is None:
         raise UsageError(
             f"--reference {path}",
-            expected="joints to lay markers over, and their frame rate",
+            expected="predicted joints to align the markers with, and their frame rate",
             found="no joints" if prediction is None else "no frame rate",
-            todo="Name a prediction with joints, and give --fps where it belongs to no match.",
+            todo="Name a prediction with joints, and give --fps if it belongs to no match.",
         )
     markers = read_markers(path)
     people = map_marker_names(markers.names) if marker_map is None else read_marker_map(marker_map)
@@ -180,7 +180,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             f"--prediction {name}",
             expected="one clip",
             found=f"a match of {len(clips)} clips",
-            todo="Export it and score clip by clip.",
+            todo="Export the match and score clip by clip.",
         )
     cameras = static_cameras(run, spec, stage) | broadcast_cameras(run) if truth.cameras else {}
     return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
@@ -200,7 +200,7 @@ def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str,
                 str(Path(reference) / "cameras" / f"{name}.npz"),
                 expected=f"a camera or clip of the match: {', '.join([*sizes, *clips])}",
                 found=repr(name),
-                todo="Rename the file, or take it out.",
+                todo="Rename or remove the file.",
             )
         file = Path(reference) / "cameras" / f"{name}.npz"
         cameras[name] = read_camera(file, sizes[camera_id])

@@ -78,7 +78,7 @@ def export_people(
             str(folder),
             expected="an absent or empty folder",
             found="files",
-            todo="Name another folder: what people annotated is never overwritten.",
+            todo="Choose another folder: annotations are never overwritten.",
         )
     (folder / PICTURES).mkdir(parents=True)
     exported, unseen = [], 0

@@ -86,9 +86,9 @@ def new_corrections(
     if standing != tuple(match.journal.standing.values()):
         raise InputError(
             f"corrections of {match.match_id}",
-            expected="those that were there when this was begun",
-            found="others, made in between",
-            todo="Look at them with `worldpose review show`, and correct again.",
+            expected="the corrections that existed when this edit began",
+            found="others, which were made since",
+            todo="Read them with `worldpose review show`, and repeat the correction.",
         )
     folder, said = match.folder, []
     for number, given in enumerate(edits):
@@ -110,7 +110,7 @@ def new_corrections(
                 f"edit {number + 1} of {len(edits)}, {edit.kind}",
                 expected="one that applies",
                 found=replay.stale[0][1] if replay.stale else "one that changes nothing",
-                todo="Correct it; none of these edits was taken in.",
+                todo="Fix this edit; none of the edits was recorded.",
             )
         folder = replay.folder
         said.append(correction)
@@ -173,7 +173,7 @@ def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit
         f"{edit.marking} in {edit.camera}",
         expected=f"{edit.was or 'not there'}, as it was when this was begun",
         found=found,
-        todo="Look at it, and correct it again where it is still wrong.",
+        todo="Reload the page, and repeat the correction if it is still needed.",
     )
     error.difference = {
         "camera": edit.camera,

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from pydantic import JsonValue
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.review import Edit
+from data_contracts.review import Acceptance, Edit
 from flows.review.edit_conflicts import StaleEditError, edits_since
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
+from worldpose.review import say
 from worldpose.review.detections import (
     DETECTION_EDITS,
     DetectionEdit,
     find_objection,
     replay_detections,
 )
+from worldpose.review.evidence import OpenDetections, open_detections
 from worldpose.store import Store, recipe_key
 
-if TYPE_CHECKING:  # imports dask, which planning a run must not load
+if TYPE_CHECKING:
     import xarray as xr
 
 
@@ -60,7 +64,7 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
             continue
         place = (edit.camera, edit.frame)
         if place not in found:
-            found[place] = detections_now(store, match, *place)
+            found[place] = detections_now(store, match, edit.camera, edit.frame)
         objection = (
             find_objection(found[place], edit) if len(found[place].frame) else "no such frame"
         )
@@ -72,9 +76,9 @@ def require_seen(store: Store, match: Match, edits: Sequence[Edit]) -> None:
 def _stale(edit: DetectionEdit, objection: str) -> StaleEditError:
     error = StaleEditError(
         f"{edit.camera}, frame {edit.frame}, {edit.kind}",
-        expected="a correction that fits what is seen by now",
+        expected="a correction that fits the current detections",
         found=objection,
-        todo="Look at it again.",
+        todo="Load the frame again and repeat the correction if it is still needed.",
     )
     error.difference = {"camera": edit.camera, "frame": edit.frame, "now": objection}
     return error
@@ -111,9 +115,9 @@ def results_of(
         place = f"{match.match_id}, {camera}"
         raise InputError(
             place if frame is None else f"{place}, frame {frame}",
-            expected="people seen there in the latest run",
+            expected="detections of this camera in the latest run",
             found="none",
-            todo=f"Run it first: worldpose run {match.match_id}.",
+            todo=f"Run the match first: worldpose run {match.match_id}.",
         )
     return found
 
@@ -151,13 +155,77 @@ class _Result:
 def _result(store: Store, match: Match, name: str) -> _Result:
     """Return a result of the latest run, by `stage/unit`."""
     stage, _, unit = name.partition("/")
-    key = store.run(match.match_id).results[name]
-    place = (match.match_id, stage, unit)
-    recipe = store.manifest(*place, key).recipe
+    match_id = match.match_id
+    key = store.run(match_id).results[name]
+    recipe = store.manifest(match_id, stage, unit, key).recipe
     sources = dict(recipe.sources)
     taken_in = sources.pop("edits", None) or []
     assert isinstance(taken_in, list)
     plain = recipe_key(recipe.model_copy(update={"sources": sources}))
-    if store.has(*place, plain):
-        return _Result(store.open_result(*place, plain), plain, [])
-    return _Result(store.open_result(*place, key), plain, taken_in)
+    if store.has(match_id, stage, unit, plain):
+        return _Result(store.open_result(match_id, stage, unit, plain), plain, [])
+    return _Result(store.open_result(match_id, stage, unit, key), plain, taken_in)
+
+
+def left_to_look_at(store: Store, match: Match, camera: str) -> list[OpenDetections]:
+    """Return the detections that no person has accepted or corrected, by result of the camera.
+
+    Args:
+        store: the store.
+        match: the match with its journal.
+        camera: a static camera, or the clip of a broadcast camera.
+
+    Raises:
+        InputError: the latest run has no detections of this camera.
+    """
+    said = [each for each in match.journal.records if isinstance(each, Acceptance)]
+    edits = [
+        correction.edit
+        for correction in match.corrections
+        if isinstance(correction.edit, DETECTION_EDITS) and correction.edit.camera == camera
+    ]
+    found = []
+    for name in results_of(store, match, camera):
+        result, plain = stored_people(store, match, name)
+        accepted = [each for each in said if each.results.get(name) == plain]
+        found.append(
+            open_detections(result["frame"].values, result["score"].values, accepted, edits)
+        )
+    return found
+
+
+def accept(
+    store: Store,
+    match: Match,
+    camera: str,
+    *,
+    at_least: float | None,
+    people: Sequence[tuple[int, int]],
+    who: str,
+) -> Acceptance:
+    """Record in the journal that a person accepted detections.
+
+    Args:
+        store: the store that holds the journal.
+        match: the match.
+        camera: a static camera, or the clip of a broadcast camera.
+        at_least: accept every detection with at least this score [1]; None = only those in
+            `people`.
+        people: match frame, and index among the detections of the frame.
+        who: name of the reviewer.
+
+    Raises:
+        InputError: the latest run has no detections of this camera.
+    """
+    names = results_of(store, match, camera)
+    acceptance = Acceptance(
+        id=f"acceptance.{uuid.uuid4().hex[:12]}",
+        match_id=match.match_id,
+        results={name: stored_people(store, match, name)[1] for name in names},
+        at_least=at_least,
+        people=tuple(people),
+        who=who,
+        accepted_at=datetime.now(UTC),
+    )
+    say(store, match.match_id, lambda journal: [acceptance])
+    return acceptance

@@ -47,7 +47,7 @@ def edits_since(
         raise InputError(
             f"{match_id}, {place}",
             expected="a result without the corrections that were withdrawn since",
-            found="one that holds them",
-            todo=f"Run it first: worldpose run {match_id}.",
+            found="one that contains them",
+            todo=f"Run the match first: worldpose run {match_id}.",
         )
     return later

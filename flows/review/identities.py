@@ -54,9 +54,9 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         if objection is not None:
             error = StaleEditError(
                 f"clip {edit.clip}, {edit.kind}",
-                expected="a correction that fits who is who by now",
+                expected="a correction that fits the current identities",
                 found=objection,
-                todo="Look at the clip again.",
+                todo="Load the clip again and repeat the correction if it is still needed.",
             )
             error.difference = {"clip": edit.clip, "kind": edit.kind, "now": objection}
             raise error
@@ -72,14 +72,14 @@ def _found(store: Store, match: Match, clip: str) -> tuple[Identities, list[Json
             f"{match.match_id}, clip {clip}",
             expected="tracks in the latest run",
             found="none",
-            todo=f"Run it first: worldpose run {match.match_id}.",
+            todo=f"Run the match first: worldpose run {match.match_id}.",
         )
-    unit = (match.match_id, "tracking", clip)
-    recipe = store.manifest(*unit, key).recipe
+    match_id, stage = match.match_id, "tracking"
+    recipe = store.manifest(match_id, stage, clip, key).recipe
     sources = dict(recipe.sources)
     taken_in = sources.pop("identities", None) or []
     assert isinstance(taken_in, list)
     plain = recipe_key(recipe.model_copy(update={"sources": sources}))
-    if taken_in and not store.has(*unit, plain):
-        return stored_identities(store.open_result(*unit, key)), taken_in
-    return stored_identities(store.open_result(*unit, plain)), []
+    if taken_in and not store.has(match_id, stage, clip, plain):
+        return stored_identities(store.open_result(match_id, stage, clip, key)), taken_in
+    return stored_identities(store.open_result(match_id, stage, clip, plain)), []

@@ -32,14 +32,14 @@ def propose(videos: Sequence[Path], every: int, folder: Path, settings: Detectio
             str(folder),
             expected="an absent or empty folder",
             found="files",
-            todo="Name another folder: labels that people corrected are never overwritten.",
+            todo="Choose another folder: corrected labels are never overwritten.",
         )
     if len({video.stem for video in videos}) < len(videos):
         raise InputError(
             "videos",
             expected="files of different names",
             found=", ".join(video.name for video in videos),
-            todo="Rename one: its name is that of its frames' pictures.",
+            todo="Rename one: the images of its frames are named after it.",
         )
     frames = _frames(videos, every)
     return len(
@@ -58,7 +58,7 @@ def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, NDArray[n
                         str(video),
                         expected=f"pictures of {shape[1]} x {shape[0]} as in the videos before",
                         found=f"{picture.shape[1]} x {picture.shape[0]}",
-                        todo="Label videos of another size in a folder of their own.",
+                        todo="Label videos of another size in a separate folder.",
                     )
                 shape = picture.shape
                 yield f"{video.stem}_{number:06d}", picture

@@ -9,7 +9,7 @@ from typing import Literal
 
 from data_contracts.review import Correction, Edit, Origin, ReviewDecision, ReviewRequest
 from data_contracts.run import RunRecord, WaitingUnit
-from flows.method import GATES
+from flows.gates import GATES
 from flows.orchestration.prefect_environment import has_server
 from flows.review.corrections import new_corrections, withdrawal
 from flows.review.edit_conflicts import StaleEditError
@@ -64,7 +64,10 @@ def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
     results = {} if latest is None else latest.results
     found = []
     for request in requests_by_id(journal.questions).values():
-        decisions = [last_decision(journal.questions, *each) for each in request.contents.items()]
+        decisions = [
+            last_decision(journal.questions, unit, content)
+            for unit, content in request.contents.items()
+        ]
         is_current = any(results.get(unit) == key for unit, key in request.keys.items())
         found.append(Review(request, decisions[0] if decisions else None, is_current))
     return found
@@ -131,7 +134,7 @@ def decide(
                 f"review {unknown[0]}" if unknown else f"reviews of {match.match_id}",
                 expected=f"what the latest run asks about: {', '.join(current) or '(nothing)'}",
                 found="no such question" if unknown else "nothing that waits",
-                todo=f"List them: worldpose review list {match.match_id}.",
+                todo=f"List the pending reviews: worldpose review list {match.match_id}.",
             )
         for name in ids:
             if seen is not None and current[name].state != seen.get(name):
@@ -233,15 +236,15 @@ def resume(store: Store, match: Match) -> list[str]:
             f"resuming {match_id}",
             expected="PREFECT_API_URL, the server that keeps the suspended run",
             found="none",
-            todo=f"A run without a server goes on with: worldpose run {match_id}.",
+            todo=f"Continue a run without a server: worldpose run {match_id}.",
         )
     waiting = [r for r in reviews_of(match, latest_run(store, match_id)) if r.state == "waits"]
     if waiting:
         raise InputError(
             f"resuming {match_id}",
-            expected="a verdict on all that waits",
+            expected="a verdict on every pending review",
             found=f"none on {', '.join(review.request.id for review in waiting)}",
-            todo="Decide first: worldpose review approve, or reject.",
+            todo="Decide first: worldpose review approve, or worldpose review reject.",
         )
     from flows.orchestration.suspension import (
         resume_suspended,  # imported here: Prefect takes seconds to import

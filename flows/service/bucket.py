@@ -41,7 +41,7 @@ class BucketInbox:
                 f"--bucket {url}",
                 expected="s3://bucket or s3://bucket/prefix",
                 found=repr(url),
-                todo="Name one, as in --bucket s3://arriving/matches.",
+                todo="Name a bucket, as in --bucket s3://arriving/matches.",
             )
         self._objects = ObjectBlobs.at(url)
         self._file = state.folder / "bucket.json"

@@ -63,10 +63,20 @@ def watch(plan: ServePlan) -> None:
 
 
 def pages(plan: ServePlan) -> None:
-    """Serve the review pages and the status page."""
-    from flows.service.pages import serve_pages
+    """Serve the review pages and the status page until this process ends."""
+    from flows.web.access import access_for
+    from flows.web.serving import serve
 
-    serve_pages(plan)
+    access = access_for(
+        plan.host,
+        token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # hide it from runs that pages start
+        names=plan.names,
+        secure=plan.certificate is not None,
+    )
+    tls = None
+    if plan.certificate is not None and plan.key is not None:
+        tls = (plan.certificate, plan.key)
+    serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls)
 
 
 PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}

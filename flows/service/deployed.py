@@ -13,7 +13,7 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.deployments import run_deployment
 from prefect.task_runners import TaskRunner
 from prefect_dask import DaskTaskRunner
-from pydantic import TypeAdapter, ValidationError
+from pydantic import JsonValue, TypeAdapter, ValidationError
 
 from data_contracts.finetune import NetKind
 from data_contracts.operations import Arrival
@@ -21,7 +21,9 @@ from data_contracts.records import Name
 from flows.match import process_match
 from flows.orchestration.prefect_environment import served_cluster
 from flows.registering import open_match
-from flows.service.arrivals import take_in
+from flows.reprocess import reprocess_matches
+from flows.running import RunRequest
+from flows.service.inbox import take_in
 from flows.service.plan import ServePlan
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
@@ -90,6 +92,49 @@ def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
     return str(cast("FlowRun", begun).id)  # already awaited, outside an event loop
 
 
+class UnprocessedError(WorldposeError):
+    """Some matches could not be recomputed; the others are current."""
+
+
+@flow(name="reprocess", validate_parameters=False)
+def reprocess(
+    project: str,
+    matches: tuple[str, ...] | list[str] = (),
+    settings: dict[str, dict[str, JsonValue]] | None = None,
+    retry: bool = False,
+    dask: str | None = None,
+    workers: int | None = None,
+    time_limits: dict[str, float] | None = None,
+) -> dict[str, str]:
+    """Recompute the stale results of every match of a project; return each match's state.
+
+    Nothing is started if nothing is stale. A match that waits for review is no failure; its run
+    continues when this flow is called again after the verdict.
+
+    Args:
+        project: folder or URL of the store.
+        matches: ids of registered matches; none = all.
+        settings: stage to settings that override those of each match's latest run.
+        retry: retry failed units, even without an edit.
+        dask: address of a running Dask scheduler; None starts workers on this machine.
+        workers: number of worker processes on this machine; None = one per core.
+        time_limits: stage to the time limit of a unit [min], if not the default.
+
+    Raises:
+        UnprocessedError: some matches failed or are partial; the others are done.
+    """
+    request = RunRequest(settings or {}, dask=dask, workers=workers, time_limits=time_limits or {})
+    found = reprocess_matches(Store.open(project), tuple(matches), request, retry=retry)
+    unprocessed = [
+        f"{each.match_id} is {each.state}" + (f": {each.problem}" if each.problem else "")
+        for each in found
+        if each.state in ("failed", "partial")
+    ]
+    if unprocessed:
+        raise UnprocessedError("; ".join(unprocessed))
+    return {each.match_id: each.state for each in found}
+
+
 @flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
 def release(
     project: str,
@@ -113,8 +158,8 @@ def release(
         WorldposeError: the latest run is not complete.
     """
     from flows.reports.report import write_report
-    from flows.results.formats import Origin  # imported here, as everything that few runs need
-    from flows.results.releasing import release as write_release
+    from flows.results.export import Origin  # imported here, as everything that few runs need
+    from flows.results.export import release as write_release
 
     store = Store.open(project)
     opened = open_match(store, match_id)
@@ -122,7 +167,7 @@ def release(
     if run.record.state != "complete":
         raise WorldposeError(
             f"run {run.record.run_id} of {match_id}: expected a complete one, found "
-            f"{run.record.state}. Run the match to the end, and approve what waits, first."
+            f"{run.record.state}. Run the match to the end and decide the pending reviews first."
         )
     folder = release_folder(store, opened.match_id, name, out)
     origin = Origin(run, opened.registration, None)
@@ -152,7 +197,7 @@ def release_folder(store: Store, match_id: str, name: str, out: str | None) -> P
             f"release {name!r}",
             expected="a name of letters, digits, `.`, `_` and `-`",
             found=repr(name),
-            todo="Choose such a name.",
+            todo="Choose a name of these characters.",
         ) from None
     if "://" in store.url:
         raise UsageError(

@@ -128,7 +128,7 @@ def state_folder(project: str, given: Path | None) -> StateFolder:
             f"worldpose serve --project {project}",
             expected="--state, a folder on this machine for Prefect's database and logs",
             found="none",
-            todo="Name one, as in --state /var/lib/worldpose.",
+            todo="Name a folder, as in --state /var/lib/worldpose.",
         )
     return StateFolder(Path(project).resolve() / "operations")
 

@@ -18,10 +18,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.registry import Collector
 
-from flows.gates import Figures
-from flows.method import GATES
+from flows.gates import GATES, Figures
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, Overview, UnitGlance, age
+from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.service.plan import ServePlan
 from flows.web.host_guard import LOOPBACK, host_name
 from flows.web.http_server import Connections
@@ -222,7 +221,7 @@ def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
 
 
 def _judged(
-    units: tuple[UnitGlance, ...], judged: Callable[[Figures], Figures], name: str
+    units: tuple[UnitSummary, ...], judged: Callable[[Figures], Figures], name: str
 ) -> list[float]:
     figures = [judged(unit.figures) for unit in units if unit.figures]
     return [each[name] for each in figures if name in each]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Literal
 
 from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import ResultManifest, RunRecord
-from flows.method import GATES, METHOD
+from flows.gates import GATES
+from flows.method import METHOD
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.review import last_decision, read_journal, requests_by_id
@@ -22,7 +23,7 @@ BODIES = "body_fitting"
 
 
 @dataclass(frozen=True)
-class UnitGlance:
+class UnitSummary:
     """One unit of a match's latest run.
 
     Attributes:
@@ -59,7 +60,7 @@ class MatchStatus:
     match_id: str
     latest: RunRecord | None = None
     at_work_since: datetime | None = None
-    stages: Mapping[str, tuple[UnitGlance, ...]] = field(default_factory=dict)
+    stages: Mapping[str, tuple[UnitSummary, ...]] = field(default_factory=dict)
     problem: str = ""
 
     @property
@@ -72,7 +73,7 @@ class MatchStatus:
         return "not run" if self.latest is None else self.latest.state
 
     @property
-    def units(self) -> Iterable[tuple[str, UnitGlance]]:
+    def units(self) -> Iterable[tuple[str, UnitSummary]]:
         """Yield all units with their stage."""
         return ((stage, unit) for stage, units in self.stages.items() for unit in units)
 
@@ -116,14 +117,14 @@ class Overview:
         stages = {} if latest is None else self._stages(latest)
         return MatchStatus(match_id, latest, at_work[-1] if at_work else None, stages)
 
-    def _stages(self, run: RunRecord) -> dict[str, tuple[UnitGlance, ...]]:
+    def _stages(self, run: RunRecord) -> dict[str, tuple[UnitSummary, ...]]:
         records = read_journal(self.store, run.match_id).questions
         asked = requests_by_id(records)
-        units: dict[str, list[UnitGlance]] = {}
+        units: dict[str, list[UnitSummary]] = {}
         for name, glance in (
             *((name, self._result(run, name, records, asked)) for name in sorted(run.results)),
             *((each.unit, _failed(each.unit, each.message)) for each in run.failed),
-            *((name, UnitGlance(_unit(name), "blocked")) for name in run.blocked),
+            *((name, UnitSummary(_unit(name), "blocked")) for name in run.blocked),
         ):
             units.setdefault(name.partition("/")[0], []).append(glance)
         return {
@@ -138,19 +139,21 @@ class Overview:
         name: str,
         records: tuple[ReviewRecord, ...],
         asked: Mapping[str, ReviewRequest],
-    ) -> UnitGlance:
+    ) -> UnitSummary:
         manifest = self._manifest(run.match_id, name, run.results[name])
         decision = last_decision(records, name, manifest.content)
         is_approved = decision is not None and decision.verdict == "approve"
         gate = {each.stage: each for each in GATES}.get(name.partition("/")[0])
         objections = () if gate is None or is_approved else gate.objections(manifest.figures)
         waits = next((each for each in run.waiting if each.unit == name), None)
-        known = (manifest.seconds, manifest.figures, objections)
+        done = UnitSummary(
+            _unit(name), "done", manifest.seconds, manifest.figures, objections=objections
+        )
         if waits is None or is_approved:
-            return UnitGlance(_unit(name), "done", *known)
+            return done
         request = asked.get(waits.request)
         since = run.finished_at if request is None else request.created_at
-        return UnitGlance(_unit(name), "waiting", *known, since, "; ".join(waits.reasons))
+        return replace(done, state="waiting", waiting_since=since, why="; ".join(waits.reasons))
 
     def _manifest(self, match_id: str, name: str, key: str) -> ResultManifest:
         stage, _, unit = name.partition("/")
@@ -166,8 +169,8 @@ def age(since: datetime | None) -> float:
     return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
 
 
-def _failed(name: str, message: str) -> UnitGlance:
-    return UnitGlance(_unit(name), "failed", why=message)
+def _failed(name: str, message: str) -> UnitSummary:
+    return UnitSummary(_unit(name), "failed", why=message)
 
 
 def _unit(name: str) -> str:

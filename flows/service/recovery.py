@@ -7,6 +7,7 @@ events, not states, and cannot tell a suspended run from a killed one.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
@@ -55,15 +56,15 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
     again = []
     async with get_client() as client:
         if at_start and plan.owns_prefect:
-            for run in await _runs(client, plan, *AT_WORK):
+            for run in await _runs(client, plan, AT_WORK):
                 was_cancelled = run.state_type == StateType.CANCELLING
                 state: State[Any] = Cancelled() if was_cancelled else Crashed(message=KILLED)
                 await client.set_flow_run_state(run.id, state, force=True)
         else:
-            for run in await _runs(client, plan, StateType.RUNNING, StateType.PENDING):
+            for run in await _runs(client, plan, (StateType.RUNNING, StateType.PENDING)):
                 if await _is_dead(client, plan, run):
                     await client.set_flow_run_state(run.id, Crashed(message=KILLED), force=True)
-        for run in await _runs(client, plan, StateType.CRASHED, StateType.FAILED):
+        for run in await _runs(client, plan, (StateType.CRASHED, StateType.FAILED)):
             if may_begin_again(run):
                 why = KILLED if run.state_type == StateType.CRASHED else "its machines were lost"
                 LOG.warning("%s: %s; it begins again", run.name, why)
@@ -105,7 +106,10 @@ async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool
     return not signs.events
 
 
-async def _runs(client: PrefectClient, plan: ServePlan, *states: StateType) -> list[FlowRun]:
+async def _runs(
+    client: PrefectClient, plan: ServePlan, states: Sequence[StateType]
+) -> list[FlowRun]:
+    """Return the runs of the project's deployments that are in one of these states."""
     return await client.read_flow_runs(
         flow_run_filter=FlowRunFilter(
             state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states)))

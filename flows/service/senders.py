@@ -65,7 +65,7 @@ class Webhook:
                 "WORLDPOSE_ALERT_URL",
                 expected="https://HOST/PATH (or http:)",
                 found="something else, which may hold a secret",
-                todo="Set it so, or unset it to post nothing.",
+                todo="Correct the variable, or unset it to post nothing.",
             )
         return cls(address)
 
@@ -124,7 +124,7 @@ class Mail:
                 "WORLDPOSE_ALERT_MAIL",
                 expected="smtps://USER:PASSWORD@HOST/?to=SOMEBODY@EXAMPLE.ORG",
                 found="something else, which may hold a secret",
-                todo="Set it so, or unset it to send no mail.",
+                todo="Correct the variable, or unset it to send no mail.",
             ) from None
         user, password = unquote(parts.username or ""), unquote(parts.password or "")
         return cls(host, port, is_secure, user, password, sender, receivers)

@@ -80,7 +80,7 @@ def secrets_of(plan: ServePlan, pages: str) -> Secrets:
             METRICS_TOKEN,
             expected=f"at least {TOKEN_LENGTH} characters",
             found=f"{len(metrics)}",
-            todo="Make one with: openssl rand -hex 16.",
+            todo="Create a token with: openssl rand -hex 16.",
         )
     state = plan.state_folder
     if metrics is None:

@@ -182,7 +182,7 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 f"worldpose serve --project {plan.project}",
                 expected="nothing that serves this project yet",
                 found=f"another process; see {state.serving}",
-                todo="See how it is with --check, or end it first.",
+                todo="Read its state with --check, or end it first.",
             )
         with _until_told() as told:
             supervisor = _Supervisor(plan, secrets, tell)
@@ -244,7 +244,7 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
             f"PREFECT_API_URL={plan.prefect}",
             expected="a running Prefect server",
             found="no answer",
-            todo="Start it, or unset PREFECT_API_URL to have one started.",
+            todo="Start the server, or unset PREFECT_API_URL: then worldpose starts one.",
         )
     else:
         require_login(plan.prefect)

@@ -16,8 +16,8 @@ from data_contracts.operations import Arrival
 from flows.method import METHOD
 from flows.progress import in_short
 from flows.service.layout import served_state
-from flows.service.overview import MatchStatus, Overview, UnitGlance, age
-from flows.web.app_context import Desk
+from flows.service.overview import MatchStatus, Overview, UnitSummary, age
+from flows.web.app_context import PageContext
 
 WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
 REFRESH_SECONDS: Final = 15
@@ -51,23 +51,23 @@ summary { cursor: pointer; }
 """Colours that are distinct for colour-blind readers; each state is also given as text."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of the status page, and of its JSON."""
     router = APIRouter()
-    overview = Overview(desk.store)
+    overview = Overview(context.store)
 
     @router.get("/api/status")
     def status() -> dict[str, Any]:
         return {
             "matches": [_as_json(match) for match in overview.look()],
-            "arrivals": [each.model_dump(mode="json") for each in _arrivals(desk)],
+            "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
         }
 
     @router.get("/status")
     def page() -> HTMLResponse:
-        serving = served_state(desk.store.url).read_serving()
+        serving = served_state(context.store.url).read_serving()
         dashboard = "" if serving is None else serving.prefect.removesuffix("/api")
-        return HTMLResponse(status_html(overview.look(), _arrivals(desk), dashboard))
+        return HTMLResponse(status_html(overview.look(), _arrivals(context), dashboard))
 
     @router.get("/status/page.css")
     def style() -> Response:
@@ -105,7 +105,7 @@ def status_html(matches: Sequence[MatchStatus], arrivals: Iterable[Arrival], das
         '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
         '<link rel="stylesheet" href="/status/page.css"></head><body>'
         f'<header><h1>worldpose status</h1><span class="dim">{escape(said)}</span>'
-        f'<a href="/">What waits for review</a>{link}</header>'
+        f'<a href="/">Pending review</a>{link}</header>'
         f"<main>{table}{_inbox(arrivals)}{details}</main></body></html>"
     )
 
@@ -130,7 +130,7 @@ def _row(
     return f"<tr><td>{review}</td><td>{state}</td>{cells}</tr>"
 
 
-def _cell(units: Sequence[UnitGlance]) -> str:
+def _cell(units: Sequence[UnitSummary]) -> str:
     """Render one stage of a match: the worst unit state, units done, computation time."""
     if not units:
         return "<td></td>"
@@ -163,7 +163,7 @@ def _details(match: MatchStatus) -> str:
     )
 
 
-def _said(unit: UnitGlance) -> str:
+def _said(unit: UnitSummary) -> str:
     return "; ".join(filter(None, [unit.why, *unit.objections, in_short(unit.figures)]))
 
 
@@ -207,8 +207,8 @@ def _as_json(match: MatchStatus) -> dict[str, Any]:
     }
 
 
-def _arrivals(desk: Desk) -> list[Arrival]:
-    return list(served_state(desk.store.url).arrivals().values())
+def _arrivals(context: PageContext) -> list[Arrival]:
+    return list(served_state(context.store.url).arrivals().values())
 
 
 def _time(seconds: float) -> str:

@@ -27,7 +27,7 @@ from prefect.client.schemas.objects import State, StateType
 from prefect.deployments import arun_deployment
 
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
-from flows.service.arrivals import watch_once
+from flows.service.inbox import watch_once
 from flows.service.metrics import ProjectFigures, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan

@@ -81,7 +81,7 @@ def clip_sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 STAGE = Stage(
     name="tracking",
-    about="find who is who in every camera and over time",
+    about="identify people across cameras and over time",
     settings=TrackingSettings,
     units=units,
     inputs=inputs,

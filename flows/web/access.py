@@ -131,7 +131,7 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
             "WORLDPOSE_REVIEW_TOKEN",
             expected=f"at least {TOKEN_LENGTH} characters",
             found=f"{len(token)}",
-            todo="Make one with: openssl rand -hex 16.",
+            todo="Create a token with: openssl rand -hex 16.",
         )
     hosts = {name.lower() for name in (*LOOPBACK, *names, host)} - {"0.0.0.0", "::"}
     if host not in LOOPBACK:
@@ -140,13 +140,13 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
                 f"--host {host}",
                 expected="WORLDPOSE_REVIEW_TOKEN, which people log in with from other machines",
                 found="none",
-                todo="Set it, or leave --host out and reach the pages with: ssh -L.",
+                todo="Set it, or omit --host and connect to the pages with: ssh -L.",
             )
         if hosts == LOOPBACK:
             raise UsageError(
                 f"--host {host}",
                 expected="--host-name, under which browsers find this machine",
                 found="none",
-                todo="Give it as in --host-name review.example.org.",
+                todo="Add the name, as in --host-name review.example.org.",
             )
     return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure)

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
 from threading import Thread
 from typing import Final
 
 from fastapi import APIRouter, FastAPI, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
 from pydantic import Field, field_validator
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from data_contracts.records import Record
+from flows.review.edit_conflicts import StaleEditError
 from flows.service import status_page
 from flows.web import (
     calibration,
@@ -25,11 +33,12 @@ from flows.web import (
     views,
 )
 from flows.web.access import NAME_LENGTH, SESSION_SECONDS, Access
-from flows.web.app_context import Desk, Person
-from flows.web.errors import add_answers
-from flows.web.guard import Guard
+from flows.web.app_context import PageContext, Person
+from flows.web.host_guard import refusal, refuse_foreign
+from worldpose.errors import InputError, InternalError, WorldposeError
 from worldpose.store import Store
 
+LOG: Final = logging.getLogger("worldpose.pages")
 TYPES: Final = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -65,11 +74,11 @@ def create_app(project: str, access: Access) -> FastAPI:
     Raises:
         InputError: there is no such project.
     """
-    desk = Desk(Store.open(project), access)
+    context = PageContext(Store.open(project), access)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        Thread(target=calibration.warm_up, args=[desk], daemon=True).start()
+        Thread(target=calibration.warm_up, args=[context], daemon=True).start()
         yield
 
     app = FastAPI(
@@ -81,7 +90,7 @@ def create_app(project: str, access: Access) -> FastAPI:
         lifespan=lifespan,
     )
     add_answers(app)
-    app.include_router(_sessions(desk))
+    app.include_router(_sessions(context))
     for module in (
         queue,
         decisions,
@@ -93,15 +102,15 @@ def create_app(project: str, access: Access) -> FastAPI:
         identities,
         status_page,
     ):
-        app.include_router(module.routes(desk))
+        app.include_router(module.routes(context))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)
     return app
 
 
-def _sessions(desk: Desk) -> APIRouter:
+def _sessions(context: PageContext) -> APIRouter:
     router = APIRouter()
-    access = desk.access
+    access = context.access
 
     @router.get("/api/health")
     def health() -> dict[str, str]:
@@ -141,7 +150,7 @@ def _sessions(desk: Desk) -> APIRouter:
     @router.get("/api/session")
     def session(request: Request, who: Person) -> dict[str, str]:
         secret = access.form_secret(request.state.session)
-        return {"who": who, "form_secret": secret, "project": desk.store.url}
+        return {"who": who, "form_secret": secret, "project": context.store.url}
 
     return router
 
@@ -171,3 +180,160 @@ def _answer(name: str, content: bytes) -> Callable[[], Response]:
         return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
 
     return answer
+
+
+def add_answers(app: FastAPI) -> None:
+    """Answer with JSON: 409 and the difference, 422 and what to do, 500 or 507 and the reason."""
+
+    @app.exception_handler(StaleEditError)
+    def stale(request: Request, error: StaleEditError) -> JSONResponse:
+        return JSONResponse(
+            {"error": str(error), "difference": dict(error.difference)}, status_code=409
+        )
+
+    @app.exception_handler(InputError)
+    def unfit(request: Request, error: InputError) -> JSONResponse:
+        parts = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
+        return JSONResponse({"error": str(error), **parts}, status_code=422)
+
+    @app.exception_handler(RequestValidationError)
+    def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        said = f"{place}: {first['msg']}"
+        # A key of the body can contain lone surrogates, which a response cannot.
+        return JSONResponse({"error": said.encode("utf-8", "replace").decode()}, status_code=422)
+
+    @app.exception_handler(OSError)
+    def unreachable(request: Request, error: OSError) -> JSONResponse:
+        place = f"{error.filename}: " if error.filename else ""
+        return JSONResponse({"error": f"{place}{error.strerror or error}"}, status_code=500)
+
+    @app.exception_handler(WorldposeError)
+    def failed(request: Request, error: WorldposeError) -> JSONResponse:
+        said = " ".join(str(error).split())
+        LOG.warning("%s %r failed: %s", request.method, request.url.path, said)
+        cause = error.__cause__
+        is_full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+        return JSONResponse({"error": str(error)}, status_code=507 if is_full else 500)
+
+    @app.exception_handler(Exception)
+    def unforeseen(request: Request, error: Exception) -> JSONResponse:
+        """Report an internal error: traceback in the log, no blame of the user on the page."""
+        where = f"{request.method} {request.url.path}"
+        return JSONResponse({"error": str(InternalError.wrapping(where, error))}, status_code=500)
+
+
+OPEN: Final = frozenset(
+    {"/api/health", "/api/login", "/login", "/login/page.js", "/login/page.css"}
+)
+"""Paths that answer without a session."""
+BODY_BYTES: Final = 1 << 20
+"""Maximum size of a request body [byte]."""
+SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+ASKING: Final = "/preview"
+"""Suffix of paths that are posted to with every mouse move, and change nothing."""
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "media-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
+"""Content that a page can load: scripts, styles, images, videos of this server; nothing inline."""
+
+
+class Guard:
+    """Refuses requests that do not come from a page of this server with a valid session.
+
+    Host: a foreign name that points here (DNS rebinding) is refused. Session: all but `OPEN` needs
+        one. Changes: need the session's form secret, and this origin if the browser states one.
+        Size: at most `BODY_BYTES`. Every login and every requested change is logged with person,
+        request and response.
+    """
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self.app, self.access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the refusal, or pass the request on with `state.who` and `state.session`."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            raise RuntimeError(f"nothing here speaks {scope['type']}")
+        headers = Headers(scope=scope)
+        session = _cookie(headers, self.access.cookie)
+        who = self.access.person(session)
+        state = scope.setdefault("state", {})
+        state["who"], state["session"] = who, session
+
+        is_gone = False
+
+        async def heard() -> Message:
+            nonlocal is_gone
+            message = await receive()
+            is_gone = is_gone or message["type"] == "http.disconnect"
+            return message
+
+        async def sealed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                _seal(MutableHeaders(scope=message), scope["path"])
+                asked = scope["path"].endswith(ASKING) and message["status"] < 400
+                # A client that disconnected in the middle of its request requested nothing.
+                if scope["method"] not in SAFE and not asked and not is_gone:
+                    place = f"{scope['method']} {scope['path']}"
+                    # After a login, log the new person.
+                    LOG.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
+            await send(message)
+
+        refusal = self._refusal(scope, headers, who, session)
+        if refusal is not None:
+            await refusal(scope, heard, sealed)
+            return
+        await self.app(scope, heard, sealed)
+
+    def _refusal(
+        self, scope: Scope, headers: Headers, who: str | None, session: str | None
+    ) -> Response | None:
+        foreign = refuse_foreign(scope, headers, self.access.hosts)
+        if foreign is not None:
+            return foreign
+        path, method = scope["path"], scope["method"]
+        if path not in OPEN and who is None:
+            if method == "GET" and path == "/":
+                return RedirectResponse("/login", status_code=303)
+            return refusal(401, "log in first")
+        if method in SAFE:
+            return None
+        if headers.get("sec-fetch-site", "same-origin") != "same-origin":
+            return refusal(403, "this comes from a page of another server")
+        if headers.get("content-type", "").partition(";")[0] != "application/json":
+            return refusal(415, "only JSON is taken in")
+        if path not in OPEN and not self.access.has_form_secret(
+            session or "", headers.get("x-form-secret", "")
+        ):
+            return refusal(403, "the page is of another session: load it again")
+        length = headers.get("content-length", "")
+        if not (length.isascii() and length.isdigit()):  # without a length, the size is unbounded
+            return refusal(411, "say how long it is")
+        if len(length) > 12 or int(length) > BODY_BYTES:
+            return refusal(413, f"at most {BODY_BYTES} bytes are taken in")
+        return None
+
+
+def _cookie(headers: Headers, name: str) -> str | None:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(name)
+    except CookieError:
+        return None
+    return None if found is None else found.value
+
+
+def _seal(headers: MutableHeaders, path: str) -> None:
+    headers["content-security-policy"] = POLICY
+    headers["x-content-type-options"] = "nosniff"
+    headers["x-frame-options"] = "DENY"
+    headers["referrer-policy"] = "no-referrer"
+    headers["cross-origin-opener-policy"] = "same-origin"
+    headers["cross-origin-resource-policy"] = "same-origin"
+    if "cache-control" not in headers:
+        headers["cache-control"] = "no-store"

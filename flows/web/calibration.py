@@ -19,7 +19,7 @@ from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, Dra
 from flows.review.verdicts import reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
@@ -80,7 +80,7 @@ class Pictures:
             return self._decoded[name]
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of one image: of a static camera, or of a frame of a broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/pictures/{owner}")
     pictures = Pictures()
@@ -89,7 +89,7 @@ def routes(desk: Desk) -> APIRouter:
     def prepared(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
         """Return a match's pitch and image sizes; both are fixed per match."""
         if match_id not in drawings:
-            folder = desk.match(match_id).folder
+            folder = context.match(match_id).folder
             pitch = folder.pitch
             if pitch is None:
                 raise HTTPException(404, "the match has no pitch")
@@ -112,10 +112,10 @@ def routes(desk: Desk) -> APIRouter:
 
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         size = size_of(match_id, owner)
         clicked = _clicked(match, owner, frame)
-        latest = latest_run(desk.store, match_id)
+        latest = latest_run(context.store, match_id)
         stage = "static_calibration" if frame is None else "broadcast_calibration"
         unit = f"{stage}/{owner}"
         names = [camera.id for camera in match.folder.spec.static_cameras]
@@ -142,7 +142,7 @@ def routes(desk: Desk) -> APIRouter:
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int | None = None) -> Response:
         size_of(match_id, owner)
-        content = pictures.png(desk.match(match_id), owner, frame)
+        content = pictures.png(context.match(match_id), owner, frame)
         return Response(content, media_type="image/png")
 
     @router.post("/preview")
@@ -156,7 +156,7 @@ def routes(desk: Desk) -> APIRouter:
                 DrawnMarking(name=n, xy=xy) for n, xy in sorted(clicked.drawn.items()) if xy
             ),
         )
-        seen = pictures.decoded(desk.match(match_id), owner, frame) if clicked.refine else None
+        seen = pictures.decoded(context.match(match_id), owner, frame) if clicked.refine else None
         try:
             found = preview(
                 prepared(match_id)[0],
@@ -173,15 +173,15 @@ def routes(desk: Desk) -> APIRouter:
     return router
 
 
-def warm_up(desk: Desk) -> None:
+def warm_up(context: PageContext) -> None:
     """Calibrate one clicked camera, which loads kernels, and open all matches with their journals.
 
     The first request then waits for neither.
     """
     is_warm = False
-    for name in desk.store.matches():
+    for name in context.store.matches():
         try:
-            folder = desk.match(name).folder
+            folder = context.match(name).folder
             if folder.pitch is None or not folder.clicked or is_warm:
                 continue
             camera, clicked = next(iter(folder.clicked.items()))

@@ -14,7 +14,7 @@ from flows.cli.review_text import correction_json
 from flows.review.corrections import keep_edits
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
-from flows.web.app_context import Desk, Person
+from flows.web.app_context import PageContext, Person
 
 EDITS: int = 200
 """Maximum number of edits per request."""
@@ -69,34 +69,36 @@ class GoingOn(Record):
     """When results need review; None = the default of `worldpose run`."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of all requests that change the journal or start a run."""
     router = APIRouter(prefix="/api/matches/{match_id}")
 
     @router.post("/decisions")
     def take_verdict(match_id: str, given: Verdict, who: Person) -> dict[str, Any]:
-        match = desk.match(match_id)
-        latest = latest_run(desk.store, match_id)
+        match = context.match(match_id)
+        latest = latest_run(context.store, match_id)
         why, seen = given.why, given.seen
-        decide(desk.store, match, given.reviews, given.verdict, who=who, why=why, seen=seen)
-        waiting = still_waiting(desk.match(match_id), latest)
-        run = desk.continuing.go_on(match_id) if given.go_on and not waiting else None
+        decide(context.store, match, given.reviews, given.verdict, who=who, why=why, seen=seen)
+        waiting = still_waiting(context.match(match_id), latest)
+        run = context.continuing.go_on(match_id) if given.go_on and not waiting else None
         return {"waiting": len(waiting), "run": run}
 
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:
         edits = {each.id: each.edit for each in given.edits}
-        kept = keep_edits(desk.store, lambda: desk.match(match_id), edits, who=who, note=given.note)
+        kept = keep_edits(
+            context.store, lambda: context.match(match_id), edits, who=who, note=given.note
+        )
         return {"kept": [correction_json(each) for each in kept]}
 
     @router.post("/withdrawals")
     def take_back(match_id: str, given: Withdrawing, who: Person) -> dict[str, Any]:
-        withdraw(desk.store, desk.match(match_id), given.correction, who=who, why=given.why)
+        withdraw(context.store, context.match(match_id), given.correction, who=who, why=given.why)
         return {"withdrawn": given.correction}
 
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
-        desk.match(match_id)
-        return desk.continuing.go_on(match_id, given.gates)
+        context.match(match_id)
+        return context.continuing.go_on(match_id, given.gates)
 
     return router

@@ -14,10 +14,9 @@ from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from flows.reports.match_pictures import frame_picture
-from flows.review.acceptance import accept, left_to_look_at
-from flows.review.detections import detections_now
+from flows.review.detections import accept, detections_now, left_to_look_at
 from flows.stage import Match
-from flows.web.app_context import Desk, Person
+from flows.web.app_context import PageContext, Person
 from worldpose.errors import InputError
 from worldpose.store import Store
 
@@ -36,13 +35,13 @@ class Accepting(Record):
     """Match frame, and index among the detections of the frame."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of the detections in one frame of a static or broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/detections/{owner}")
 
     @router.get("")
     def detections(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         spec = match.folder.spec
         frames = [
             [clip.first_frame, clip.first_frame + clip.frame_count - 1]
@@ -59,7 +58,7 @@ def routes(desk: Desk) -> APIRouter:
             "has_picture": owner in match.folder.videos,
             "joints": COCO17,
             "bones": COCO17_BONES,
-            **_seen(detections_now(desk.store, match, owner, frame)),
+            **_seen(detections_now(context.store, match, owner, frame)),
             "cameras": [camera.id for camera in spec.static_cameras],
         }
 
@@ -68,7 +67,7 @@ def routes(desk: Desk) -> APIRouter:
         import cv2  # imported here: few pages decode an image
 
         try:
-            picture = frame_picture(desk.store, desk.match(match_id), owner, frame)
+            picture = frame_picture(context.store, context.match(match_id), owner, frame)
         except InputError as error:
             raise HTTPException(404, error.found) from error
         if picture is None:
@@ -78,14 +77,14 @@ def routes(desk: Desk) -> APIRouter:
 
     @router.get("/queue")
     def queue(match_id: str, owner: str) -> dict[str, Any]:
-        return _queue(desk.store, desk.match(match_id), owner)
+        return _queue(context.store, context.match(match_id), owner)
 
     @router.post("/acceptances")
     def take(match_id: str, owner: str, given: Accepting, who: Person) -> dict[str, Any]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         people, at_least = given.people, given.at_least
-        accept(desk.store, match, owner, at_least=at_least, people=people, who=who)
-        return _queue(desk.store, desk.match(match_id), owner)
+        accept(context.store, match, owner, at_least=at_least, people=people, who=who)
+        return _queue(context.store, context.match(match_id), owner)
 
     return router
 

@@ -23,7 +23,7 @@ from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.people import adjustment_tables, body_tables
 from flows.results.best_results import placed_joints, static_cameras
 from flows.stage import Match
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.formats import JointTracks
 from worldpose.reports import CaptionedImage
 from worldpose.reports.clips import plot_paths
@@ -48,7 +48,7 @@ class Evidence:
     """Camera or clip whose video shows it; None if there is none."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of the evidence for one review request."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
     drawn: dict[tuple[str, str], Evidence] = {}
@@ -56,7 +56,7 @@ def routes(desk: Desk) -> APIRouter:
     videos = TemporaryDirectory(prefix="worldpose-pages-")
 
     def evidence_of(match_id: str, request: str) -> Evidence:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
@@ -64,7 +64,7 @@ def routes(desk: Desk) -> APIRouter:
             if (match_id, request) not in drawn:
                 while len(drawn) >= KEPT:
                     drawn.pop(next(iter(drawn)))
-                drawn[match_id, request] = draw_evidence(desk.store, match, asked)
+                drawn[match_id, request] = draw_evidence(context.store, match, asked)
             return drawn[match_id, request]
 
     @router.get("/evidence")
@@ -94,16 +94,16 @@ def routes(desk: Desk) -> APIRouter:
     def video(match_id: str, request: str) -> FileResponse:
         if evidence_of(match_id, request).video is None:
             raise HTTPException(404, "no camera of this clip has a video")
-        match = desk.match(match_id)
+        match = context.match(match_id)
         asked = requests_by_id(match.journal.questions)[request]
         name = hashlib.sha256(f"{match_id} {request}".encode()).hexdigest()
         file = Path(videos.name) / f"{name}.mp4"
         with filming:
             if not file.is_file():
-                run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
+                run = open_run(context.store.url, match_id, asked.run_id, complete=True)
                 (unit,) = asked.keys
                 draft = file.with_suffix(".draft.mp4")
-                write_clip_video(desk.store, run, match, unit.partition("/")[2], draft)
+                write_clip_video(context.store, run, match, unit.partition("/")[2], draft)
                 draft.replace(file)
         return FileResponse(file, media_type="video/mp4")
 

@@ -262,6 +262,6 @@ def _listeners(host: str, port: int, connections: Connections) -> list[socket.so
             f"{host}, port {port}",
             expected="an address of this machine and a port that is free",
             found=error.strerror or str(error),
-            todo="Choose another with --port, or end what listens there.",
+            todo="Choose another port with --port, or end the program that uses it.",
         ) from error
     return listeners

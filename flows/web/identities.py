@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flows.results.best_results import static_cameras
 from flows.review.identities import identities_now
 from flows.stage import Match
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.ingest import unit_frames
 from worldpose.review.identities import Identities, find_sighting
 from worldpose.store import Store, open_run
@@ -26,15 +26,15 @@ AROUND: Final = 1.6
 """Half the height of a person's crop [m]."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of the identities in one clip."""
     router = APIRouter(prefix="/api/matches/{match_id}/identities/{clip}")
 
     def opened(match_id: str, clip: str) -> tuple[Match, Identities]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         if clip not in {each.id for each in match.folder.spec.clips}:
             raise HTTPException(404, "no such clip")
-        return match, identities_now(desk.store, match, clip).identities
+        return match, identities_now(context.store, match, clip).identities
 
     @router.get("")
     def identities(match_id: str, clip: str) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def routes(desk: Desk) -> APIRouter:
         match, found = opened(match_id, clip)
         if person not in found.person or frame not in found.frame:
             raise HTTPException(404, "nobody is there")
-        return Response(_crop(desk.store, match, found, person, frame), media_type="image/png")
+        return Response(_crop(context.store, match, found, person, frame), media_type="image/png")
 
     return router
 

@@ -14,7 +14,7 @@ from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint
 from flows.results.best_results import ADJUSTED
 from flows.stage import Match
 from flows.stages.detection import seen_by
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.review import current_value, requests_by_id
 from worldpose.store import Run, open_run
 
@@ -25,17 +25,17 @@ Outlier = tuple[float, str, MovedPoint | MovedKeypoint | DeletedDetection, bool]
 already removed."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the route of the outliers of the adjustment that a review request refers to."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
 
     @router.get("/outliers")
     def outliers(match_id: str, request: str) -> list[dict[str, Any]]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
-        run = open_run(desk.store.url, match_id, asked.run_id, complete=True)
+        run = open_run(context.store.url, match_id, asked.run_id, complete=True)
         if ADJUSTED not in asked.keys or ADJUSTED not in run:
             return []
         return [

@@ -8,11 +8,11 @@ from fastapi import APIRouter, Query
 
 from data_contracts.review import Correction, ReviewRequest
 from flows.cli.review_text import correction_json, in_words, review_json
-from flows.method import GATES
+from flows.gates import GATES
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
 from flows.stage import Match
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
@@ -20,21 +20,21 @@ CORRECTIONS: Final = 200
 """Maximum per response: a match can have many thousand, and a page shows the last ones."""
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
 
     @router.get("")
     def matches() -> dict[str, Any]:
-        return {"matches": [_at_a_glance(desk, name) for name in desk.store.matches()]}
+        return {"matches": [_at_a_glance(context, name) for name in context.store.matches()]}
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
-        opened = desk.match(match_id)
-        latest = latest_run(desk.store, match_id)
+        opened = context.match(match_id)
+        latest = latest_run(context.store, match_id)
         folder = opened.folder
         return {
-            **_glance(desk, opened),
+            **_glance(context, opened),
             "reviews": [shown(each) for each in reviews_of(opened, latest)],
             **_corrections(opened),
             "cameras": [
@@ -43,11 +43,11 @@ def routes(desk: Desk) -> APIRouter:
                     "given": camera.id in folder.calibrations,
                     "clicks": _clicks(opened, camera.id),
                     "has_picture": camera.id in folder.stills or camera.id in folder.videos,
-                    "figures": _figures(desk, opened, f"static_calibration/{camera.id}"),
+                    "figures": _figures(context, opened, f"static_calibration/{camera.id}"),
                 }
                 for camera in folder.spec.static_cameras
             ],
-            "clips": [_clip(desk, opened, clip.id) for clip in folder.spec.clips],
+            "clips": [_clip(context, opened, clip.id) for clip in folder.spec.clips],
             "failures": [] if latest is None else [each.model_dump() for each in latest.failed],
             "left_out": {} if latest is None else latest.left_out,
             "warnings": [] if latest is None else list(latest.warnings),
@@ -55,7 +55,7 @@ def routes(desk: Desk) -> APIRouter:
 
     @router.get("/{match_id}/corrections")
     def corrections(match_id: str, skip: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
-        return _corrections(desk.match(match_id), skip)
+        return _corrections(context.match(match_id), skip)
 
     return router
 
@@ -91,16 +91,16 @@ def shown(review: Review) -> dict[str, Any]:
     return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
 
 
-def _at_a_glance(desk: Desk, name: str) -> dict[str, Any]:
+def _at_a_glance(context: PageContext, name: str) -> dict[str, Any]:
     """Return one match of the queue; a match that cannot be opened has its error instead."""
     try:
-        return _glance(desk, desk.match(name))
+        return _glance(context, context.match(name))
     except (OSError, WorldposeError) as error:
         return {"match": name, "problem": str(error), "waiting": [], "run": None}
 
 
-def _glance(desk: Desk, match: Match) -> dict[str, Any]:
-    store = desk.store
+def _glance(context: PageContext, match: Match) -> dict[str, Any]:
+    store = context.store
     latest = latest_run(store, match.match_id)
     known = {each.request.id: each for each in reviews_of(match, latest)}
     waiting = []
@@ -135,13 +135,13 @@ def _glance(desk: Desk, match: Match) -> dict[str, Any]:
         "to_click": [each.id for each in folder.spec.static_cameras if each.id not in clicked],
         "corrections": len(match.corrections),
         "stale": len(match.stale),
-        "at_work": _at_work(store, desk, match.match_id),
+        "at_work": _at_work(store, context, match.match_id),
     }
 
 
-def _at_work(store: Store, desk: Desk, match_id: str) -> dict[str, Any] | None:
+def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any] | None:
     """Return the run started on a page, or else one started elsewhere that has not ended."""
-    state = desk.continuing.state(match_id)
+    state = context.continuing.state(match_id)
     if state is not None:
         return state
     open_runs = store.unfinished_runs(match_id)
@@ -151,14 +151,14 @@ def _at_work(store: Store, desk: Desk, match_id: str) -> dict[str, Any] | None:
     return {"state": "elsewhere", "lines": [f"run {last.run_id} on {last.host} has not ended"]}
 
 
-def _clip(desk: Desk, match: Match, clip: str) -> dict[str, Any]:
+def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     """Return a clip, and its broadcast key frames: clicked, and those to click next."""
     picked = match.folder.key_frames.get(clip)
-    latest = latest_run(desk.store, match.match_id)
+    latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
     pick_next = []
     if key is not None:
-        result = desk.store.open_result(match.match_id, "broadcast_calibration", clip, key)
+        result = context.store.open_result(match.match_id, "broadcast_calibration", clip, key)
         pick_next = [int(frame) for frame in result.attrs["pick_next"]]
     return {
         "id": clip,
@@ -180,6 +180,6 @@ def _clicks(match: Match, camera: str) -> int:
     return 0 if clicked is None else len(clicked.points) + len(clicked.drawn)
 
 
-def _figures(desk: Desk, match: Match, unit: str) -> dict[str, float]:
-    latest = latest_run(desk.store, match.match_id)
+def _figures(context: PageContext, match: Match, unit: str) -> dict[str, float]:
+    latest = latest_run(context.store, match.match_id)
     return {} if latest is None else latest.figures.get(unit, {})

@@ -15,7 +15,7 @@ from flows.results.best_results import static_cameras
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
 from flows.stage import Match
-from flows.web.app_context import Desk
+from flows.web.app_context import PageContext
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.review.evidence import check_views, epipolar_curves
@@ -44,7 +44,7 @@ class Group:
     keypoints: NDArray[np.float64]
 
 
-def routes(desk: Desk) -> APIRouter:
+def routes(context: PageContext) -> APIRouter:
     """Create the route of the other cameras' views."""
     router = APIRouter(prefix="/api/matches/{match_id}/detections/{owner}")
     known: dict[tuple[Any, ...], Group] = {}
@@ -60,16 +60,16 @@ def routes(desk: Desk) -> APIRouter:
         x: float | None = None,
         y: float | None = None,
     ) -> dict[str, Any]:
-        match = desk.match(match_id)
+        match = context.match(match_id)
         if owner not in {camera.id for camera in match.folder.spec.static_cameras}:
             return {"person": None, "views": [], "here": None}
-        runs = desk.store.runs(match_id)
+        runs = context.store.runs(match_id)
         said = len(match.journal.entries)
         place = (match_id, runs[-1:], said, owner, frame, detection)
         with lock:
             while len(known) >= KEPT:
                 known.pop(next(iter(known)))
-            group = known.get(place) or _group(desk, match, owner, frame, detection)
+            group = known.get(place) or _group(context, match, owner, frame, detection)
             known[place] = group
         at = None if x is None or y is None or joint is None else (x, y)
         if owner not in group.names or (joint is not None and not 0 <= joint < len(COCO17)):
@@ -79,7 +79,7 @@ def routes(desk: Desk) -> APIRouter:
     return router
 
 
-def _group(desk: Desk, match: Match, owner: str, frame: int, detection: int) -> Group:
+def _group(context: PageContext, match: Match, owner: str, frame: int, detection: int) -> Group:
     """Return a detection's person by tracks and corrections, with its detections in all cameras.
 
     Raises:
@@ -93,12 +93,12 @@ def _group(desk: Desk, match: Match, owner: str, frame: int, detection: int) -> 
         ),
         None,
     )
-    cameras = static_cameras(open_run(desk.store.url, match.match_id), match.folder.spec)
+    cameras = static_cameras(open_run(context.store.url, match.match_id), match.folder.spec)
     names = list(cameras)
     detections = [detection if name == owner else -1 for name in names]
     person = None
     try:
-        found = None if clip is None else identities_now(desk.store, match, clip.id).identities
+        found = None if clip is None else identities_now(context.store, match, clip.id).identities
     except InputError:
         found = None  # no tracks yet
     if found is not None and owner in found.cameras and frame in found.frame:
@@ -112,7 +112,7 @@ def _group(desk: Desk, match: Match, owner: str, frame: int, detection: int) -> 
     keypoints = np.full((len(names), len(COCO17), 2), np.nan)
     for c, (name, k) in enumerate(zip(names, detections, strict=True)):
         if k >= 0:
-            seen = detections_now(desk.store, match, name, frame)
+            seen = detections_now(context.store, match, name, frame)
             if len(seen.frame) and k < seen.keypoints.shape[1]:
                 keypoints[c] = seen.keypoints[0, k]
     return Group(person, names, list(cameras.values()), detections, keypoints)

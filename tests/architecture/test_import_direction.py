@@ -137,7 +137,7 @@ def test_the_library_imports_without_orchestrators(package):
 def test_deciding_what_to_run_imports_neither_prefect_nor_dask():
     script = (
         "import sys\n"
-        "import flows.running, flows.planning, flows.cli.app\n"
+        "import flows.running, flows.run_plan, flows.cli.app\n"
         "loaded = {'prefect', 'dask', 'distributed'} & set(sys.modules)\n"
         "assert not loaded, loaded\n"
     )

@@ -17,10 +17,11 @@ from test_killed_runs import assert_nothing_half_written, assert_same_store, fil
 from data_contracts.review import DeletedDetection
 from flows import iterate
 from flows import match as match_flow
-from flows.fan_out import task_of
 from flows.iterate import iterate_match
+from flows.match import task_of
 from flows.registering import open_match, register
 from flows.review.verdicts import correct
+from flows.run_record import RunLog
 from flows.running import RunRequest
 from flows.settings import selected_stages
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
@@ -44,8 +45,8 @@ def compute_here(stage, units, work):
 def run_here(store, match, request):
     match = open_match(store, match.match_id)  # as the flow does: it may have been edited
     stages = selected_stages(request.from_stage, request.until_stage)
-    settings = (request.settings, "never", request.iteration, request.time_limits)
-    return match_flow._run_stages(store, match, stages, *settings)
+    log = RunLog.begin(store, match, stages, request.settings, "never", request.iteration)
+    return match_flow._run_stages(log, request.time_limits)
 
 
 @contextmanager

@@ -101,7 +101,7 @@ def serve_and_die(project, port, last, spoiled):
     Disk(last, syncs=spoiled != "unsynced").install()
     if spoiled in ("early", "forgetful"):
         decisions.keep_edits = globals()[spoiled](decisions.keep_edits)
-    calibration.warm_up = lambda desk: None  # a second of kernels in each life
+    calibration.warm_up = lambda context: None  # a second of kernels in each life
     access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
     serve(str(project), access, host="127.0.0.1", port=port, tls=None)
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from flows.cli.ablation import print_ablation
+from flows.cli.evaluate import print_ablation
 from flows.results import ablation
 from flows.results.ablation import CLICKS, Score, trial
 

@@ -4,9 +4,9 @@ import pytest
 from stand_ins import publish_stand_in
 from test_refitting import halves
 
-from flows.basis import basis_of
-from flows.planning import plan_run, plan_stage
+from flows.gates import Gatekeeper
 from flows.registering import register
+from flows.run_plan import RunPlan, plan_run
 from flows.run_record import RunLog, latest_run
 from flows.settings import selected_stages
 from worldpose.store import Store
@@ -23,7 +23,7 @@ def iterate(store, match, overrides, passes):
                 publish_stand_in(store, match, unit)
         log = RunLog.begin(store, match, stages, overrides, iteration=number)
         for stage in stages:
-            log.reuse(log.plan(stage).units)
+            log.reuse(log.plan.plan_stage(stage))
         log.close()
     return latest_run(store, match.match_id)
 
@@ -43,13 +43,14 @@ def test_a_later_stage_goes_on_with_the_pass_that_the_latest_run_was_made_of(cli
     iterate(store, match, {}, 2)
     latest = iterate(store, match, OTHER, 2)
     stages = selected_stages(start, None)
-    basis = basis_of(store, match, stages, {}, latest, 1)
-    assert basis.iteration == 2
-    first = {unit.name: unit.key for unit in plan_run(store, match, OTHER)}
-    assert basis.before["filtering/first"] == first["filtering/first"]
     asked = OTHER if start == "tracking" else {}
-    plan = plan_stage(store, match, stages[0], asked, basis.results, basis.before)
-    assert {unit.key for unit in plan.units} <= set(latest.results.values())
+    plan = RunPlan.begin(Gatekeeper(store, match, "never"), stages, asked, latest, 1)
+    assert plan.iteration == 2
+    first = {unit.name: unit.key for unit in plan_run(store, match, OTHER)}
+    assert plan.before["filtering/first"] == first["filtering/first"]
+    planned = plan.plan_stage(stages[0])
+    assert {unit.key for unit in planned} <= set(latest.results.values())
+    assert {unit.iteration for unit in planned} == {2}
 
 
 def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
@@ -59,13 +60,13 @@ def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
     for tail in (3.0, 4.0):
         asked = {"body_fitting": {"tail": tail}}
         log = RunLog.begin(store, match, stages, asked, iteration=1)
-        assert log.iteration == 2
+        assert log.plan.iteration == 2
         for stage in stages:
-            plan = log.plan(stage)
-            assert not plan.blocked
-            for unit in plan.units:
+            units = log.plan.plan_stage(stage)
+            assert not log.plan.blocked
+            for unit in units:
                 publish_stand_in(store, match, unit)
-            log.reuse(plan.units)
+            log.reuse(units)
         record = log.close()
         assert (record.state, record.iteration) == ("complete", 2)
         kept = [name for name in latest.results if name.startswith("tracking/")]
@@ -76,6 +77,7 @@ def test_the_whole_method_goes_on_from_nothing_but_the_pass_before(clips):
     store, match = clips
     latest = iterate(store, match, OTHER, 2)
     stages = selected_stages("ingest", "tracking")
-    assert basis_of(store, match, stages, {}, latest, 1).results == {}
-    basis = basis_of(store, match, stages, {}, latest, 2)
-    assert basis.before == {unit.name: unit.key for unit in plan_run(store, match, {})}
+    gatekeeper = Gatekeeper(store, match, "never")
+    assert RunPlan.begin(gatekeeper, stages, {}, latest, 1).results == {}
+    plan = RunPlan.begin(gatekeeper, stages, {}, latest, 2)
+    assert plan.before == {unit.name: unit.key for unit in plan_run(store, match, {})}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flows.review.click_advice import click_advice
+from flows.review.advice import click_advice
 
 
 def run(noise, cameras, freedom=8.0):

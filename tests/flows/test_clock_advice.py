@@ -3,7 +3,7 @@
 import pytest
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.review.clock_advice import clock_advice
+from flows.review.advice import clock_advice
 
 
 def match(cameras, offset=0, clips=("clip",)):

@@ -1,5 +1,6 @@
 """The table of commands: every entry loads, and listing them imports none."""
 
+import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -36,6 +37,39 @@ def test_the_list_of_commands_and_the_version_import_no_estimator():
         "assert not loaded, loaded\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option):
+    script = (
+        "import sys\n"
+        f"sys.argv = ['worldpose', '{option}']\n"
+        "from flows.cli import main\n"
+        "try:\n"
+        "    main()\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code\n"
+        "heavy = {'prefect', 'dask', 'distributed', 'torch', 'numpy', 'scipy', 'xarray', 'cv2'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+def test_a_shell_completes_the_names_of_commands():
+    script = "import sys; sys.argv = ['worldpose']; from flows.cli import main; main()"
+    typed = {
+        "_WORLDPOSE_COMPLETE": "complete_bash",
+        "COMP_WORDS": "worldpose re",
+        "COMP_CWORD": "1",
+    }
+    answer = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, **typed},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert answer.stdout.split() == ["reprocess", "report", "review"]
 
 
 def test_the_version_is_that_of_the_installed_package():

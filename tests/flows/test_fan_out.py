@@ -3,7 +3,7 @@
 import pytest
 from distributed import Client, LocalCluster, Worker, get_worker
 
-from flows.fan_out import on_workers_with, task_count
+from flows.match import on_workers_with, task_count
 
 
 def where(number):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS, IDENTITIES, PEOPLE
-from flows.method import GATES, METHOD
+from flows.gates import ACCEPTANCE, ADJUSTMENT, CAMERAS, GATES, IDENTITIES, PEOPLE
+from flows.method import METHOD
 
 
 def test_gates_stand_behind_stages_of_the_method():

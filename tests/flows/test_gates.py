@@ -9,9 +9,8 @@ from typer.testing import CliRunner
 
 from data_contracts.review import MovedPoint, ReviewDecision
 from flows.cli.app import app
-from flows.gatekeeping import Gatekeeper
-from flows.method import GATES, METHOD
-from flows.planning import plan_run
+from flows.gates import GATES, Gatekeeper
+from flows.method import METHOD
 from flows.registering import open_match
 from flows.review.verdicts import (
     correct,
@@ -23,6 +22,7 @@ from flows.review.verdicts import (
     warnings_of,
     withdraw,
 )
+from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from flows.running import RunRequest, run_match
 from tasks.static_calibration import static_calibration
@@ -187,7 +187,7 @@ def test_a_correction_on_what_somebody_else_changed_is_refused(store):
     run(store, "auto")
     match = open_match(store, TINY)
     correct(store, match, [wrong_click(match)], who="Ada", why="")
-    with pytest.raises(InputError, match="made in between"):
+    with pytest.raises(InputError, match="made since"):
         correct(store, match, [wrong_click(match)], who="Bob", why="")
     fresh = open_match(store, TINY)
     gone = match.folder.clicked["cam03"].points[0].name

@@ -4,12 +4,12 @@ import pytest
 from command_line import TINY
 
 from data_contracts.review import Correction, MergedTracks, SplitTrack
-from flows.planning import plan_run
 from flows.registering import open_match
 from flows.review.corrections import keep_edits
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import identities_now
 from flows.review.verdicts import origins_of
+from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review import standing_corrections

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from command_line import TINY, succeed, worldpose
@@ -10,13 +11,12 @@ from test_refitting import halves
 from data_contracts.review import DeletedDetection
 from data_contracts.run import RunRecord
 from flows import iterate
-from flows.cli.iterations import parse_iterations
+from flows.cli.run import parse_iterations
 from flows.iterate import Iteration, held_out_error, iterate_match
 from flows.method import METHOD
-from flows.outlook import Outlook
-from flows.planning import plan_run, results_before
 from flows.registering import register
 from flows.review.verdicts import correct
+from flows.run_plan import plan_run, results_before
 from flows.running import RunRequest
 from worldpose.errors import UsageError
 from worldpose.store import Store
@@ -149,8 +149,8 @@ def looped(monkeypatch):
             return record(request.iteration, errors[request.iteration - 1], state)
 
         monkeypatch.setattr(iterate, "run_match", run)
-        monkeypatch.setattr(iterate, "_outlook", lambda *_: Outlook((), {}, ()))
-        monkeypatch.setattr(iterate, "_recorded", lambda *_: None)
+        monkeypatch.setattr(iterate, "_plan", lambda *_: SimpleNamespace(missing=[]))
+        monkeypatch.setattr(iterate, "_recorded_run", lambda *_: None)
         monkeypatch.setattr(iterate, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1]))
 
         class Anything:
@@ -198,7 +198,7 @@ def test_without_a_held_out_error_no_iteration_is_better():
 def test_a_loop_whose_left_out_cameras_cannot_judge_keeps_the_first_and_says_so(looped, most, ran):
     found, runs = looped([None, None, None], most)
     assert (found.kept.number, runs) == (1, ran)
-    assert found.ended == "left-out cameras cannot judge which iteration is better"
+    assert found.ended == "held-out cameras cannot tell which iteration is better"
 
 
 def test_clips_count_by_their_keypoints():

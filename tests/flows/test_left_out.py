@@ -8,8 +8,8 @@ from command_line import TINY, succeed, worldpose
 
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD
-from flows.planning import plan_run, plan_stage
 from flows.registering import register
+from flows.run_plan import RunPlan, plan_run
 from tasks.static_calibration import static_calibration
 from worldpose.store import Store, open_run
 
@@ -68,9 +68,10 @@ def test_people_are_not_tracked_with_fewer_than_two_cameras(calibrated):
     store, match = calibrated
     results = {unit.name: unit.key for unit in plan_run(store, match, {})}
     only = match.without([camera.id for camera in match.folder.spec.static_cameras][2:])
-    plan = plan_stage(store, only, STAGES["tracking"], {}, results)
+    plan = RunPlan(store, only, {}, results=results)
+    assert plan.plan_stage(STAGES["tracking"]) == []
     assert plan.lacks_cameras
-    assert plan.blocked == ("tracking/clip",)
+    assert plan.blocked == ["tracking/clip"]
     left_out = left_out_cameras(store, only, METHOD, results)
     first, second = left_out_warnings(only, left_out, 2)
     assert first.startswith("camera cam01 is left out: annotations/static_calibration/cam01.json")

@@ -12,8 +12,7 @@ from page_client import HERE, MATCH, TOKEN, a_click, moved
 
 from flows.review import corrections
 from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
-from flows.web.app import create_app
-from flows.web.guard import BODY_BYTES, OPEN
+from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
 from worldpose.review import read_journal
 from worldpose.store import Store

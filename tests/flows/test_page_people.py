@@ -6,9 +6,9 @@ from command_line import TINY
 from page_client import MATCH
 
 from data_contracts.conventions import COCO17
-from flows.planning import plan_run
 from flows.registering import open_match
 from flows.results.best_results import static_cameras
+from flows.run_plan import plan_run
 from tasks.ingest import ingest
 from worldpose.store import Store, open_run
 

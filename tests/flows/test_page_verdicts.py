@@ -14,9 +14,8 @@ from data_contracts.review import ReviewRequest
 from flows.registering import open_match
 from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
-from flows.web import continuing
-from flows.web.app_context import Desk
-from flows.web.continuing import Continuing
+from flows.web import app_context
+from flows.web.app_context import Continuing, PageContext
 from worldpose.review import say
 from worldpose.store import Store, open_run
 from worldpose.video import VideoReader
@@ -74,7 +73,7 @@ def test_a_run_that_is_answered_while_it_ends_is_run_once_more(project_copy, tmp
         f"open({str(ran)!r}, 'a').write(sys.argv[1] + '\\n')\n"
         f"while not pathlib.Path({str(gate)!r}).exists(): time.sleep(0.01)\n"
     )
-    monkeypatch.setattr(continuing, "_COMMAND", [sys.executable, "-c", script])
+    monkeypatch.setattr(app_context, "_COMMAND", [sys.executable, "-c", script])
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     runs = Continuing(Store.open(str(project_copy)))
     for _ in range(3):  # the second and third come while the first is at work
@@ -127,14 +126,14 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     grey = np.full((size.height, size.width, 3), 90, dtype=np.uint8)
     for number in range(clip.frame_count - 1):  # the last picture is missing
         cv2.imwrite(str(frames / f"{number:04d}.png"), grey, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    opened = Desk.match
+    opened = PageContext.match
 
     def with_video(self, name):
         match = opened(self, name)
         match.folder.videos["cam02"] = frames
         return match
 
-    monkeypatch.setattr(Desk, "match", with_video)
+    monkeypatch.setattr(PageContext, "match", with_video)
     evidence = ada.get(f"{path}/evidence").json()
     assert evidence["video"] == "cam02"
     assert evidence["pictures"] and evidence["tables"]

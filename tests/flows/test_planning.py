@@ -11,7 +11,7 @@ from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
 from data_contracts.static_calibration import ClickedMarkings
 from flows.method import METHOD
-from flows.planning import plan_stage
+from flows.run_plan import RunPlan
 from flows.stage import Match, once_a_match
 from worldpose.ingest import MatchFolder
 from worldpose.review import Journal
@@ -71,12 +71,11 @@ def calls(match):
     profile = cProfile.Profile()
     units, before = 0, None
     for _ in range(2):
-        results = {}
+        plan = RunPlan(Everything(), match, {}, before=before)
         for stage in METHOD:
-            plan = profile.runcall(plan_stage, Everything(), match, stage, {}, results, before)
+            plan.add_results(profile.runcall(plan.plan_stage, stage))
             assert not plan.blocked
-            results |= {unit.name: unit.key for unit in plan.units}
-        units, before = units + len(results), results
+        units, before = units + len(plan.results), plan.results
     return pstats.Stats(profile).total_calls, units
 
 

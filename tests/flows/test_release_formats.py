@@ -9,7 +9,7 @@ import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.release import BaselineSettings
-from flows.results.formats import EXPORTS, Origin
+from flows.results.export import EXPORTS, Origin
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.skeletons import CHALLENGE15
 from worldpose.errors import InputError, WorldposeError

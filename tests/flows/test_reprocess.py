@@ -1,4 +1,4 @@
-"""What an edit touches, match by match: exactly what was made from it, found without running."""
+"""What an edit makes stale, match by match: what was made from it, found without running."""
 
 import json
 import sys
@@ -11,18 +11,18 @@ from typer.testing import CliRunner
 
 from data_contracts.review import DeletedDetection, MergedTracks, MovedPoint
 from data_contracts.run import UnitFailure
-from flows import planning, reprocessing
+from flows import reprocess, run_plan
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
 from flows.method import METHOD
 from flows.registering import open_match, register
-from flows.reprocess import UnprocessedError, reprocess
-from flows.reprocessing import Reprocessed, reprocess_matches
+from flows.reprocess import Reprocessed, reprocess_matches
 from flows.review.edit_conflicts import edits_since
 from flows.review.verdicts import correct
+from flows.run_status import run_status
 from flows.running import RunRequest
+from flows.service import deployed
 from flows.stages.tracking import STAGE
-from flows.touched import find_touched
 from worldpose.errors import InputError
 from worldpose.store import ResultId, Store
 from worldpose.store.paths import record_path
@@ -30,7 +30,7 @@ from worldpose.store.paths import record_path
 FLOW = [
     sys.executable,
     "-c",
-    "import json, sys; from flows.reprocess import reprocess as flow; "
+    "import json, sys; from flows.service.deployed import reprocess as flow; "
     "print(json.dumps(flow(sys.argv[1])))",
 ]
 
@@ -82,26 +82,26 @@ def edit_setting(store):
 
 
 @pytest.mark.parametrize("edit", [edit_point, edit_box, edit_identity, edit_setting])
-def test_an_edit_touches_what_was_made_from_it_and_nothing_else(store, edit):
-    assert not find_touched(store, TINY).is_touched
+def test_an_edit_makes_what_was_made_from_it_stale_and_nothing_else(store, edit):
+    assert not run_status(store, TINY).is_stale
     settings, starts = edit(store)
-    found = find_touched(store, TINY, settings)
+    found = run_status(store, TINY, settings)
     expected = made_from(store, *starts)
     assert {unit.unit for unit in found.units} == expected
     assert len(found.to_compute) == len(expected)
     assert {unit.unit for unit in found.units if unit.own_reasons} == set(starts)
 
 
-def test_new_code_touches_what_is_computed_with_it(store, monkeypatch):
-    real = planning.code_version
+def test_new_code_makes_what_is_computed_with_it_stale(store, monkeypatch):
+    real = run_plan.code_version
 
     def newer(module):
         return real(module) | ({"worldpose.filtering.judging": "new"} if "filter" in module else {})
 
-    monkeypatch.setattr(planning, "code_version", newer)
-    (unit,) = find_touched(store, TINY).units
+    monkeypatch.setattr(run_plan, "code_version", newer)
+    (unit,) = run_status(store, TINY).units
     assert (unit.unit, unit.state) == ("filtering/clip", "stale")
-    assert any("worldpose.filtering.judging" in reason for reason in unit.own_reasons)
+    assert any("worldpose.filtering.judging" in str(reason) for reason in unit.own_reasons)
 
 
 def finish(store, **changes):
@@ -119,9 +119,9 @@ def without(record, *stages):
 def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
     later = ("bundle_adjustment", "retriangulation", "body_fitting", "filtering")
     finish(store, results=without(store.run(TINY), *later))
-    assert not find_touched(store, TINY).is_touched
+    assert not run_status(store, TINY).is_stale
     edit_identity(store)
-    found = find_touched(store, TINY)
+    found = run_status(store, TINY)
     assert found.until_stage == "triangulation"
     assert [unit.unit for unit in found.units] == ["tracking/clip", "triangulation/clip"]
 
@@ -142,22 +142,24 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
     later = [stage.name for stage in METHOD[METHOD.index(STAGE) :]]
     results = without(store.run(TINY), *later)
     finish(store, state="failed", results=results, failed=(failure,), figures={}, reused=())
-    assert find_touched(store, TINY).is_touched == again
+    assert run_status(store, TINY).is_stale == again
     if not again:
         said = CliRunner().invoke(app, ["reprocess", "--project", store.url]).stdout
-        assert "nothing was edited since run 0002 was failed: --retry" in said
-    assert find_touched(store, TINY, retry=True).is_touched
+        assert "nothing was edited since run 0002, which is failed; --retry" in " ".join(
+            said.split()
+        )
+    assert run_status(store, TINY, retry=True).is_stale
     edit_box(store)
-    assert "tracking/clip" in {unit.unit for unit in find_touched(store, TINY).units}
+    assert "tracking/clip" in {unit.unit for unit in run_status(store, TINY).units}
 
 
-def test_a_later_iteration_is_touched_in_every_pass(store):
+def test_a_later_iteration_is_stale_in_every_pass(store):
     finish(store, iteration=2)
-    found = find_touched(store, TINY)
+    found = run_status(store, TINY)
     # Nothing of the second pass is there; the first pass stands in the run before.
     assert {unit.iteration for unit in found.units} == {2}
     edit_box(store)
-    found = find_touched(store, TINY)
+    found = run_status(store, TINY)
     assert {unit.iteration for unit in found.units} == {1, 2}
     assert len({unit.key for unit in found.to_compute}) == len(found.to_compute)
 
@@ -165,26 +167,26 @@ def test_a_later_iteration_is_touched_in_every_pass(store):
 def test_the_pass_before_stands_though_another_run_came_between_or_its_record_went(store):
     first = store.run(TINY)
     finish(store, iteration=2)
-    second = find_touched(store, TINY).units
+    second = run_status(store, TINY).units
     assert second
     for overrides in ({"tracking": {"min_joints": 6}}, {}):
         # Another run of a first pass, that has not all of its results.
         results = without(store.run(TINY), "filtering")
         finish(store, iteration=1, results=results, overrides=overrides)
         finish(store, iteration=2, results=first.results, overrides={})
-        assert [unit.unit for unit in find_touched(store, TINY).units] == [
+        assert [unit.unit for unit in run_status(store, TINY).units] == [
             unit.unit for unit in second
         ]
     for run_id in store.runs(TINY)[:-1]:
         store.blobs.delete(record_path(TINY, run_id))
-    assert {unit.iteration for unit in find_touched(store, TINY).units} == {2}
+    assert {unit.iteration for unit in run_status(store, TINY).units} == {2}
 
 
 def test_a_result_that_was_withdrawn_is_a_reason_and_no_failure(store):
     edit_identity(store)
     store.withdraw(ResultId(TINY, "tracking", "clip", store.run(TINY).results["tracking/clip"]))
-    found = {unit.unit: unit for unit in find_touched(store, TINY).units}
-    assert any("withdrawn" in reason for reason in found["tracking/clip"].own_reasons)
+    found = {unit.unit: unit for unit in run_status(store, TINY).units}
+    assert any("withdrawn" in str(reason) for reason in found["tracking/clip"].own_reasons)
 
 
 def test_a_match_whose_weights_are_gone_is_a_problem_of_its_own(store, tmp_path):
@@ -220,9 +222,9 @@ def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
     def machines(store, request):
         yield lambda missing: request
 
-    monkeypatch.setattr(reprocessing, "run_match", run)
-    monkeypatch.setattr(reprocessing, "shared_machines", machines)
-    real = reprocessing.find_touched
+    monkeypatch.setattr(reprocess, "run_match", run)
+    monkeypatch.setattr(reprocess, "shared_machines", machines)
+    real = reprocess.run_status
 
     def broken(store, match_id, settings, *, retry):
         if match_id == "halves":
@@ -236,17 +238,17 @@ def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
         (TINY, "complete"),
     ]
     assert ran == [(TINY, "never", 3)]
-    monkeypatch.setattr(reprocessing, "find_touched", broken)
+    monkeypatch.setattr(reprocess, "run_status", broken)
     second = reprocess_matches(store, (), request)
     assert [(each.state, each.problem) for each in second] == [
         ("failed", "its folder is gone"),
         ("complete", None),
     ]
     assert exit_code(second) == 4
-    with pytest.raises(UnprocessedError, match="halves is failed: its folder is gone"):
-        reprocess.fn(store.url)
+    with pytest.raises(deployed.UnprocessedError, match="halves is failed: its folder is gone"):
+        deployed.reprocess.fn(store.url)
     rehearsed = reprocess_matches(store, (TINY,), request, is_rehearsal=True)
-    assert [each.state for each in rehearsed] == ["touched"]
+    assert [each.state for each in rehearsed] == ["stale"]
     assert len(ran) == 3
 
 
@@ -254,9 +256,9 @@ def test_the_exit_code_says_how_far_it_came():
     def code(*states):
         return exit_code([Reprocessed("m", state) for state in states])
 
-    assert code() == code("untouched", "never run", "touched", "complete") == 0
+    assert code() == code("current", "never run", "stale", "complete") == 0
     assert code("failed") == 1
-    assert code("failed", "untouched") == code("partial") == 4
+    assert code("failed", "current") == code("partial") == 4
     assert code("waiting", "complete") == 3
 
 
@@ -264,8 +266,8 @@ def test_the_command_lists_what_it_would_compute_and_why(store):
     edit_box(store)
     answer = CliRunner().invoke(app, ["reprocess", "--dry-run", "--project", store.url])
     assert answer.exit_code == 0
-    assert f"{TINY}: touched, run 0001; 8 units to compute" in answer.stdout
-    assert "made from ingest/cam01" in " ".join(answer.stdout.split())
+    assert f"{TINY}: stale, run 0001; 8 units to compute" in answer.stdout
+    assert "changed inputs: ingest/cam01" in " ".join(answer.stdout.split())
     assert store.runs(TINY) == ("0001",)
 
 

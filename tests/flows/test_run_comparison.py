@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from data_contracts.run import RunRecord
-from flows.results import comparison, pose_diff
-from flows.results.comparison import compare_runs, count_marks
-from flows.results.pairing import BodiesOfBoth, pair_people
+from flows.results import comparison
+from flows.results.comparison import BodiesOfBoth, compare_runs, count_marks, pair_people
 from worldpose.geometry import Camera, Rigid
 
 
@@ -182,11 +181,11 @@ def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
     after[1, 0, :, 1] += 0.02
     after[2, 1, :, 1] += 0.01
     bodies = BodiesOfBoth("clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before, after)
-    (picture,) = pose_diff._worst(bodies, "cam01", {"cam01": camera}, {"cam01": camera})
+    (picture,) = comparison._worst(bodies, "cam01", {"cam01": camera}, {"cam01": camera})
     assert (picture.camera, picture.frame, picture.person) == ("cam01", 11, 7)
     assert picture.moved_px == pytest.approx(10.0)
     # Nobody in the picture, nothing to look at.
     away = BodiesOfBoth(
         "clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before + 9.0, after + 9.0
     )
-    assert pose_diff._worst(away, "cam01", {"cam01": camera}, {"cam01": camera}) == []
+    assert comparison._worst(away, "cam01", {"cam01": camera}, {"cam01": camera}) == []

@@ -14,8 +14,8 @@ from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.review.verdicts import correct
 from flows.run_record import RunLog
+from flows.run_status import run_status
 from flows.running import RunRequest
-from flows.touched import find_touched
 from worldpose.store import Store
 
 
@@ -36,10 +36,8 @@ def recorded(store, stages, failing=None, before_stage=None):
     for stage in stages:
         if before_stage == stage.name:
             merge(store)
-        plan = log.plan(stage)
-        log.blocked += plan.blocked
-        for unit in plan.units:
-            log.finished(unit, RuntimeError("x") if stage.name == failing else None)
+        for unit in log.plan.plan_stage(stage):
+            log.finish_unit(unit, RuntimeError("x") if stage.name == failing else None)
     return log.close()
 
 
@@ -68,7 +66,7 @@ def test_a_run_during_an_edit_has_the_match_as_it_began_and_the_edit_is_seen_nex
     record = recorded(store, METHOD, before_stage="tracking")
     assert record.state == "complete"
     assert record.results == before.results, "no unit of the edited match is among the others"
-    found = find_touched(store, TINY)
+    found = run_status(store, TINY)
     assert found.latest.run_id == record.run_id
     assert {unit.unit for unit in found.units if unit.own_reasons} == {"tracking/clip"}
 

@@ -163,7 +163,7 @@ def run_match(folder, project, overrides=(), until=None):
     Raises:
         WorldposeError: the match or a setting is refused.
     """
-    from flows.fan_out import task_of
+    from flows.match import task_of
     from flows.registering import register
     from flows.run_record import RunLog
     from flows.settings import parse_overrides, selected_stages
@@ -176,22 +176,18 @@ def run_match(folder, project, overrides=(), until=None):
     match, _ = register(store, Path(folder))
     log = RunLog.begin(store, match, stages, settings, "never")
     failures = []
-    for stage in stages:
-        plan = log.plan(stage)
-        log.blocked += plan.blocked
-        log.reuse(unit for unit in plan.units if unit.published)
-        for unit in plan.units:
-            if unit.published:
-                continue
+
+    def compute(stage, units):
+        for unit in (each for each in units if not each.published):
             failure = None
             try:
                 task_of(stage).fn(unit.work(store.url, match, log.run_id))
             except Exception as error:
                 failure = error
                 failures.append((unit.name, error))
-            log.finished(unit, failure)
-        log.hold(stage)
-    return store, match, log.close(), failures
+            yield unit, failure
+
+    return store, match, log.run_stages(compute), failures
 
 
 def _open_results_once(store_kind):
@@ -215,9 +211,9 @@ def _open_results_once(store_kind):
 
 def warnings_said(record, match):
     """What `worldpose run` warns of after a run, in its own words."""
-    from flows.review import clock_advice
+    from flows.review.advice import clock_advice
 
-    said = [*record.warnings, *clock_advice.clock_advice(record.figures, match.folder.spec)]
+    said = [*record.warnings, *clock_advice(record.figures, match.folder.spec)]
     for name, figures in record.figures.items():
         if figures.get("joints") == 0:
             said.append(f"{name} found nobody")
@@ -226,7 +222,7 @@ def warnings_said(record, match):
 
 def gate_objections(record):
     """What `--gates auto` would ask about, beside what clicks without a still always raise."""
-    from flows.method import GATES
+    from flows.gates import GATES
 
     usual = ("expected_ground_error", "weak is")
     found = []

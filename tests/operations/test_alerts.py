@@ -10,7 +10,7 @@ import pytest
 from data_contracts.operations import Arrival
 from flows.service.alerts import Alert, AlertDispatcher, FailedRun, alerts_now
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, UnitGlance
+from flows.service.overview import MatchStatus, UnitSummary
 from flows.service.plan import ServePlan
 from flows.service.senders import Webhook, senders_of
 from flows.service.watching import Trouble
@@ -173,7 +173,7 @@ def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
 def test_a_question_is_no_alert_before_its_time(plan):
     def waiting(hours):
         since = datetime.now(UTC) - timedelta(hours=hours)
-        unit = UnitGlance("cam04", "waiting", waiting_since=since, why="clicks_wrong is 1")
+        unit = UnitSummary("cam04", "waiting", waiting_since=since, why="clicks_wrong is 1")
         return [MatchStatus("m", stages={"static_calibration": (unit,)})]
 
     assert alerts_now(plan, waiting(0.9), [], []) == []
@@ -185,7 +185,7 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
-    unit = UnitGlance("clip", "done", objections=("offset_rms_m is 0.05, at most 0.03 passes",))
+    unit = UnitSummary("clip", "done", objections=("offset_rms_m is 0.05, at most 0.03 passes",))
     match = MatchStatus("m", stages={"body_fitting": (unit,)})
     assert kinds(alerts_now(plan, [match], [], [])) == ["quality"]
     arrivals = [
@@ -201,5 +201,5 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
 
 
 def test_a_good_match_raises_nothing(plan):
-    unit = UnitGlance("clip", "done", 1.0, {"offset_rms_m": 0.01})
+    unit = UnitSummary("clip", "done", 1.0, {"offset_rms_m": 0.01})
     assert alerts_now(plan, [MatchStatus("m", stages={"body_fitting": (unit,)})], [], []) == []

@@ -18,10 +18,9 @@ from prefect.workers.process import ProcessWorker
 
 from flows.service import recovery
 from flows.service.deployed import release_folder
-from flows.service.deployments import DEPLOYED, install
+from flows.service.deployments import DEPLOYED, RefusedRunError, install, require_installed
 from flows.service.plan import FLOWS, ServePlan
 from flows.service.recovery import begin_again
-from flows.service.served_worker import RefusedRunError, require_installed
 from flows.service.watching import failed_runs
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store

@@ -10,8 +10,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from flows.service.arrivals import take_in, watch_once
-from flows.service.inbox import MOST_FILES, RefusalError, entries, fingerprint_of, missing_of
+from flows.service.inbox import (
+    MOST_FILES,
+    RefusalError,
+    entries,
+    fingerprint_of,
+    missing_of,
+    take_in,
+    watch_once,
+)
 from flows.service.layout import StateFolder, state_folder
 from worldpose.errors import UsageError
 from worldpose.store import Store
@@ -50,7 +57,7 @@ def clock(monkeypatch):
     """The machine's clock that only goes forward, as a test sets it [s]."""
     clock = SimpleNamespace(now=1000.0)
     read = SimpleNamespace(monotonic=lambda: clock.now)
-    monkeypatch.setattr("flows.service.arrivals.time", read)
+    monkeypatch.setattr("flows.service.inbox.time", read)
     return clock
 
 
@@ -210,16 +217,16 @@ def test_a_match_that_moves_to_another_queue_is_known(desk, drop):
 
 def take_in_and_die(folder, poisoned):
     """A process that dies, as from the system's out-of-memory killer, when it reads one match."""
-    from flows.service import arrivals
+    from flows.service import inbox
 
-    register = arrivals.register
+    register = inbox.register
 
     def register_or_die(store, match, **options):
         if match.name == poisoned:
             os._exit(137)
         return register(store, match, **options)
 
-    arrivals.register = register_or_die
+    inbox.register = register_or_die
     Desk(folder).take_in()
 
 
@@ -268,7 +275,7 @@ def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkey
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("flows.service.arrivals.register", interrupt)
+        patch.setattr("flows.service.inbox.register", interrupt)
         for _ in range(3):
             with pytest.raises(KeyboardInterrupt):
                 desk.take_in()

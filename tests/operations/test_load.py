@@ -12,8 +12,8 @@ import yaml
 from command_line import WORLDPOSE, succeed
 
 from flows.method import METHOD
-from flows.planning import plan_run
 from flows.registering import register
+from flows.run_plan import plan_run
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.store import Store
 
@@ -114,7 +114,7 @@ def test_ten_thousand_small_units_are_computed_and_found_again(tmp_path, capsys)
 
 def seconds_in_a_loop(folder, project):
     """What a unit takes where one process computes and publishes one after another."""
-    from flows.fan_out import task_of  # late: Dask and Prefect take seconds to import
+    from flows.match import task_of  # late: Dask and Prefect take seconds to import
 
     store = Store.create(str(project))
     match, _ = register(store, folder)

@@ -8,8 +8,8 @@ import yaml
 from command_line import succeed
 from stand_ins import publish_stand_in
 
-from flows.planning import plan_run
 from flows.registering import register
+from flows.run_plan import plan_run
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.store import Store
 

@@ -8,7 +8,7 @@ from command_line import TINY
 
 from data_contracts.operations import Arrival
 from flows.service.layout import StateFolder
-from flows.service.overview import MatchStatus, Overview, UnitGlance
+from flows.service.overview import MatchStatus, Overview, UnitSummary
 from flows.service.status_page import STYLE, status_html
 from flows.web.access import access_for
 from flows.web.app import create_app
@@ -73,9 +73,9 @@ def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
 
 def test_the_worst_state_of_a_stage_is_what_is_seen():
     units = (
-        UnitGlance("cam00", "done", 1.0),
-        UnitGlance("cam01", "waiting", 2.0, waiting_since=datetime.now(UTC)),
-        UnitGlance("cam02", "failed", why=EVIL),
+        UnitSummary("cam00", "done", 1.0),
+        UnitSummary("cam01", "waiting", 2.0, waiting_since=datetime.now(UTC)),
+        UnitSummary("cam02", "failed", why=EVIL),
     )
     match = MatchStatus("m", stages={"ingest": units[:1], "static_calibration": units})
     run = "1f2e"

@@ -11,10 +11,10 @@ import tasks.detection
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Correction, DeletedDetection
 from data_contracts.work import Work
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.method import METHOD
-from flows.planning import plan_stage
 from flows.registering import register
+from flows.run_plan import RunPlan
 from tasks.clip_inputs import open_clip, open_frames
 from worldpose.detection import People
 from worldpose.errors import InputError
@@ -59,7 +59,7 @@ def computed(store, match, stages):
     """Results of the first stages, by `stage/unit`."""
     results = {}
     for stage in METHOD[:stages]:
-        for unit in plan_stage(store, match, stage, {}, results).units:
+        for unit in RunPlan(store, match, {}, results=results).plan_stage(stage):
             task_of(stage).fn(unit.work(store.url, match, "0001"))
             results[unit.name] = unit.key
     return results
@@ -73,8 +73,9 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     late = store.open_result("filmed", "ingest", "right", results["ingest/right"])
     # Frames 20 to 29 are pictures 23 to 32 of `right`, which has 31.
     assert late.attrs["video"]["missing_frames"] == [[28, 29]]
-    plan = plan_stage(store, match, METHOD[names.index("tracking")], {}, results)
-    early, late = (unit.work(store.url, match, "0001") for unit in plan.units)
+    plan = RunPlan(store, match, {}, results=results)
+    planned = plan.plan_stage(METHOD[names.index("tracking")])
+    early, late = (unit.work(store.url, match, "0001") for unit in planned)
     assert set(early.recipe.inputs) == {
         *("detection/left.early", "detection/right.early"),
         *("static_calibration/left", "static_calibration/right"),
@@ -143,7 +144,7 @@ def computed_again(store, match, stages, before):
     """The same where what is there already is not computed."""
     results = {}
     for stage in METHOD[:stages]:
-        for unit in plan_stage(store, match, stage, {}, results).units:
+        for unit in RunPlan(store, match, {}, results=results).plan_stage(stage):
             if before.get(unit.name) != unit.key:
                 task_of(stage).fn(unit.work(store.url, match, "0001"))
             results[unit.name] = unit.key
@@ -155,10 +156,11 @@ def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, 
     match, _ = register(store, filmed)
     names = [stage.name for stage in METHOD]
     results = computed(store, match, names.index("detection"))
-    plan = plan_stage(store, match, METHOD[names.index("detection")], {}, results)
+    plan = RunPlan(store, match, {}, results=results)
+    planned = plan.plan_stage(METHOD[names.index("detection")])
     monkeypatch.setattr(tasks.detection, "weights_of", lambda settings: {"embedded": "another"})
     with pytest.raises(InputError, match="planned with"):
-        task_of(METHOD[names.index("detection")]).fn(plan.units[0].work(store.url, match, "0001"))
+        task_of(METHOD[names.index("detection")]).fn(planned[0].work(store.url, match, "0001"))
 
 
 def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp_path):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.method import METHOD
-from flows.planning import plan_run
 from flows.registering import register
+from flows.run_plan import plan_run
 from worldpose.store import Store
 
 NOBODY = {"tracking": {"size_range": [3.0, 4.0]}}

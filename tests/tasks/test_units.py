@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from prefect.states import Failed
 
-from flows.fan_out import task_of
+from flows.match import task_of
 from flows.method import METHOD
-from flows.planning import plan_run, plan_stage
 from flows.registering import register
+from flows.run_plan import plan_run
 from flows.run_record import RunLog
 from tasks.clip_inputs import ClipInputs
 from tasks.ingest import ingest
@@ -221,12 +221,10 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned, failing):
     failed = f"{failing}/{first.recipe.unit}"
     log = RunLog.begin(store, match, METHOD, {})
     for stage in METHOD:
-        plan = plan_stage(store, match, stage, {}, log.results)
-        log.blocked += plan.blocked
-        for unit in plan.units:
+        for unit in log.plan.plan_stage(stage):
             if unit.name != failed:
                 task_of(stage).fn(unit.work(store.url, match, log.run_id))
-            log.finished(unit, RuntimeError("x") if unit.name == failed else None)
+            log.finish_unit(unit, RuntimeError("x") if unit.name == failed else None)
     record = log.close()
     assert record.state == "failed"
     assert [failure.unit for failure in record.failed] == [failed]
@@ -246,10 +244,10 @@ def test_units_behind_a_failed_one_are_recorded_as_blocked(planned, failing):
 def test_a_run_until_a_stage_is_partial_when_some_of_its_units_are_there(planned):
     store, match, first = planned
     log = RunLog.begin(store, match, METHOD[:1], {})
-    for unit in plan_stage(store, match, METHOD[0], {}, {}).units:
+    for unit in log.plan.plan_stage(METHOD[0]):
         if unit.name != first.name:
             ingest.fn(unit.work(store.url, match, log.run_id))
-        log.finished(unit, RuntimeError("x") if unit.name == first.name else None)
+        log.finish_unit(unit, RuntimeError("x") if unit.name == first.name else None)
     assert log.close().state == "partial"
 
 

@@ -8,7 +8,14 @@ from worldpose.store.comparison import compare_stores
 from worldpose.store.garbage import Garbage, GcPlan, collect, plan_gc
 from worldpose.store.integrity import Finding, repair, verify
 from worldpose.store.paths import ResultId
-from worldpose.store.recipes import code_version, explain_difference, libraries, recipe_key
+from worldpose.store.recipes import (
+    RecipeDifference,
+    code_version,
+    explain_difference,
+    libraries,
+    recipe_differences,
+    recipe_key,
+)
 from worldpose.store.runs import list_pins, pin_run, unpin_run
 from worldpose.store.store import Run, Store, open_run
 from worldpose.store.writer import ResultWriter
@@ -17,6 +24,7 @@ __all__ = [
     "Finding",
     "Garbage",
     "GcPlan",
+    "RecipeDifference",
     "ResultId",
     "ResultWriter",
     "Run",
@@ -30,6 +38,7 @@ __all__ = [
     "open_run",
     "pin_run",
     "plan_gc",
+    "recipe_differences",
     "recipe_key",
     "repair",
     "unpin_run",

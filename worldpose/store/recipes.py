@@ -6,9 +6,10 @@ import ast
 import functools
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from data_contracts.work import Recipe
 from worldpose.errors import StoreError
@@ -181,13 +182,34 @@ def recipe_key(recipe: Recipe) -> str:
     return digest(canonical_json(dict(recipe)))[:KEY_LENGTH]
 
 
-def explain_difference(old: Recipe, new: Recipe) -> list[str]:
-    """Return one line per difference between `old` and `new`; empty if equal.
+DifferenceKind = Literal[
+    "contract", "match", "unit", "source", "input", "setting", "module", "library", "recipe"
+]
 
-    Lines read `setting gate.max_distance: 0.5 -> 0.7` or `module worldpose.tracking.tracker:
-    3f2a... -> 77b1...`; a missing side reads `absent`.
+
+@dataclass(frozen=True)
+class RecipeDifference:
+    """One difference between two recipes.
+
+    Attributes:
+        kind: part of the recipe.
+        name: name within that part; empty if the part is a single value.
+        before: value in the old recipe as short text, or `absent`.
+        after: value in the new one.
     """
-    lines = [
+
+    kind: DifferenceKind
+    name: str
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}".rstrip() + f": {self.before} -> {self.after}"
+
+
+def recipe_differences(old: Recipe, new: Recipe) -> list[RecipeDifference]:
+    """Return the differences between `old` and `new`; empty if equal."""
+    found = [
         *_changes("contract", {"": old.contract}, {"": new.contract}),
         *_changes("match", {"": old.match_id}, {"": new.match_id}),
         *_changes("unit", {"": old.name}, {"": new.name}),
@@ -198,16 +220,27 @@ def explain_difference(old: Recipe, new: Recipe) -> list[str]:
         *_changes("library", old.libraries, new.libraries),
     ]
     # Digests with equal beginnings look equal when shortened; every difference must show.
-    if not lines and recipe_key(old) != recipe_key(new):
-        lines.append(f"recipe: {recipe_key(old)} -> {recipe_key(new)}")
-    return lines
+    if not found and recipe_key(old) != recipe_key(new):
+        found.append(RecipeDifference("recipe", "", recipe_key(old), recipe_key(new)))
+    return found
 
 
-def _changes(kind: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+def explain_difference(old: Recipe, new: Recipe) -> list[str]:
+    """Return one line per difference between `old` and `new`; empty if equal.
+
+    Lines read `setting gate.max_distance: 0.5 -> 0.7` or `module worldpose.tracking.tracker:
+    3f2a... -> 77b1...`; a missing side reads `absent`.
+    """
+    return [str(each) for each in recipe_differences(old, new)]
+
+
+def _changes(
+    kind: DifferenceKind, old: Mapping[str, Any], new: Mapping[str, Any]
+) -> Iterator[RecipeDifference]:
     for name in sorted(old.keys() | new.keys()):
         before, after = _format_value(old, name), _format_value(new, name)
         if before != after:
-            yield f"{kind} {name}".rstrip() + f": {before} -> {after}"
+            yield RecipeDifference(kind, name, before, after)
 
 
 def _format_value(values: Mapping[str, Any], name: str) -> str:

@@ -13,8 +13,8 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from flows.planning import plan_run
 from flows.registering import register
+from flows.run_plan import plan_run
 from flows.stages.broadcast_pooling import STAGE as POOLING
 from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling

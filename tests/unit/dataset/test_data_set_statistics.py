@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 
 from data_contracts.release import ClipStatistics
 from flows.cli.app import app
-from flows.results.checking import check
-from flows.results.statistics import count
+from flows.results.dataset import check, count
 from worldpose.body import BodyParameters
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates, write_frame_rates
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics
@@ -179,7 +178,7 @@ def test_a_frame_rate_that_nobody_stated_is_said_and_an_export_s_is_taken(tmp_pa
     places = made(np.random.default_rng(3), 50, 2).astype(np.float64)
     joints = np.tile(places.swapaxes(0, 1)[:, :, None], (1, 1, 17, 1))
     write_joints(tmp_path / "joints.npz", JointTracks(np.arange(50), np.arange(2), joints))
-    told = "frames a second not stated: taken as 50 (--fps)"
+    told = "no frame rate is stated: 50 per second is assumed (--fps)"
     assert told in CliRunner().invoke(app, [command, str(tmp_path)]).stderr
     assert told not in CliRunner().invoke(app, [command, str(tmp_path), "--fps", "30"]).stderr
     write_frame_rates(tmp_path, {"A_1": 25.0})

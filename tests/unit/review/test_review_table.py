@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from types import SimpleNamespace
 
 from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest, Withdrawal
-from flows.reports.review import MOST, review_table
+from flows.reports.report import MOST, review_table
 
 NOW = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 ASKED = ReviewRequest(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from method_files import FRAMES, WRITERS, scene, truth_of
 
-from flows.cli.methods import named_rates
+from flows.cli.evaluate import named_rates
 from flows.results.baselines import score_methods
 from worldpose.body import BodyParameters
 from worldpose.errors import UsageError

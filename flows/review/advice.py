@@ -1,22 +1,58 @@
-"""Advice on clock offsets of static cameras in match.yaml, from a run's metrics."""
+"""Advice from a run's metrics, on the click noise setting and on clock offsets in match.yaml."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import sqrt
 from statistics import median_low
 from typing import Final
 
 from data_contracts.match import MatchSpec
+
+MIN_FREEDOM: Final = 10.0
+"""Minimum degrees of freedom of all cameras for advice [1]."""
+MIN_NOISE_RATIO: Final = 1.25
+"""Minimum ratio of estimated to stated noise for advice [1]."""
+MIN_STANDARD_ERRORS: Final = 4.0
+"""Minimum difference from the stated noise in standard errors."""
+
+
+def click_advice(figures: Mapping[str, Mapping[str, float]], stated: float) -> list[str]:
+    """Return advice if the click noise is significantly larger than stated.
+
+    The clicks of all cameras are pooled: a single camera with few clicks cannot determine its
+    noise.
+
+    Args:
+        figures: metrics of a run, by unit and name.
+        stated: `static_calibration.click_noise` of that run [px].
+    """
+    told = [
+        (each["click_noise_px"], each["click_freedom"])
+        for name, each in figures.items()
+        if name.startswith("static_calibration/") and "click_noise_px" in each
+    ]
+    freedom = sum(worth for _, worth in told)
+    if freedom < MIN_FREEDOM:
+        return []
+    noise = sqrt(sum(worth * own**2 for own, worth in told) / freedom)
+    error = noise / sqrt(2.0 * freedom)
+    if noise < max(MIN_NOISE_RATIO * stated, stated + MIN_STANDARD_ERRORS * error):
+        return []
+    return [
+        f"the clicks of {len(told)} cameras are {noise:.1f} px off (standard error {error:.1f} "
+        f"px), stated are {stated:g} px: cameras with few clicks state too little uncertainty; run "
+        f"with --set static_calibration.click_noise={noise:.2g}"
+    ]
+
 
 STAGES: Final = ("filtering", "retriangulation", "triangulation")
 """Stages that estimate clock offsets, most accurate first: adjusted cameras absorb much of a
 clock offset, and only filtering separates the two."""
 LATE: Final = "clock_late_frames."
 ERROR: Final = "clock_error_frames."
-WORTH: Final = 0.5
+MIN_OFFSET: Final = 0.5
 """Minimum difference for advice: from here another integer offset is nearer [frame]."""
-SURE: Final = 4.0
-"""Minimum difference for advice in standard errors."""
 
 
 def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) -> list[str]:
@@ -34,7 +70,10 @@ def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) ->
             continue
         late, error = min(known, key=lambda each: each[1])
         offset = round(camera.offset_frames - late)
-        if abs(late) > max(WORTH, SURE * error) and offset != camera.offset_frames:
+        if (
+            abs(late) > max(MIN_OFFSET, MIN_STANDARD_ERRORS * error)
+            and offset != camera.offset_frames
+        ):
             said.append(
                 f"camera {camera.id} shows {abs(late):.1f} frames "
                 f"{'later' if late > 0 else 'earlier'} than the others: set its offset_frames to "

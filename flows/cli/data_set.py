@@ -1,0 +1,154 @@
+"""Command statistics: size of a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.console import JsonOption, errors, line, print_json, print_table
+
+
+def statistics(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folders of one exported data set.")
+    ],
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", help="Histograms of trajectory and clip lengths, as a PNG."),
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--page", help="Write an HTML page with statistics and check results."),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            "--fps", min=0.001, help="Frames per second; by default the data set's, or 50."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count a data set as the paper does: clips, frames, poses, people, distances.
+
+    Example: worldpose statistics exported --picture lengths.png
+    """
+    from flows.results.dataset import count
+
+    for folder in folders:
+        tell_unstated_rate(folder, fps)
+    found = count(folders, fps=fps)
+    if picture is not None:
+        from worldpose.formats.files import whole_file
+        from worldpose.reports.data_set import plot_statistics
+
+        with whole_file(picture) as draft:
+            draft.write_bytes(plot_statistics(found))
+    if page is not None:
+        from flows.results.dataset import check
+        from worldpose.formats.files import whole_file
+        from worldpose.reports.data_set import data_set_page
+
+        checks = {str(folder): check(folder, fps=fps) for folder in folders}
+        title = ", ".join(folder.resolve().name for folder in folders)
+        with whole_file(page) as draft:
+            draft.write_text(data_set_page(title, found, checks), encoding="utf-8")
+    if as_json:
+        print_json(found.model_dump(mode="json"))
+        return
+    rows = [
+        (
+            name,
+            clip.camera or "-",
+            f"{clip.frames}",
+            f"{clip.seconds:.1f}",
+            f"{clip.persons}",
+            f"{clip.poses}",
+            f"{sum(clip.trajectories_m):.0f}",
+        )
+        for name, clip in found.clips.items()
+    ]
+    titles = ("frames", "s", "people", "poses", "distance m")
+    print_table("", ("clip", "camera", *(f">{title}" for title in titles)), rows)
+    line(
+        f"{len(found.clips)} clips, {found.minutes:.1f} min, {found.frames} frames, "
+        f"{found.poses} poses, {found.distance_km:.2f} km, camera {found.camera or '-'}"
+    )
+    if found.subjects_per_frame is not None and found.speed_m_s is not None:
+        line(
+            f"{found.subjects_per_frame:.1f} people in a frame, {found.speed_m_s:.1f} m/s, "
+            f"trajectories up to {found.longest_trajectory_m or 0.0:.0f} m"
+        )
+    for written in (picture, page):
+        if written is not None:
+            line(f"wrote {written}")
+
+
+FAULTY = 1
+"""Exit code if the data set has faults."""
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of an exported data set.")],
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            "--fps", min=0.001, help="Frames per second; by default the data set's, or 50."
+        ),
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", help="Body model of pose files without one; the open body."),
+    ] = None,
+    pitch: Annotated[
+        bool, typer.Option("--pitch/--no-pitch", help="Whether the ground is a football pitch.")
+    ] = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Check whether a data set is consistent, and which convention it violates if not.
+
+    Example: worldpose check exported
+    """
+    from flows.results.dataset import check as check_data_set
+
+    tell_unstated_rate(folder, fps)
+    report = check_data_set(folder, fps=fps, body=body, pitch=pitch)
+    if as_json:
+        print_json({**report.model_dump(mode="json"), "passed": not report.findings})
+    else:
+        rows = [
+            (
+                name,
+                f"{figures.frames}",
+                f"{figures.persons}",
+                f"{figures.cameras}",
+                f"{figures.compared}",
+                _shown(figures.reprojection_median_px),
+                _shown(figures.plausible_share),
+            )
+            for name, figures in report.clips.items()
+        ]
+        titles = ("frames", "people", "cameras", "compared", "reprojection px", "plausible")
+        print_table("", ("clip", *(f">{title}" for title in titles)), rows)
+        for finding in report.findings:
+            figures = ", ".join(f"{name} {value:.4g}" for name, value in finding.figures.items())
+            line(f"{finding.fault}: {finding.says} [{', '.join(finding.where)}] {figures}".rstrip())
+        line(f"{len(report.findings)} findings" if report.findings else "no findings")
+    if report.findings:
+        raise typer.Exit(FAULTY)
+
+
+def tell_unstated_rate(folder: Path, fps: float | None) -> None:
+    """Print the assumed frame rate, since seconds and speeds depend on it."""
+    from flows.results.dataset import USUAL_FPS, stated_rates
+
+    if None in stated_rates(folder, fps).values():
+        line(
+            f"{folder}: no frame rate is stated: {USUAL_FPS:g} per second is assumed (--fps)",
+            to=errors,
+        )
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

@@ -1,0 +1,338 @@
+"""Run plan: the units of a run and their keys, decided before any work starts.
+
+A unit's key is the digest of its recipe: inputs' keys, sources, settings, code, libraries. A result
+is reused if and only if the store holds its key. Every run, and every question about what a run
+would do, plans stage by stage with the `RunPlan` of this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Self
+
+from data_contracts.run import RunRecord, WaitingUnit
+from data_contracts.work import Recipe, Work
+from flows.gates import Gatekeeper
+from flows.left_out import left_out_cameras
+from flows.method import METHOD
+from flows.settings import Overrides, settings_of
+from flows.stage import Match, Stage
+from worldpose.errors import StoreError, UsageError
+from worldpose.store import Store, code_version, libraries, recipe_key
+
+
+@dataclass(frozen=True)
+class PlannedUnit:
+    """One unit of a run.
+
+    Attributes:
+        recipe: all that its result depends on.
+        key: digest of the recipe.
+        published: whether the store held its result when it was planned; otherwise it is to run.
+        iteration: the iteration that it belongs to, from 1.
+    """
+
+    recipe: Recipe
+    key: str
+    published: bool
+    iteration: int = 1
+
+    @property
+    def name(self) -> str:
+        """Name as `stage/unit`."""
+        return self.recipe.name
+
+    def work(self, project: str, match: Match, run_id: str, seconds: float | None = None) -> Work:
+        """Return the work order for this unit's task, with a time limit [s]."""
+        return Work(
+            project=project,
+            folder=match.registration.folder,
+            recipe=self.recipe,
+            key=self.key,
+            run_id=run_id,
+            seconds=seconds,
+        )
+
+
+@dataclass
+class RunPlan:
+    """Plan of a run, made stage by stage.
+
+    A stage is planned from the results of the stages before it. A plan of a run in progress adds
+    the results that exist (`add_results`); a plan made ahead (`plan_ahead`) adds those that the
+    run will compute.
+
+    Attributes:
+        store: store with existing results.
+        match: the match, with all its cameras.
+        overrides: settings that differ from their defaults.
+        stages: stages of the run, in order.
+        iteration: iteration number, from 1.
+        results: `stage/unit` to key of the results that the run has, or will have.
+        before: the same for the previous iteration; None in the first.
+        gatekeeper: decides which results need review; None = every result passes.
+        units: the units planned so far whose inputs are known.
+        waiting: results that need review; later stages cannot use them.
+        blocked: names, as `stage/unit`, of units with an input without a result, that wait for the
+            decision which cameras are left out, or that need more cameras than are left.
+        lacks_cameras: whether some are blocked because too many cameras are left out.
+    """
+
+    store: Store
+    match: Match
+    overrides: Overrides
+    stages: tuple[Stage, ...] = METHOD
+    iteration: int = 1
+    results: dict[str, str] = field(default_factory=dict)
+    before: Mapping[str, str] | None = None
+    gatekeeper: Gatekeeper | None = None
+    units: list[PlannedUnit] = field(default_factory=list)
+    waiting: list[WaitingUnit] = field(default_factory=list)
+    blocked: list[str] = field(default_factory=list)
+    lacks_cameras: bool = False
+
+    @classmethod
+    def begin(
+        cls,
+        gatekeeper: Gatekeeper,
+        stages: tuple[Stage, ...],
+        overrides: Overrides,
+        latest: RunRecord | None,
+        iteration: int,
+    ) -> Self:
+        """Return the plan of a run of `stages` before its first stage.
+
+        A run from the method's first stage uses the previous iteration with its own settings. Any
+        other run continues the latest run: it takes that run's results of earlier stages, stale or
+        not, and the previous iteration that they were computed from.
+
+        Args:
+            gatekeeper: with the store and the match.
+            stages: stages of the run.
+            overrides: settings that differ from their defaults.
+            latest: the match's latest run.
+            iteration: iteration number, if the run does not continue the latest run.
+        """
+        store, match = gatekeeper.store, gatekeeper.match
+        results: dict[str, str] = {}
+        before: Mapping[str, str] | None = None
+        earlier = METHOD[: METHOD.index(stages[0])]
+        if not earlier:
+            before = results_before(store, match, overrides, iteration)
+        elif latest is None:
+            iteration = 1
+        else:
+            iteration = latest.iteration
+            names = {stage.name for stage in earlier}
+            results = {
+                name: key for name, key in latest.results.items() if name.partition("/")[0] in names
+            }
+            before = _inputs_from_before(store, match, latest) if iteration > 1 else None
+        plan = cls(
+            store=store,
+            match=match,
+            overrides=overrides,
+            stages=stages,
+            iteration=iteration,
+            results=results,
+            before=before,
+            gatekeeper=gatekeeper,
+        )
+        for stage in earlier:
+            plan.hold(stage, results)
+        return plan
+
+    @property
+    def missing(self) -> list[PlannedUnit]:
+        """The planned units to compute."""
+        return [unit for unit in self.units if not unit.published]
+
+    @property
+    def usable_results(self) -> dict[str, str]:
+        """The results that later stages can use."""
+        return without_waiting(self.results, self.waiting)
+
+    def plan_stage(self, stage: Stage) -> list[PlannedUnit]:
+        """Plan a stage from the results so far; return its units whose inputs are known.
+
+        The plan uses the cameras that no earlier result leaves out (`flows.left_out`).
+        """
+        if self.before is None and stage.first_pass > 1:
+            return []
+        results = self.usable_results
+        earlier = METHOD[: METHOD.index(stage)]
+        left_out = left_out_cameras(self.store, self.match, earlier, results)
+        match = self.match.without(left_out)
+        lacks_cameras = len(match.folder.spec.static_cameras) < stage.min_cameras
+        if stage.min_cameras and not _cameras_are_decided(match, earlier, results):
+            self.blocked += (f"{stage.name}/{unit}" for unit in stage.units(match))
+            return []
+        if left_out and lacks_cameras:
+            self.blocked += (f"{stage.name}/{unit}" for unit in stage.units(match))
+            self.lacks_cameras = True
+            return []
+        planned = self._plan_units(match, stage, results)
+        self.units += planned
+        return planned
+
+    def _plan_units(
+        self, match: Match, stage: Stage, results: Mapping[str, str]
+    ) -> list[PlannedUnit]:
+        """Plan the units of a stage for a match without the cameras that are left out."""
+        before = self.before
+        settings = settings_of(stage, self.overrides)
+        outside = stage.external_inputs(settings)
+        units = []
+        for unit in stage.units(match):
+            inputs = {name: results.get(name) for name in stage.inputs(match, unit)}
+            if before is not None:
+                inputs |= {name: results.get(name) for name in stage.late_inputs(match, unit)}
+                inputs |= {
+                    name: before.get(name) for name in stage.previous_pass_inputs(match, unit)
+                }
+            known = {name: key for name, key in inputs.items() if key is not None}
+            if known.keys() != inputs.keys():
+                self.blocked.append(f"{stage.name}/{unit}")
+                continue
+            # Not validated here: all values are ours, `recipe_key` refuses any that are not JSON,
+            # and validating thousands of corrections one by one takes longer than all other steps.
+            recipe = Recipe.model_construct(
+                match_id=match.match_id,
+                stage=stage.name,
+                unit=unit,
+                sources=stage.sources(match, unit) | outside,
+                inputs=known,
+                settings=settings.model_dump(mode="json"),
+                code=code_version(f"tasks.{stage.name}"),
+                libraries=libraries(),
+            )
+            key = recipe_key(recipe)
+            published = self.store.has(match.match_id, stage.name, unit, key)
+            units.append(PlannedUnit(recipe, key, published, self.iteration))
+        return units
+
+    def add_results(self, units: Iterable[PlannedUnit]) -> None:
+        """Count the results of units as existing."""
+        self.results |= {unit.name: unit.key for unit in units}
+
+    def hold(self, stage: Stage, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
+        """Hold back the results of a stage that need review; return these.
+
+        Args:
+            stage: a stage.
+            results: `stage/unit` to key of existing results.
+        """
+        held = () if self.gatekeeper is None else self.gatekeeper.held(stage.name, results)
+        self.waiting += held
+        return held
+
+    def is_recorded_by(self, latest: RunRecord | None) -> bool:
+        """Return whether the latest run's record equals that of a run made now."""
+        if latest is None or latest.failed or latest.state == "failed" or self.missing:
+            return False
+        is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
+        return is_asked and self.results.items() <= latest.results.items()
+
+
+def plan_ahead(
+    gatekeeper: Gatekeeper,
+    stages: tuple[Stage, ...],
+    overrides: Overrides,
+    latest: RunRecord | None,
+    iteration: int,
+) -> RunPlan:
+    """Plan all stages of a run.
+
+    The plan assumes that every unit succeeds and that every missing result passes its gate.
+
+    Args:
+        gatekeeper: with the store and the match.
+        stages: stages of the run.
+        overrides: settings that differ from their defaults.
+        latest: the match's latest run.
+        iteration: iteration number, if the run does not continue the latest run.
+
+    Raises:
+        UsageError: the latest run lacks inputs of the stages.
+    """
+    plan = RunPlan.begin(gatekeeper, stages, overrides, latest, iteration)
+    for stage in stages:
+        units = plan.plan_stage(stage)
+        if plan.blocked and not plan.waiting and not plan.lacks_cameras:
+            raise UsageError(
+                f"--from {stages[0].name}",
+                expected=f"a latest run with all inputs of {plan.blocked[0]}",
+                found=", ".join(sorted(plan.results)) or "no result of an earlier stage",
+                todo="Run the match without --from first.",
+            )
+        plan.add_results(units)
+        plan.hold(stage, {unit.name: unit.key for unit in units if unit.published})
+    return plan
+
+
+def plan_run(
+    store: Store,
+    match: Match,
+    overrides: Overrides,
+    stages: tuple[Stage, ...] = METHOD,
+    iteration: int = 1,
+) -> list[PlannedUnit]:
+    """Plan all units of the method's first `stages`, as if every unit succeeded.
+
+    Args:
+        store: store with existing results.
+        match: the match.
+        overrides: settings that differ from their defaults.
+        stages: the stages to plan, from the first.
+        iteration: iteration number, from 1.
+    """
+    before = results_before(store, match, overrides, iteration)
+    plan = RunPlan(store, match, overrides, stages, iteration, before=before)
+    for stage in stages:
+        plan.add_results(plan.plan_stage(stage))
+    return plan.units
+
+
+def results_before(
+    store: Store, match: Match, overrides: Overrides, iteration: int
+) -> dict[str, str] | None:
+    """Return the previous iteration's results, `stage/unit` to key; None in the first iteration."""
+    if iteration == 1:
+        return None
+    planned = plan_run(store, match, overrides, iteration=iteration - 1)
+    return {unit.name: unit.key for unit in planned}
+
+
+def without_waiting(results: Mapping[str, str], waiting: Iterable[WaitingUnit]) -> dict[str, str]:
+    """Return the results that do not wait for review."""
+    held = {unit.unit for unit in waiting}
+    return {name: key for name, key in results.items() if name not in held}
+
+
+def _inputs_from_before(store: Store, match: Match, latest: RunRecord) -> dict[str, str]:
+    """Return the latest run's inputs from the previous iteration, read from its recipes."""
+    before: dict[str, str] = {}
+    for stage in METHOD:
+        for unit in stage.units(match):
+            name = f"{stage.name}/{unit}"
+            taken = stage.previous_pass_inputs(match, unit)
+            if not taken or name not in latest.results:
+                continue
+            try:
+                manifest = store.manifest(match.match_id, stage.name, unit, latest.results[name])
+            except StoreError:  # withdrawn: other recipes name them, else missing
+                continue
+            inputs = manifest.recipe.inputs
+            before |= {each: inputs[each] for each in taken if each in inputs}
+    return before
+
+
+def _cameras_are_decided(
+    match: Match, stages: tuple[Stage, ...], results: Mapping[str, str]
+) -> bool:
+    """Return whether every result that can leave cameras out exists, and none waits."""
+    judging = (stage for stage in stages if stage.leaves_out)
+    return all(
+        f"{stage.name}/{unit}" in results for stage in judging for unit in stage.units(match)
+    )

@@ -1,0 +1,293 @@
+"""Run status: which units of a match are stale, and why.
+
+An edit is a correction or a verdict, a changed file of the match folder, a setting, a detector's
+weights, the code. All of them are in the units' recipes, so edits need no notification: the run
+plan of now is compared with a match's latest run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from pydantic import JsonValue
+
+from data_contracts.run import RunRecord, UnitFailure
+from data_contracts.work import Recipe
+from flows.gates import Gatekeeper
+from flows.method import METHOD
+from flows.registering import open_match
+from flows.renames import rename_settings
+from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
+from flows.run_record import latest_run
+from flows.settings import Overrides, selected_stages
+from flows.stage import Match
+from worldpose.errors import InputError, StoreError
+from worldpose.store import RecipeDifference, Store, recipe_differences
+
+TEMPORARY_ERRORS: Final = frozenset(
+    error.__name__
+    for error in (
+        StoreError,
+        OSError,
+        BlockingIOError,
+        ChildProcessError,
+        ConnectionError,
+        BrokenPipeError,
+        ConnectionAbortedError,
+        ConnectionRefusedError,
+        ConnectionResetError,
+        FileExistsError,
+        FileNotFoundError,
+        InterruptedError,
+        IsADirectoryError,
+        NotADirectoryError,
+        PermissionError,
+        ProcessLookupError,
+        TimeoutError,
+    )
+)
+"""Errors of a disk or a network, as run records name them; the next attempt can succeed."""
+
+
+class UnitState(StrEnum):
+    """State of a unit relative to a run."""
+
+    CURRENT = "current"
+    """The run has the result of the current recipe."""
+    READY = "ready"
+    """The store has that result, the run has not."""
+    STALE = "stale"
+    """The run has the result of another recipe; the unit is to be computed."""
+    MISSING = "missing"
+    """There is no result; the unit is to be computed."""
+
+
+class Cause(StrEnum):
+    """Why a unit's result is or is not that of a run, where no difference of recipes says it."""
+
+    NOT_COMPUTED = "no run has computed it"
+    WITHDRAWN = "its result was withdrawn or removed"
+    WITHDRAWN_WITH_RECIPE = "its result was withdrawn or removed, and with it what it was made from"
+
+
+Reason = Cause | RecipeDifference
+"""Formatted by `str`."""
+
+
+@dataclass(frozen=True)
+class UnitStatus:
+    """A planned unit compared with a run.
+
+    Attributes:
+        planned: the unit with its current recipe, its key and its iteration.
+        state: its state relative to the run.
+        run_id: the run that has a result of the unit; None if it has none.
+        reasons: causes of the state; differences of the recipe if it is stale.
+    """
+
+    planned: PlannedUnit
+    state: UnitState
+    run_id: str | None
+    reasons: tuple[Reason, ...]
+
+    @property
+    def unit(self) -> str:
+        """Name as `stage/unit`."""
+        return self.planned.name
+
+    @property
+    def iteration(self) -> int:
+        """The iteration that it belongs to, from 1."""
+        return self.planned.iteration
+
+    @property
+    def own_reasons(self) -> tuple[Reason, ...]:
+        """Causes in this unit itself; empty if only its inputs changed."""
+        return tuple(each for each in self.reasons if not _is_input(each))
+
+    @property
+    def changed_inputs(self) -> tuple[str, ...]:
+        """Changed inputs, as `stage/unit`."""
+        return tuple(
+            each.name
+            for each in self.reasons
+            if isinstance(each, RecipeDifference) and each.kind == "input"
+        )
+
+    def describe(self) -> tuple[str, ...]:
+        """Return the reasons as lines for people."""
+        lines = tuple(str(each) for each in self.reasons)
+        if self.run_id is None:
+            return lines
+        is_recorded = self.state == UnitState.CURRENT or Cause.WITHDRAWN in self.reasons
+        header = f"run {self.run_id} has it" if is_recorded else f"since run {self.run_id}:"
+        return (header, *lines)
+
+
+def _is_input(reason: Reason) -> bool:
+    return isinstance(reason, RecipeDifference) and reason.kind == "input"
+
+
+def unit_status(store: Store, unit: PlannedUnit, record: RunRecord | None) -> UnitStatus:
+    """Compare a planned unit with a run; None is a match without a run."""
+    state = unit_state(unit, record)
+    if record is None or unit.name not in record.results:
+        return UnitStatus(unit, state, None, (Cause.NOT_COMPUTED,))
+    reasons: tuple[Reason, ...]
+    if record.results[unit.name] == unit.key:
+        reasons = () if unit.published else (Cause.WITHDRAWN,)
+    else:
+        reasons = recorded_differences(store, record, unit.name, unit.recipe)
+    return UnitStatus(unit, state, record.run_id, reasons)
+
+
+def unit_state(unit: PlannedUnit, record: RunRecord | None) -> UnitState:
+    """Return the state of a planned unit relative to a run."""
+    recorded = None if record is None else record.results.get(unit.name)
+    if unit.published:
+        return UnitState.CURRENT if recorded == unit.key else UnitState.READY
+    return UnitState.MISSING if recorded in (None, unit.key) else UnitState.STALE
+
+
+def recorded_differences(
+    store: Store, record: RunRecord, unit: str, recipe: Recipe | None
+) -> tuple[Reason, ...]:
+    """Return the differences of a recipe from that of a run's result."""
+    before = recorded_recipe(store, record, unit)
+    if before is None or recipe is None:
+        return (Cause.WITHDRAWN_WITH_RECIPE,)
+    return tuple(recipe_differences(before, recipe))
+
+
+def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None:
+    """Return the recipe of a run's result; None if the result was withdrawn or removed."""
+    stage, _, name = unit.partition("/")
+    key = record.results[unit]
+    if not store.has(record.match_id, stage, name, key):
+        return None
+    return store.manifest(record.match_id, stage, name, key).recipe
+
+
+@dataclass(frozen=True)
+class RunStatus:
+    """What a match's latest run would recompute.
+
+    Attributes:
+        match: with all current corrections and verdicts.
+        latest: the current run.
+        settings: settings of that run, and further requested ones.
+        until_stage: last stage of that run; None = the method's last.
+        units: units that differ from the run, in order.
+        is_stale: whether there is anything to do, even only to apply a verdict.
+    """
+
+    match: Match
+    latest: RunRecord
+    settings: Overrides
+    until_stage: str | None
+    units: tuple[UnitStatus, ...]
+    is_stale: bool
+
+    @property
+    def to_compute(self) -> tuple[PlannedUnit, ...]:
+        """Units to compute, each key once."""
+        missing = [unit.planned for unit in self.units if unit.state != UnitState.READY]
+        return tuple({unit.key: unit for unit in missing}.values())
+
+
+def run_status(
+    store: Store, match_id: str, settings: Overrides | None = None, *, retry: bool = False
+) -> RunStatus | None:
+    """Return what a match's latest run would recompute; None if the match never had a run.
+
+    A failed unit with an unchanged recipe is skipped, and so are the units that depend on it,
+    unless a disk or a network failed.
+
+    Args:
+        store: the project.
+        match_id: a registered match.
+        settings: requested settings beyond those of the latest run.
+        retry: retry all failed units.
+
+    Raises:
+        InputError: the match folder is invalid.
+    """
+    latest = latest_run(store, match_id)
+    if latest is None:
+        return None
+    match = open_match(store, match_id)
+    requested = merge_settings(latest.overrides, settings or {})
+    until = _last_stage(match, latest)
+    stages = selected_stages(None, until)
+    gatekeeper = Gatekeeper(store, match, latest.gates)
+    units: list[UnitStatus] = []
+    hopeless = {} if retry else {f.unit: f.key for f in latest.failed if not _is_temporary(f)}
+    for number in range(1, latest.iteration + 1):
+        plan = plan_ahead(gatekeeper, stages, requested, latest, number)
+        is_last = number == latest.iteration
+        record = latest if is_last else _run_of_iteration(store, latest, number)
+        found = _stale_units(store, plan, record, hopeless)
+        # Only the results of earlier iterations count: their records can have other settings.
+        units += [unit for unit in found if is_last or unit.state != UnitState.READY]
+    is_settled = latest.state in ("complete", "waiting")
+    return RunStatus(
+        match=match,
+        latest=latest,
+        settings=requested,
+        until_stage=until,
+        units=tuple(units),
+        is_stale=bool(units) or (is_settled and not plan.is_recorded_by(latest)),
+    )
+
+
+def merge_settings(before: Overrides, further: Overrides) -> dict[str, dict[str, JsonValue]]:
+    """Return settings overridden by further ones."""
+    names = before.keys() | further.keys()
+    return {name: {**before.get(name, {}), **further.get(name, {})} for name in sorted(names)}
+
+
+def _stale_units(
+    store: Store,
+    plan: RunPlan,
+    record: RunRecord | None,
+    hopeless: Mapping[str, str | None],
+) -> Iterator[UnitStatus]:
+    """Yield the units that differ from a run, except those that would fail again."""
+    failing: set[str] = set()
+    for unit in plan.units:
+        if (unit.name, unit.key) in hopeless.items() or failing & unit.recipe.inputs.keys():
+            failing.add(unit.name)
+        elif unit_state(unit, record) != UnitState.CURRENT:
+            yield unit_status(store, unit, record)
+
+
+def _last_stage(match: Match, latest: RunRecord) -> str | None:
+    """Return the last stage of the run; None = the method's last."""
+    planned = {*latest.results, *latest.blocked, *(failure.unit for failure in latest.failed)}
+    planned_stages = {name.partition("/")[0] for name in planned}
+    known = [stage for stage in METHOD if stage.name in latest.settings and stage.units(match)]
+    reached = [stage for stage in known if stage.name in planned_stages]
+    if not reached:
+        raise InputError(
+            f"run {latest.run_id} of {match.match_id}",
+            expected="results of a stage that this version knows",
+            found=", ".join(sorted(planned)) or "none",
+            todo=f"Run the match again: worldpose run {match.match_id}.",
+        )
+    return None if reached[-1] is known[-1] else reached[-1].name
+
+
+def _run_of_iteration(store: Store, latest: RunRecord, number: int) -> RunRecord | None:
+    """Return the newest run of an earlier iteration, preferably with the latest run's settings."""
+    records = [store.run(latest.match_id, run_id) for run_id in store.runs(latest.match_id)]
+    passes = [record for record in reversed(records) if record.iteration == number]
+    same = (record for record in passes if rename_settings(record.overrides) == latest.overrides)
+    return next(same, passes[0] if passes else None)
+
+
+def _is_temporary(failure: UnitFailure) -> bool:
+    """Return whether a recorded failure was a disk's or a network's."""
+    return failure.error in TEMPORARY_ERRORS
