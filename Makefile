@@ -1,10 +1,10 @@
-# Verbs: install, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, schemas, pages, clean. All work from a
+# Verbs: install, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, docs, schemas, pages, clean. All work from a
 # fresh clone; real-demo and pages need npm.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: install demo demo-quick demo-match real-demo check format test test-all schemas pages clean
+.PHONY: install demo demo-quick demo-match real-demo check format test test-all docs schemas pages clean
 
 install: $(INSTALLED)
 
@@ -68,6 +68,10 @@ test: install check
 
 test-all: install check
 	$(PYTEST)
+
+# The site of the documentation, at build/docs/index.html; a warning is an error.
+docs: install
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
 schemas: install
 	$(BIN)/python -m data_contracts.schemas docs/schemas

@@ -53,7 +53,7 @@ class Store:
 
     @property
     def url(self) -> str:
-        """The project's folder or `s3://bucket/prefix`."""
+        """The project's folder, or the address of its bucket and prefix."""
         return self.blobs.url
 
     @classmethod

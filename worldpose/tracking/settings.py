@@ -103,6 +103,6 @@ class TrackingSettings(Record):
     visitor_odds: float = Field(default=0.1, ge=1e-6, le=1)
     """The same without a pitch, where people come and go [1]. At 0.01, a track that fits badly is
     joined where no other fits: in 26 subsets of Shelf's cameras 6 tracks show two people, 4 at
-        0.1."""
+    0.1."""
     join_odds: float = Field(default=10.0, ge=1, le=1000)
     """Odds against every alternative that decide a join [1]; other joins go to review."""
