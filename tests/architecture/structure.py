@@ -27,6 +27,9 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("data_contracts", "worldpose", "tasks", "flows")
 MAX_PARAMETERS = 8
 MAX_LINES = 600
+MAX_ENGINE_FILES = 20
+ANY_NUMBER = {"block_diag", "zip", "reshape", "Sequential"}
+"""Functions that take any number of like arguments."""
 
 
 class Structure:
@@ -146,12 +149,16 @@ class Structure:
         return found
 
     def starred_calls(self) -> list[str]:
-        """Return the calls that unpack a variable, so that names of arguments are hidden."""
+        """Return the calls that unpack a variable, so that names of arguments are hidden.
+
+        A call that takes any number of like things, such as `zip`, hides no name.
+        """
         return [
             f"{name}:{node.lineno}: {ast.unparse(node)[:80]}"
             for name, tree in self.trees.items()
             for node in ast.walk(tree)
             if isinstance(node, ast.Call)
+            and ast.unparse(node.func).rpartition(".")[2] not in ANY_NUMBER
             and any(
                 isinstance(each, ast.Starred) and isinstance(each.value, ast.Name)
                 for each in node.args

@@ -3,7 +3,7 @@
 import graphlib
 
 import pytest
-from structure import Structure
+from structure import MAX_ENGINE_FILES, ROOT, Structure
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_circle_is_found_through_three_modules(planted):
 def test_a_module_with_one_importer_long_signatures_and_starred_calls_are_found(planted):
     structure = planted(
         {
-            "one/a.py": "import one.b\ngiven = (1, 2)\none.b.many(*given)",
+            "one/a.py": "import one.b\ngiven = (1, 2)\none.b.many(*given)\nzip(*given)",
             "one/b.py": "def many(a, b, c, d, e, f, g, h, i): ...",
         }
     )
@@ -69,3 +69,15 @@ def test_no_modules_import_each_other_in_a_circle():
 
 def test_no_file_has_more_than_600_lines():
     assert Structure().long_files() == []
+
+
+def test_no_function_has_more_than_eight_parameters():
+    assert Structure().parameters() == []
+
+
+def test_no_call_hides_the_names_of_its_arguments():
+    assert Structure().starred_calls() == []
+
+
+def test_the_engine_of_flows_is_visible():
+    assert len(list((ROOT / "flows").glob("*.py"))) <= MAX_ENGINE_FILES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -58,16 +58,30 @@ def _interpolate_plane(
     return x, y, xu, yu, xv, yv
 
 
+class SceneRows(NamedTuple):
+    """What `paint_scene` needs to know of a stadium.
+
+    Attributes:
+        paint: of `paint_rows`.
+        table: (64, 64) random numbers of the grass.
+        scene: length and width of the pitch, its bend, contrast of stripes, paint.
+        half: (2,) half the distances between the boards [m].
+        look: seed of the stadium's look.
+    """
+
+    paint: Floats
+    table: Floats
+    scene: Floats
+    half: Floats
+    look: int
+
+
 @compiled
 def paint_scene(
     grid: Floats,
     o: Floats,
     r: Floats,
-    paint: Floats,
-    table: Floats,
-    scene: Floats,
-    half: Floats,
-    look: int,
+    stadium: SceneRows,
     color: Singles,
     ground: Singles,
     distance: Singles,
@@ -78,15 +92,12 @@ def paint_scene(
         grid: of `plane_grid`.
         o: (3,) the camera's center.
         r: (3, 3) world from camera.
-        paint: of `paint_rows`.
-        table: (64, 64) random numbers of the grass.
-        scene: length and width of the pitch, its bend, contrast of stripes, paint.
-        half: (2,) half the distances between the boards [m].
-        look: seed of the stadium's look.
+        stadium: pitch, boards and look.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
         distance: (height, width) from the camera [m], written; infinite in the sky.
     """
+    paint, table, scene, half, look = stadium
     place = np.empty(8)
     bend = scene[2]
     for v in range(color.shape[0]):
@@ -279,11 +290,15 @@ def paint_venue(
         grid,
         center,
         np.ascontiguousarray(world_from_cam),
-        paint_rows(pitch),
-        venue.table,
-        np.array([pitch.length, pitch.width, venue.bend, settings.stripes, settings.paint]),
-        venue.half,
-        venue.look,
+        SceneRows(
+            paint=paint_rows(pitch),
+            table=venue.table,
+            scene=np.array(
+                [pitch.length, pitch.width, venue.bend, settings.stripes, settings.paint]
+            ),
+            half=venue.half,
+            look=venue.look,
+        ),
         color,
         ground,
         distance,
