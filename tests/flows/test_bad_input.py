@@ -163,7 +163,7 @@ def test_ingesting_twice_says_so_and_changes_nothing(tiny, project_copy):
         (["--set", "triangulation.min_views=many"], "integer"),
         (["--set", "triangulation.min_views=" + "[" * 3000], "integer"),
         (["--set", "min_views"], "stage.name=value"),
-        (["--from", "triangulation", "--until", "tracking"], "Swap them"),
+        (["--from", "triangulation", "--until", "tracking"], "Swap the two stages"),
         (["--until", "body"], "one of ingest, static_calibration, detection, redetection"),
     ],
 )

@@ -85,7 +85,7 @@ def test_without_a_place_to_keep_it_every_server_makes_its_own(tmp_path, kept):
 def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
     (tmp_path / "prefect").touch()  # a file where the folder should be
     with (
-        pytest.raises(StoreError, match=r"prefect: File exists.*run again.*results are untouched"),
+        pytest.raises(StoreError, match=r"File exists.*run again.*results are unchanged"),
         prefect_server(str(tmp_path), is_local=True),
     ):
         pass

@@ -10,7 +10,7 @@ import pytest
 from command_line import TINY
 from page_client import HERE, MATCH, TOKEN, a_click, moved
 
-from flows.review import corrections
+from flows.web import app
 from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
 from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
@@ -245,7 +245,7 @@ def test_every_answer_forbids_what_pages_do_not_need(ada, stranger):
 
 
 def test_no_page_asks_anything_of_another_server():
-    files = list(Path(corrections.__file__).parent.glob("web/*/**/*.*"))
+    files = list(Path(app.__file__).parent.glob("*/**/*.*"))
     shown = [file for file in files if file.suffix in (".html", ".css")]
     assert {file.parent.name for file in shown} >= {"login", "static"}
     for file in shown:

@@ -73,7 +73,7 @@ def test_the_run_of_a_release_is_never_collected(released, tiny_run):
     assert [(pin.name, pin.run_id) for pin in list_pins(store.blobs, match)] == [
         ("release-first", run)
     ]
-    with pytest.raises(InputError, match=r"the name release-first\. .*worldpose unpin"):
+    with pytest.raises(InputError, match=r"pinned as release-first\. .*worldpose unpin"):
         plan_gc(store, forget=[f"{match}/{run}"])
 
 
@@ -84,7 +84,7 @@ def test_a_release_is_frozen(released, exporting):
     renamed = [("second" if word == "first" else word) for word in exporting]
     answer = worldpose(*renamed, "--out", released)
     assert answer.code == 2
-    assert "A release is never overwritten" in answer.err
+    assert "a release is never overwritten" in answer.err
     assert {path: path.read_bytes() for path in released.rglob("*.*")} == before
 
 

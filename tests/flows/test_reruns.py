@@ -100,7 +100,7 @@ def test_an_edited_detection_file_is_another_match(tiny, project_copy, tmp_path)
     answer = worldpose("run", edited, "--project", project_copy)
     assert answer.code == 1
     assert f"detections/{path.name}" in answer.err
-    assert "id of its own" in answer.err
+    assert "give the changed match a new id" in answer.err
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_from_after_a_run_that_stopped_earlier_is_refused(tiny, ingested):
 def test_from_needs_a_run_to_start_from(tiny, tmp_path):
     answer = worldpose("run", tiny, "--project", tmp_path / "new", "--from", "triangulation")
     assert answer.code == 2
-    assert "Run without --from first" in answer.err
+    assert "without --from first" in answer.err
 
 
 def test_two_runs_of_one_match_at_once_end_with_one_result(tiny, tmp_path):

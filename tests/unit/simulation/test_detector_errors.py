@@ -423,7 +423,7 @@ def test_dropped_frames_have_no_detections():
     keypoints, confidence = np.ones((3, 2, 17, 2)), np.ones((3, 2, 17))
     dropped = np.array([False, True, False])
     observations, identity = reporting(keypoints, confidence, np.ones((3, 2)), dropped=dropped)
-    assert observations.frame.tolist() == [40, 41, 42]
+    assert observations.frame.tolist() == [0, 1, 2]
     for array in observations.arrays().values():
         assert np.isnan(array[1]).all()
         assert np.isfinite(array[[0, 2]]).all()
