@@ -43,7 +43,7 @@ def adjustment_tables(run: Run) -> list[Table]:
             )
         )
     cameras = Table(
-        "Clicked markings and left-out people, before and after the adjustment",
+        "Clicked markings and held-out people, before and after the adjustment",
         (
             "camera",
             ">markings before px",

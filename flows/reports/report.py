@@ -109,10 +109,9 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
     cameras = static_cameras(run, match.folder.spec)
     return [
         Section(
-            "In space",
+            "3D view",
             tuple(clip_scene(run, match, clip) for clip in clips),
-            "Drag to turn, Shift and drag to move, click and use the wheel to come closer; Space "
-            "plays.",
+            "Drag to rotate, Shift and drag to pan, click and use the wheel to zoom; Space plays.",
         ),
         Section(
             "Sample images",
@@ -122,7 +121,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Detections",
             tuple(p for clip in clips for p in detection_pictures(store, run, match, clip)),
-            "What one camera's detector said, and what all cameras together make of it.",
+            "Detections of one camera, and the people that all cameras together find.",
         ),
         Section(
             "Static cameras",

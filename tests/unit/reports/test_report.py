@@ -133,7 +133,7 @@ def test_nothing_is_asked_from_outside():
 def test_a_scene_brings_the_one_script_that_the_page_may_run():
     joints = np.full((2, 1, 17, 3), np.nan)
     scene = Scene("</script>", JointTracks(np.arange(2), np.arange(1), joints), 50.0, {})
-    text = report_page("A run", run(), seconds={}, sections=[Section("In space", (scene,))])
+    text = report_page("A run", run(), seconds={}, sections=[Section("3D view", (scene,))])
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{allowed}'" in text
