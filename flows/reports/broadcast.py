@@ -120,8 +120,8 @@ def _before_and_after(
     return [
         CaptionedImage(
             f"{clip_title(clip)}, frame {number}: before and after players and all frames "
-            "together. Crosses: keypoints that were seen. In the median, markings are "
-            f"{markings} px off, people {players} px.",
+            "together. Crosses: detected keypoints. Median errors: markings "
+            f"{markings} px, people {players} px.",
             plot_before_after(
                 before[place],
                 after[place],
@@ -283,8 +283,8 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
         CaptionedImage(
             f"{clip_title(clip)}, frame {number}, where the camera turns most from one frame to "
             "the next: points of the background where the next frame has them (arrows), those "
-            "that do not move with the others (orange), and where the found camera puts them "
-            "(yellow).",
+            "that do not move with the others (orange), and where the estimated camera projects "
+            "them (yellow).",
             png,
         )
     ]

@@ -77,7 +77,7 @@ def camera_pictures(
     return [
         CaptionedImage(
             f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
-            "as circles, clicks that it does not rest on as crosses; below, its expected "
+            "as circles, clicks that it does not use as crosses; below, its expected "
             f"error on the ground, median {errors[name]:.2g} m.",
             camera_evidence(store, run, match, name, cameras[name]),
         )
@@ -102,10 +102,10 @@ def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> lis
     png, share = plot_paint(cameras[name], still, match.folder.pitch)
     return [
         CaptionedImage(
-            f"Camera {name}: paint in its picture, and how far every pixel is from it, with the "
-            "markings as the found camera projects them. Where any paint is within "
-            f"{NEAR:.0f} px, {share:.0%} of them lie on it. A check from outside: cameras are not "
-            "found this way.",
+            f"Camera {name}: paint in its image, and the distance of every pixel from it, with the "
+            "markings as the estimated camera projects them. Where any paint is within "
+            f"{NEAR:.0f} px, {share:.0%} of them lie on it. This is a separate check: cameras "
+            "are not estimated in this way.",
             png,
         )
     ]

@@ -48,8 +48,8 @@ def clip_pictures(
         beneath = "" if still is None else ", over its still"
         pictures = [
             CaptionedImage(
-                f"{here}, from camera {widest}: markings and people as the found cameras and "
-                f"joints put them{beneath}.",
+                f"{here}, from camera {widest}: markings and reconstructed people, "
+                f"projected by the estimated camera{beneath}.",
                 plot_camera_view(
                     cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
                 ),
@@ -63,7 +63,7 @@ def clip_pictures(
         if bodies is not None:
             pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
     above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
-    pictures.append(CaptionedImage(f"{clip_title(clip)}: everybody's way.", above))
+    pictures.append(CaptionedImage(f"{clip_title(clip)}: the paths of all people.", above))
     return pictures
 
 
