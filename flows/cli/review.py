@@ -10,7 +10,7 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 
 from data_contracts.review import Edit
-from flows.cli import review_exchange, review_text
+from flows.cli import review_exchange
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -18,6 +18,7 @@ from flows.cli.console import (
     errors,
     line,
     print_json,
+    print_table,
 )
 from flows.cli.page_server import (
     PAGES_PORT,
@@ -29,10 +30,10 @@ from flows.cli.page_server import (
     TokenOption,
     certificate_and_key,
 )
-from flows.cli.review_text import correction_json, in_words, print_review, review_json, when
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
+from flows.review.descriptions import correction_json, in_words, review_json, when
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -94,7 +95,7 @@ def list_reviews(
     if as_json:
         print_json({"reviews": [review_json(each) for each in shown], "problems": problems})
     else:
-        review_text.print_list(shown)
+        _print_list(shown)
     if match and problems:
         raise typer.Exit(1)
 
@@ -123,7 +124,7 @@ def show(
                 found="no such review",
                 todo=f"List them: worldpose review list {match} --all.",
             )
-        print_review(known[request], as_json)
+        _print_review(known[request], as_json)
         return
     origins = verdicts.origins_of(store, opened, latest) if latest else {}
     marked = {name: origin for name, origin in origins.items() if origin != "automatic"}
@@ -331,3 +332,36 @@ def _tell_damage(match: Match) -> None:
 
 
 review_exchange.add_to(commands)
+
+
+def _print_list(shown: list[Review]) -> None:
+    """Print review requests, each with its state and reasons."""
+    if not shown:
+        line("nothing waits for review")
+    for each in shown:
+        request = each.request
+        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
+        for reason in request.reasons:
+            line(f"  {reason}")
+
+
+def _print_review(shown: Review, as_json: bool) -> None:
+    """Print one review request, its verdict, and all metrics."""
+    if as_json:
+        print_json(review_json(shown))
+        return
+    request, decision = shown.request, shown.decision
+    line(f"{request.id}: {shown.state}")
+    line(f"  {shown.question}")
+    for reason in request.reasons:
+        line(f"  because {reason}")
+    if decision is not None:
+        line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
+        line(f"  {decision.why or '(no reason given)'}")
+    for unit, key in request.keys.items():
+        line(f"  {unit} {key}, run {request.run_id}")
+    print_table("metrics", ("metric", ">value"), _metric_rows(shown))
+
+
+def _metric_rows(shown: Review) -> list[tuple[str, str]]:
+    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]

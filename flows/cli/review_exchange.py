@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, line, print_json
-from flows.cli.review_text import correction_json, in_words
 from flows.registering import open_match
+from flows.review.descriptions import correction_json, in_words
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, Format

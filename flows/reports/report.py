@@ -10,7 +10,6 @@ from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
 from data_contracts.review import Correction, ReviewDecision, ReviewRequest, Withdrawal
 from data_contracts.run import RunRecord
-from flows.cli.review_text import in_words, when
 from flows.reports.broadcast import (
     broadcast_pictures,
     broadcast_tables,
@@ -23,6 +22,7 @@ from flows.reports.disagreements import disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables
 from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
 from flows.results.evaluation import load_reference, score
+from flows.review.descriptions import in_words, when
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError

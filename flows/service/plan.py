@@ -37,7 +37,7 @@ class ServePlan(Record):
     dask: str | None = None
     """Address of a running Dask scheduler; None: workers on this machine for each run."""
     workers: int | None = Field(default=None, ge=1)
-    """Worker processes of a run on this machine; None: the cores, divided by `at_once`."""
+    """Worker processes of a run on this machine; None: the cores, divided by `max_concurrent`."""
     time_limits: dict[str, float] = Field(default_factory=dict)
     """Stage to the time limit of a unit [min], if not the default."""
     host: str = "127.0.0.1"

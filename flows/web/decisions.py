@@ -10,8 +10,8 @@ from pydantic import Field
 from data_contracts.records import Name, Record
 from data_contracts.review import Edit
 from data_contracts.run import GatePolicy
-from flows.cli.review_text import correction_json
 from flows.review.corrections import keep_edits
+from flows.review.descriptions import correction_json
 from flows.review.verdicts import decide, still_waiting, withdraw
 from flows.run_record import latest_run
 from flows.web.app_context import PageContext, Person

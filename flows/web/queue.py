@@ -7,8 +7,8 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query
 
 from data_contracts.review import Correction, ReviewRequest
-from flows.cli.review_text import correction_json, in_words, review_json
 from flows.gates import GATES
+from flows.review.descriptions import correction_json, in_words, review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
 from flows.stage import Match

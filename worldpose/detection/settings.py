@@ -68,7 +68,7 @@ class DetectionSettings(Record):
     find_occluded: bool = False
     """The embedded pose net also searches boxes shifted to the side of every detected person, where
     a detector sees the person in front alone. This finds more people, and more false boxes that are
-    half of two people; poses take twice as long. Not with `flip_test`."""
+    half of two people; poses take twice as long. Not with `flip_test` or another pose net."""
     min_keypoint_confidence: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
     oks_nms: float = Field(default=0.85, ge=1e-6, le=1)
@@ -78,10 +78,15 @@ class DetectionSettings(Record):
     """Most people per frame; those with the best scores stay."""
 
     @model_validator(mode="after")
-    def _refuse_occluded_search_in_flip_test(self) -> Self:
+    def _refuse_occluded_search_without_bundled_net(self) -> Self:
         if self.find_occluded and self.flip_test:
             raise ValueError(
                 "detection.find_occluded and detection.flip_test exclude each other, because the "
                 "flip test does not search for occluded people. Set one of them to false."
+            )
+        if self.find_occluded and self.pose.partition(":")[0] != "embedded":
+            raise ValueError(
+                "detection.find_occluded needs the bundled pose net (detection.pose=embedded), "
+                f"but detection.pose is {self.pose!r}. Set detection.find_occluded to false."
             )
         return self

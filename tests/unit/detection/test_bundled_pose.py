@@ -131,6 +131,13 @@ def test_settings_refuse_the_search_for_occluded_people_in_a_flip_test():
         DetectionSettings(find_occluded=True, flip_test=True)
 
 
+@pytest.mark.parametrize("pose", ["onnx:net.onnx", "transformers:net"])
+def test_another_pose_net_does_not_search_for_occluded_people(pose):
+    with pytest.raises(ValidationError, match="find_occluded needs the bundled pose net"):
+        DetectionSettings(find_occluded=True, pose=pose)
+    assert DetectionSettings(find_occluded=True, pose="embedded:net.safetensors").find_occluded
+
+
 def test_the_embedded_net_looks_beside_and_means_of_two_looks_do_not():
     pose = load_bundled_pose()
     assert isinstance(pose, FindsOccludedPeople)

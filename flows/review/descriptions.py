@@ -1,4 +1,4 @@
-"""Output of reviews and corrections, as text and JSON."""
+"""Reviews and corrections described in text and as JSON."""
 
 from __future__ import annotations
 
@@ -14,41 +14,7 @@ from data_contracts.review import (
     MovedPoint,
     RedrawnMarking,
 )
-from flows.cli.console import line, print_json, print_table
 from flows.review.verdicts import Review
-
-
-def print_list(shown: list[Review]) -> None:
-    """Print review requests, each with its state and reasons."""
-    if not shown:
-        line("nothing waits for review")
-    for each in shown:
-        request = each.request
-        line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
-        for reason in request.reasons:
-            line(f"  {reason}")
-
-
-def print_review(shown: Review, as_json: bool) -> None:
-    """Print one review request, its verdict, and all metrics."""
-    if as_json:
-        print_json(review_json(shown))
-        return
-    request, decision = shown.request, shown.decision
-    line(f"{request.id}: {shown.state}")
-    line(f"  {shown.question}")
-    for reason in request.reasons:
-        line(f"  because {reason}")
-    if decision is not None:
-        line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
-        line(f"  {decision.why or '(no reason given)'}")
-    for unit, key in request.keys.items():
-        line(f"  {unit} {key}, run {request.run_id}")
-    print_table("figures", ("figure", ">value"), _figures(shown))
-
-
-def _figures(shown: Review) -> list[tuple[str, str]]:
-    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]
 
 
 def review_json(shown: Review) -> dict[str, Any]:
