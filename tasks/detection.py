@@ -45,6 +45,7 @@ def detection(work: Work) -> str:
         found = _open_uncorrected(store, work) if edits else None
         found = found or _detect_people(store, work, spool)
         result.figures |= found.figures
+        result.warnings += [f"{work.recipe.name}: {each}." for each in found.warnings]
         detections = found.detections
         if edits:
             replay = replay_detections(detections, edits)
@@ -70,11 +71,13 @@ class _Found:
         detections: detected people.
         unreadable: [first, last] of each interval of frames without an image.
         figures: metrics.
+        warnings: sentences without the unit and the full stop.
     """
 
     detections: KeypointDetections
     unreadable: list[list[int]]
     figures: dict[str, float]
+    warnings: tuple[str, ...]
 
 
 def _open_uncorrected(store: Store, work: Work) -> _Found | None:
@@ -84,7 +87,7 @@ def _open_uncorrected(store: Store, work: Work) -> _Found | None:
         return None
     stored, manifest = published
     detections = KeypointDetections.from_arrays(stored)
-    return _Found(detections, stored.attrs["unreadable"], dict(manifest.figures))
+    return _Found(detections, stored.attrs["unreadable"], dict(manifest.figures), ())
 
 
 def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
@@ -118,6 +121,7 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
             "bridged_share": report.bridged / max(1, report.detections),
             "flicker_share": report.flickers / max(1, report.detections),
         },
+        (reason,) if (reason := report.why_no_person()) else (),
     )
 
 

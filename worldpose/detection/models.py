@@ -63,10 +63,11 @@ def _detector(name: str, settings: DetectionSettings) -> Detector:
     if kind == "embedded":
         return load_bundled_detector(path, settings.device, settings.half)
     assert path is not None  # as parted
-    if kind == "onnx":
-        from worldpose.detection.onnx_nets import load_onnx_detector
+    if kind.startswith("onnx"):
+        from worldpose.detection.onnx_detectors import load_onnx_detector
 
-        return load_onnx_detector(path, settings.device)
+        form = kind.partition("-")[2] or None
+        return load_onnx_detector(path, settings.device, form, settings.person_classes)
     from worldpose.detection.transformers_nets import load_transformers_detector
 
     return load_transformers_detector(path, settings.device, settings.half)
@@ -130,7 +131,7 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
     for name in names:
         kind, path = _split_name(name)
         found[name] = None if path is None else digest_of_weights(path)
-        for library in LIBRARIES[kind]:
+        for library in LIBRARIES[kind.partition("-")[0]]:
             try:
                 found[library] = version(library)
             except PackageNotFoundError:
@@ -158,10 +159,12 @@ def digest_of_weights(path: Path) -> str:
 def _split_name(name: str) -> tuple[str, Path | None]:
     """Return the kind of a model and the path of its weights; None for those that ship."""
     kind, colon, path = name.partition(":")
-    if kind not in LIBRARIES or (colon and not path) or (kind != "embedded" and not path):
+    library, dash, _form = kind.partition("-")
+    unknown = library not in LIBRARIES or (dash and library != "onnx")
+    if unknown or (colon and not path) or (kind != "embedded" and not path):
         raise InputError(
             f"detection: {name!r}",
-            expected="embedded, embedded:FILE, transformers:FOLDER or onnx:FILE",
+            expected="embedded, embedded:FILE, transformers:FOLDER, onnx:FILE or onnx-FORM:FILE",
             found=repr(name),
             todo="Correct detection.detector or detection.pose.",
         )

@@ -1,8 +1,11 @@
-"""Nets in ONNX files, run by onnxruntime on one thread: equal images give equal bytes."""
+"""Nets in ONNX files, run by onnxruntime on one thread: equal images give equal bytes.
+
+Pose estimators are decoded here, detectors in `onnx_detectors`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -13,8 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.interfaces import MIN_SCORE, Detector, People, PoseEstimator
-from worldpose.detection.suppression import suppress
+from worldpose.detection.interfaces import PoseEstimator
 from worldpose.errors import InputError
 
 _DTYPES = {
@@ -23,26 +25,15 @@ _DTYPES = {
     "tensor(float16)": np.dtype(np.float16),
     "tensor(float)": np.dtype(np.float32),
 }
-PERSON: Final = 0
-"""Class of people in nets trained on COCO."""
-VIEW_SIZE: Final = (640, 640)
-"""Input size for a net that takes any size [px]."""
-DOUBLES: Final = 0.7
-"""Boxes of a raw grid with a larger intersection over union are of one person [1]."""
-MULTIPOSE: Final = 56
-"""Numbers per person of MoveNet MultiPose: 17 y, x and scores, then the box and its score."""
-_FORMS: Final = (
-    "(batch, 4 + classes, anchors), (batch, anchors, 5 + classes), (batch, boxes, 6) or "
-    "(batch, people, 56)"
-)
+SIZE_INPUTS: Final = ("orig_target_sizes", "target_sizes")
+"""Names of a second input for the width and height of the image [px]."""
 CROP_SIZE: Final = (192, 256)
 """Input size for a net that takes any size [px]."""
 PADDING: Final = 1.25
 """Size of crops over that of boxes, as in the training of these nets [1]."""
-MEAN: Final = np.array([123.675, 116.28, 103.53], dtype=np.float32)
-SPREAD: Final = np.array([58.395, 57.12, 57.375], dtype=np.float32)
+IMAGENET_MEAN: Final = np.array([123.675, 116.28, 103.53], dtype=np.float32)
+IMAGENET_STD: Final = np.array([58.395, 57.12, 57.375], dtype=np.float32)
 """Mean and standard deviation of ImageNet, for RTMPose and ViTPose [grey level]."""
-Reader = Callable[[NDArray[Any]], People]
 
 
 class OnnxNet:
@@ -54,6 +45,7 @@ class OnnxNet:
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
         dtype: of its input.
         batch: images per call; None for any number.
+        metadata: what the exporter wrote into the file.
         outputs: shape of each output, with None for dynamic sizes.
     """
 
@@ -95,19 +87,21 @@ class OnnxNet:
             ) from error
         inputs = self._session.get_inputs()
         shape = [side if isinstance(side, int) else None for side in inputs[0].shape]
-        if len(inputs) != 1 or len(shape) != 4 or 3 not in (shape[1], shape[3]):
+        sizes = inputs[1:] and inputs[1].name in SIZE_INPUTS
+        if len(inputs) > 1 + bool(sizes) or len(shape) != 4 or 3 not in (shape[1], shape[3]):
             raise InputError(
                 self.where,
                 expected="one input, a batch of images with 3 channels",
                 found=f"{len(inputs)} inputs, the first of shape {inputs[0].shape}",
                 todo="Export the net without further inputs.",
             )
-        self._name = inputs[0].name
+        self._names = [each.name for each in inputs]
         self.channels_last = shape[3] == 3
         self.batch = shape[0]
         height, width = shape[1:3] if self.channels_last else shape[2:4]
         self.size = (width or default_size[0], height or default_size[1])
         self.dtype = _DTYPES.get(inputs[0].type, np.dtype(np.float32))
+        self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
         self.outputs = [
             tuple(side if isinstance(side, int) else None for side in output.shape)
             for output in self._session.get_outputs()
@@ -122,7 +116,8 @@ class OnnxNet:
         for image in images:
             given = image if self.channels_last else np.moveaxis(image, -1, 0)
             batch = np.ascontiguousarray(given[None].astype(self.dtype))
-            each.append(self._session.run(None, {self._name: batch}))
+            inputs = dict(zip(self._names, (batch, np.array([self.size])), strict=False))
+            each.append(self._session.run(None, inputs))
         return [np.concatenate(parts) for parts in zip(*each, strict=True)]
 
 
@@ -228,86 +223,6 @@ def points_in_frame(points: Floats, frames: Floats) -> Floats:
     return np.asarray(points * frames[:, None, 2:] + frames[:, None, :2])
 
 
-def load_onnx_detector(file: Path, device: str = "cpu") -> Detector:
-    """Return a detector of people from an ONNX file.
-
-    The shape of the output decides how it is read: (batch, 4 + classes, anchors) of YOLOv8 and
-    later with centre, size and class scores; (batch, anchors, 5 + classes) of YOLOv5 with an
-    objectness score before the class scores; (batch, boxes, 6) of exports with built-in
-    suppression: corners, score and class; (batch, people, 56) of MoveNet MultiPose. Inputs are
-    RGB, as 0..1 for all but MoveNet, which takes 0..255.
-
-    Args:
-        file: the net.
-        device: `cpu` or `cuda`.
-
-    Raises:
-        InputError: onnxruntime is not installed, or the file is no such net.
-    """
-    net = OnnxNet(file, device, VIEW_SIZE)
-    shape = net.outputs[0] if net.outputs else ()
-    if len(shape) != 3:
-        raise unknown_outputs(net, _FORMS)
-    _, rows, columns = shape
-    if columns == MULTIPOSE:
-        return _OnnxDetector(net, 1.0, lambda found: _read_multipose(found, net.size))
-    if columns == 6:
-        return _OnnxDetector(net, 1.0 / 255.0, _read_corners)
-    if rows is not None and (columns is None or rows < columns) and rows > 4:
-        return _OnnxDetector(net, 1.0 / 255.0, lambda found: _read_grid(found.T, with_object=False))
-    if columns is not None and columns > 5:
-        return _OnnxDetector(net, 1.0 / 255.0, lambda found: _read_grid(found, with_object=True))
-    raise unknown_outputs(net, _FORMS)
-
-
-class _OnnxDetector:
-    """A detector of people in views of the net's size."""
-
-    def __init__(self, net: OnnxNet, scale: float, read: Reader) -> None:
-        self._net, self._scale, self._read_keypoints = net, scale, read
-
-    @property
-    def view_size(self) -> tuple[int, int]:
-        """Input size of the net."""
-        return self._net.size
-
-    def detect(self, images: Sequence[Image]) -> list[People]:
-        """Return the people in each view."""
-        if not images:
-            return []
-        given: NDArray[Any] = np.stack(images)
-        if self._scale != 1.0:
-            given = given.astype(np.float32) * np.float32(self._scale)
-        return [self._read_keypoints(found.astype(np.float64)) for found in self._net.run(given)[0]]
-
-
-def _read_multipose(found: Floats, size: tuple[int, int]) -> People:
-    """Return people from rows with keypoints first, then boxes y0, x0, y1, x1 in 0..1."""
-    width, height = size
-    corners = found[:, [52, 51, 54, 53]] * [width, height, width, height] - 0.5
-    return _above_min_score(corners, found[:, 55])
-
-
-def _read_corners(found: Floats) -> People:
-    """Return people from rows of corners in pixels, score and class."""
-    people = found[found[:, 5].round() == PERSON]
-    return _above_min_score(people[:, :4] - 0.5, people[:, 4])
-
-
-def _read_grid(found: Floats, *, with_object: bool) -> People:
-    """Return people from rows of centre, size, perhaps objectness, then a score per class."""
-    middle, size = found[:, :2], found[:, 2:4]
-    score = found[:, 5 + PERSON] * found[:, 4] if with_object else found[:, 4 + PERSON]
-    corners = np.hstack([middle - size / 2.0, middle + size / 2.0]) - 0.5
-    return suppress(_above_min_score(corners, score), DOUBLES)
-
-
-def _above_min_score(boxes: Floats, scores: Floats) -> People:
-    """Return those above the least score; callers converted pixel edges to pixel centres."""
-    kept = scores >= MIN_SCORE
-    return People(boxes[kept], np.minimum(scores[kept], 1.0))
-
-
 def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
     """Return a pose estimator from an ONNX file.
 
@@ -347,7 +262,7 @@ class _OnnxPose:
         frames = fit_crops(boxes, self._net.size, PADDING)
         crops: Image | Singles = cut_crops(image, frames, self._net.size)
         if self._normal:
-            crops = (crops.astype(np.float32) - MEAN) / SPREAD
+            crops = (crops.astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         outputs = [output.astype(np.float64) for output in self._net.run(crops)]
         points, confidence = _read_keypoints(outputs, self._net.size)
         found = confidence > 0.0

@@ -22,6 +22,8 @@ from worldpose.pitch import PitchTemplate
 
 CHUNK: Final = 64
 """Frames per chunk."""
+LONG_CLIP: Final = 20
+"""Frames without any person that are suspicious."""
 
 
 @dataclass
@@ -33,7 +35,8 @@ class DetectionReport:
         unreadable: numbers of the frames without an image.
         empty: frames with an image and without people.
         detections: people in all frames.
-        crowd: boxes outside of the pitch.
+        boxes: of the detectors, from `low_score_threshold` on.
+        crowd: those of them that are outside of the pitch.
         bridged: boxes that were filled in.
         flickers: boxes of tracks with too few sightings.
         unsure: people without a single keypoint, or with the pose of a better box.
@@ -44,11 +47,39 @@ class DetectionReport:
     unreadable: list[int] = field(default_factory=list)
     empty: int = 0
     detections: int = 0
+    boxes: int = 0
     crowd: int = 0
     bridged: int = 0
     flickers: int = 0
     unsure: int = 0
     beside: int = 0
+
+    def why_no_person(self) -> str | None:
+        """Return the likely reason why a clip of `LONG_CLIP` frames or more shows no person.
+
+        None: people were found, or the clip is shorter.
+        """
+        frames = self.frames - len(self.unreadable)
+        if self.detections or frames < LONG_CLIP:
+            return None
+        found = f"no person in {frames} frames: "
+        if not self.boxes:
+            return found + (
+                "the detector gave no box from detection.low_score_threshold on. Check that "
+                "detection.detector names a person detector and, for an ONNX file, its form "
+                "(onnx-FORM:FILE), and that people are high enough in the images "
+                "(detection.zooms enlarges them)"
+            )
+        if self.crowd == self.boxes:
+            return found + (
+                f"all {self.boxes} boxes of the detector lie outside of the pitch. Check the "
+                "camera's calibration and its clicks"
+            )
+        return found + (
+            f"of {self.boxes} boxes of the detector {self.crowd} lie outside of the pitch, "
+            f"{self.flickers} are in too few frames (detection.min_hits), and the pose net found "
+            f"no distinct person in {self.unsure}. Check detection.pose and these settings"
+        )
 
 
 @dataclass(frozen=True)
@@ -140,6 +171,7 @@ class PeopleFinder:
                 people = suppress(together, settings.nms_iou)
             kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
             people = People(people.boxes[kept], people.scores[kept])
+            self.report.boxes += len(people.scores)
             if place is not None:
                 inside = self._inside(people, images[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))

@@ -16,6 +16,9 @@ def _one_or_more(value: object) -> object:
 Zoom = Annotated[float, Field(gt=0, le=16)]
 """Factor on the size of an image [1]."""
 
+Class = Annotated[int, Field(ge=0, le=10000)]
+"""Number of a class of a detector."""
+
 
 class DetectionSettings(Record):
     """Settings of `detection` (paper: refinement of 2D detection results; D1-D3)."""
@@ -23,8 +26,13 @@ class DetectionSettings(Record):
     detector: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         default=("embedded",), min_length=1
     )
-    """Detectors of people: `embedded`, `embedded:FILE`, `transformers:FOLDER` or `onnx:FILE`;
+    """Detectors of people: `embedded`, `embedded:FILE`, `transformers:FOLDER`, `onnx:FILE`, or
+    `onnx-FORM:FILE` where the net's outputs do not tell its form, for example `onnx-rtmdet:FILE`;
     several form an ensemble whose boxes are fused."""
+    person_classes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        default=None, min_length=1
+    )
+    """Classes of people in ONNX detectors [1]; None: those whose names say so, or COCO's person."""
     pose: str = "embedded"
     """Estimator of keypoints, named in the same way."""
     flip_test: bool = False

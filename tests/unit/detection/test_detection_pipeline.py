@@ -174,3 +174,27 @@ def test_of_two_boxes_with_one_pose_the_better_stays_and_who_is_close_to_one_com
     alike = object_keypoint_similarity(keypoints[1:3], np.full(2, 2400.0))[0, 1]
     assert 0.3 < alike < 0.85
     np.testing.assert_allclose(kept.score, [0.7 * (1.0 - 0.5 * alike**2), 0.8, 0.5])
+
+
+def test_a_clip_without_people_has_a_true_reason(camera):
+    feet = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, 0.0]])
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+
+    def reason(nets, frames=20, **settings):
+        finder = PeopleFinder([nets], nets, DetectionSettings(**settings))
+        frames = [(number, image) for number in range(frames)]
+        list(finder.find(frames, Place(camera, PITCH)))
+        return finder.report.why_no_person()
+
+    on_pitch = boxes_of(camera, feet)
+    assert reason(Knowing([on_pitch], [np.array([0.9, 0.8])])) is None
+    assert "no person in 20 frames: the detector gave no box" in reason(
+        Knowing([on_pitch], [np.array([0.09, 0.0])])
+    )
+    assert reason(Knowing([on_pitch], [np.array([0.09, 0.0])]), frames=19) is None
+    crowd = boxes_of(camera, feet + [0.0, 60.0, 0.0])
+    assert "all 40 boxes of the detector lie outside of the pitch" in reason(
+        Knowing([crowd], [np.array([0.9, 0.8])])
+    )
+    weak = Knowing([on_pitch], [np.array([0.3, 0.3])])  # below the score that begins a track
+    assert "of 40 boxes of the detector 0 lie outside" in reason(weak)

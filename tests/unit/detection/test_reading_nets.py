@@ -7,10 +7,7 @@ from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, load_detectors, weights_of
 from worldpose.detection.onnx_nets import (
-    _read_corners,
-    _read_grid,
     _read_keypoints,
-    _read_multipose,
     cut_crops,
     fit_crops,
     from_heat_maps,
@@ -18,28 +15,6 @@ from worldpose.detection.onnx_nets import (
 )
 from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
-
-# A box whose outer edges are 10, 20, 30 and 60: pixels 10 to 29 and 20 to 59.
-BOX = [9.5, 19.5, 29.5, 59.5]
-
-
-def test_yolo_boxes_are_people_with_a_good_score():
-    version_8 = np.array([[20, 40, 20, 40, 0.9, 0.1], [80, 40, 20, 40, 0.01, 0.9]], float)
-    found = _read_grid(version_8, with_object=False)
-    np.testing.assert_allclose(found.boxes, [BOX])
-    assert found.scores.tolist() == [0.9]
-    version_5 = np.array([[20, 40, 20, 40, 0.5, 0.9, 0.1]], float)
-    assert _read_grid(version_5, with_object=True).scores.tolist() == [0.45]
-    ended = np.array([[10, 20, 30, 60, 0.8, 0], [50, 20, 70, 60, 0.8, 32]], float)
-    np.testing.assert_allclose(_read_corners(ended).boxes, [BOX])
-
-
-def test_movenet_s_box_stands_behind_its_keypoints():
-    row = np.zeros((1, 56))
-    row[0, 51:] = [20 / 96, 10 / 192, 60 / 96, 30 / 192, 0.7]
-    found = _read_multipose(row, (192, 96))
-    np.testing.assert_allclose(found.boxes, [BOX])
-    assert found.scores.tolist() == [0.7]
 
 
 def test_a_crop_shows_the_box_and_its_points_come_back():

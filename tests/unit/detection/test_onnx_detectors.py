@@ -1,0 +1,183 @@
+"""Forms of ONNX detectors: recognized by outputs of their kind, decoded to hand-made boxes."""
+
+import numpy as np
+import pytest
+
+from worldpose.detection import DetectionSettings, load_detectors
+from worldpose.detection.onnx_detectors import (
+    FORMS,
+    _class_names,
+    _person_classes,
+    recognize_form,
+)
+from worldpose.errors import InputError
+
+SIZE = (96, 64)
+"""Of the view [px]: grids of 12 x 8, 6 x 4 and 3 x 2 cells."""
+CELLS = 12 * 8 + 6 * 4 + 3 * 2
+# A box whose outer edges are 10, 20, 30 and 60: pixels 10 to 29 and 20 to 59.
+BOX = [9.5, 19.5, 29.5, 59.5]
+PERSON = [20.0, 40.0, 20.0, 40.0]
+"""Its centre and size."""
+CAR = [70.0, 30.0, 20.0, 20.0]
+
+
+def grid(rows, objectness, *, classes=80):
+    """Pixels of a decoded grid: empty cells around their own places, a person and a car."""
+    found = np.zeros((rows, 4 + objectness + classes))
+    found[:, :2] = np.random.default_rng(0).uniform([0, 0], SIZE, (rows, 2))
+    found[:, 2:4] = 8.0
+    found[5, :4], found[9, :4] = PERSON, CAR
+    if objectness:
+        found[:, 4] = 0.001
+        found[[5, 9], 4] = 0.9
+    found[5, 4 + objectness], found[9, -1] = 0.8, 0.9
+    return found
+
+
+def raw_yolox():
+    """The same as offsets in cells and logarithms of sizes."""
+    found = np.zeros((CELLS, 85))
+    found[:, 4] = 0.001
+    # Cell (2, 5) of the finest grid, stride 8, begins at 16, 40.
+    found[5 * 12 + 2] = [0.5, 0.0, np.log(20 / 8), np.log(40 / 8), 0.9, 0.8, *[0.0] * 79]
+    # Cell (2, 0) of the coarsest grid, stride 32: a car.
+    found[-4] = [6 / 32, 30 / 32, np.log(20 / 32), np.log(20 / 32), 0.9, *[0.0] * 79, 0.9]
+    return found
+
+
+def logit(share):
+    return np.log(share / (1.0 - share))
+
+
+def detr(classes, person, score):
+    """Queries of a DETR: logits, and boxes in shares of the image."""
+    logits, boxes = np.full((30, classes), -9.0), np.full((30, 4), 0.5)
+    logits[3, person], logits[4, 7] = score, score
+    boxes[3], boxes[4] = np.array(PERSON) / [*SIZE, *SIZE], np.array(CAR) / [*SIZE, *SIZE]
+    return [logits, boxes]
+
+
+def decoded_yolox():
+    found = grid(CELLS, 1)
+    rows, columns = np.mgrid[:8, :12]
+    found[: 12 * 8, :2] = np.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0
+    found[5, :4], found[9, :4] = PERSON, CAR
+    return found
+
+
+def yolov6():
+    found = grid(CELLS, 1)
+    found[:, 4] = 1.0
+    return found
+
+
+def softmax():
+    logits, boxes = detr(92, 1, 4.0)
+    logits[:, -1] = 0.0  # no object
+    return [logits, boxes]
+
+
+MOVENET = np.zeros((6, 56))
+MOVENET[0, 51:] = [20 / 64, 10 / 96, 60 / 64, 30 / 96, 0.7]
+DETS = np.array([[10, 20, 30, 60, 0.7], [60, 20, 80, 40, 0.9]])
+NMS = np.insert(DETS, 5, [0, 2], axis=1)
+LABELS, SCORES = np.array([0, 2]), np.array([0.7, 0.9])
+OUTPUTS = {
+    "yolox": ([raw_yolox()], 0.72),
+    "yolox-decoded": ([decoded_yolox()], 0.72),
+    "yolov5": ([grid(3 * CELLS, 1)], 0.72),
+    "yolov6": ([yolov6()], 0.8),
+    "yolov8": ([grid(CELLS, 0).T], 0.8),
+    "yolo-nms": ([NMS], 0.7),
+    "detr": (softmax(), np.exp(4.0) / (np.exp(4.0) + 1.0 + 90 * np.exp(-9.0))),
+    "rfdetr": (detr(91, 1, logit(0.7)), 0.7),
+    "rtdetr": (detr(80, 0, logit(0.7)), 0.7),
+    "rtdetr-boxes": ([LABELS, DETS[:, :4], SCORES], 0.7),
+    "movenet": ([MOVENET], 0.7),
+}
+
+
+@pytest.mark.parametrize("form", OUTPUTS)
+def test_a_form_is_recognized_and_its_person_decoded(form):
+    outputs, score = OUTPUTS[form]
+    assert recognize_form("net.onnx", outputs, SIZE) == form
+    people = _person_classes("net.onnx", FORMS[form], outputs, {}, None)
+    found = FORMS[form].decode(outputs, SIZE, people)
+    np.testing.assert_allclose(found.boxes, [BOX], atol=1e-9)
+    np.testing.assert_allclose(found.scores, [score])
+
+
+@pytest.mark.parametrize("form", ["rtmdet", "yolox-dets"])
+def test_outputs_of_two_families_are_refused_until_one_is_named(form):
+    with pytest.raises(InputError, match=f"{form}: ") as refused:
+        recognize_form("net.onnx", [DETS, LABELS], SIZE)
+    assert "detection.detector=onnx-rtmdet:FILE" in str(refused.value)
+    np.testing.assert_allclose(FORMS[form].decode([DETS, LABELS], SIZE, (0,)).boxes, [BOX])
+
+
+@pytest.mark.parametrize(
+    "outputs", [[], [np.zeros((3, 7))], [np.zeros((CELLS, 84))], [np.zeros((10, 4))] * 3]
+)
+def test_unknown_outputs_are_refused_with_all_forms(outputs):
+    with pytest.raises(InputError, match=r"yolox: .*rtmdet: .*96 x 64|96 x 64.*yolox: .*rtmdet: "):
+        recognize_form("net.onnx", outputs, SIZE)
+
+
+def test_classes_of_people_are_named_numbered_or_asked_for():
+    football = {0: "ball", 1: "goalkeeper", 2: "player", 3: "Referee"}
+    outputs = [np.zeros((8, CELLS))]
+
+    def classes(names, asked=None):
+        return _person_classes("net.onnx", FORMS["yolov8"], outputs, names, asked)
+
+    assert classes(football) == (1, 2, 3)
+    assert classes(football, [2]) == (2,)
+    assert classes({}, [1, 2]) == (1, 2)
+    with pytest.raises(InputError, match="4 classes without names"):
+        classes({})
+    with pytest.raises(InputError, match="0 ball, 1 goal"):
+        classes({0: "ball", 1: "goal"})
+    with pytest.raises(InputError, match="below 4"):
+        classes({}, [4])
+    assert _class_names({"names": "{0: 'ball', 1: 'player'}"}) == {0: "ball", 1: "player"}
+    assert _class_names({"names": "['ball']"}) == {0: "ball"}
+    assert _class_names({"names": "__import__('os')"}) == _class_names({}) == {}
+
+
+def test_several_classes_of_people_share_their_best_score():
+    output = np.zeros((8, CELLS))
+    output[:4, 7], output[4:, 7] = PERSON, [0.9, 0.2, 0.6, 0.3]
+    found = FORMS["yolov8"].decode([output], SIZE, (1, 2))
+    assert found.scores.tolist() == [0.6]
+
+
+def test_a_pose_net_of_one_class_is_a_detector():
+    output = np.zeros((56, CELLS))
+    output[:4, 7], output[4, 7], output[5:, 7] = PERSON, 0.8, 90.0
+    people = _person_classes("net.onnx", FORMS["yolov8"], [output], {}, None)
+    found = FORMS["yolov8"].decode([output], SIZE, people)
+    assert found.scores.tolist() == [0.8]
+
+
+def test_nets_take_channels_and_grey_levels_as_in_their_training():
+    image = np.array([[[[255, 51, 0]]]], np.uint8)  # RGB
+    taken = {name: FORMS[name].prepare(image)[0, 0, 0] for name in FORMS}
+    np.testing.assert_allclose(taken["yolox"], [0, 51, 255])
+    np.testing.assert_allclose(taken["yolov8"], [1.0, 0.2, 0.0])
+    np.testing.assert_allclose(taken["movenet"], [255, 51, 0])
+    np.testing.assert_allclose(
+        taken["rfdetr"], [(1 - 0.485) / 0.229, -0.2560 / 0.224, -0.406 / 0.225], atol=1e-3
+    )
+    np.testing.assert_allclose(
+        taken["rtmdet"],
+        [-103.53 / 57.375, (51 - 116.28) / 57.12, (255 - 123.675) / 58.395],
+        rtol=1e-6,
+    )
+
+
+def test_an_unknown_form_is_refused_with_the_known_ones(tmp_path):
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"none")
+    with pytest.raises(InputError, match=r"one of yolox: .*rtmdet: "):
+        load_detectors(DetectionSettings(detector=f"onnx-yolo99:{file}"))
