@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Singles
 from worldpose.detection.interfaces import MIN_SCORE, Detector, People
 from worldpose.detection.onnx_nets import IMAGENET_MEAN, IMAGENET_STD, OnnxNet
 from worldpose.detection.suppression import suppress
@@ -54,11 +54,11 @@ class Form:
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     bgr: bool = False
 
-    def prepare(self, images: NDArray[Any]) -> NDArray[np.float32]:
+    def prepare(self, images: NDArray[Any]) -> Singles:
         """Return images (n, height, width, 3) of RGB 0..255 as the net takes them."""
-        given = images[..., ::-1] if self.bgr else images
-        given = given.astype(np.float32) * np.float32(self.scale)
-        return (given - np.array(self.mean, np.float32)) / np.array(self.std, np.float32)
+        ordered = images[..., ::-1] if self.bgr else images
+        given: Singles = ordered.astype(np.float32) * np.float32(self.scale)
+        return np.divide(given - np.array(self.mean, np.float32), np.array(self.std, np.float32))
 
 
 def load_onnx_detector(

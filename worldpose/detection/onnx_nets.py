@@ -19,7 +19,7 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.interfaces import PoseEstimator
 from worldpose.errors import InputError
 
-_DTYPES = {
+_DTYPES: Final[dict[str, np.dtype[Any]]] = {
     "tensor(int32)": np.dtype(np.int32),
     "tensor(uint8)": np.dtype(np.uint8),
     "tensor(float16)": np.dtype(np.float16),
@@ -100,7 +100,7 @@ class OnnxNet:
         self.batch = shape[0]
         height, width = shape[1:3] if self.channels_last else shape[2:4]
         self.size = (width or default_size[0], height or default_size[1])
-        self.dtype = _DTYPES.get(inputs[0].type, np.dtype(np.float32))
+        self.dtype: np.dtype[Any] = _DTYPES.get(inputs[0].type, np.dtype(np.float32))
         self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
         self.outputs = [
             tuple(side if isinstance(side, int) else None for side in output.shape)
