@@ -12,7 +12,7 @@ from pydantic import Field
 
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.records import Record
+from data_contracts.records import DetectionIndex, Frame, Record
 from flows.reports.match_pictures import frame_picture
 from flows.review.detections import accept, detections_now, left_to_look_at
 from flows.stage import Match
@@ -31,7 +31,7 @@ class Accepting(Record):
 
     at_least: float | None = Field(default=None, ge=0, le=1)
     """Accept every detection with at least this score [1]; None = only those in `people`."""
-    people: tuple[tuple[int, int], ...] = Field(default=(), max_length=ACCEPTED)
+    people: tuple[tuple[Frame, DetectionIndex], ...] = Field(default=(), max_length=ACCEPTED)
     """Match frame, and index among the detections of the frame."""
 
 
