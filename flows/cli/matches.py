@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +24,7 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.ingest import import_match, import_videos
+from worldpose.ingest import import_clicks, import_match, import_videos
 from worldpose.store import Store
 
 
@@ -199,15 +200,43 @@ def import_command(
         Path | None,
         typer.Option(help="Survey of the markings (CSV); writes only pitch.json."),
     ] = None,
+    clicks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Clicked markings of CVAT (XML), Label Studio or COCO (JSON); labels are names of "
+            "the pitch or places in metres."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="With --clicks: the camera, or the clip of the broadcast camera; by default, "
+            "images are named after cameras."
+        ),
+    ] = None,
     left_handed: Annotated[
         bool, typer.Option("--left-handed", help="The survey's x, y and height are left-handed.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring calibration and 2D poses or videos, or a surveyed pitch, into a match folder.
+    """Bring calibration and 2D poses or videos, clicks, or a surveyed pitch, into a match folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
+    if clicks is not None:
+        if calibration or detections or videos or fps or match_id or pitch or left_handed:
+            raise UsageError(
+                "--clicks",
+                expected="--clicks with --out, and --camera if images are not named after cameras",
+                found="options of a match or a pitch",
+                todo="Import the match first, then the clicks into its folder.",
+            )
+        _import_clicks(clicks, out, camera, as_json=as_json)
+        return
+    if camera is not None:
+        raise UsageError(
+            "--camera", expected="--camera with --clicks", found="no --clicks", todo="Add --clicks."
+        )
     if pitch is not None:
         if calibration or detections or videos or fps or match_id:
             raise UsageError(
@@ -236,6 +265,29 @@ def import_command(
         line(
             f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
             f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
+        )
+
+
+def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) -> None:
+    """Write clicks and own points into a match folder, and print what was read."""
+    found = import_clicks(file, out, camera)
+    if as_json:
+        print_json({"folder": str(out), **asdict(found)})
+        return
+    for name in found.files:
+        line(f"wrote {out / name}")
+    for owner, count in found.clicks.items():
+        line(f"{owner}: {count} clicks and lines")
+    if found.mirrored is not None:
+        side = "near" if found.mirrored else "far"
+        line(f"places: y points to the {side} side, as the clicks show")
+    if found.own_points:
+        line(f"{len(found.own_points)} points that the Laws do not name are in pitch.json")
+    for image, label in found.repeated:
+        line(
+            f"warning: {image}: {label!r} is clicked more than once. Which one is meant? "
+            "Calibration tells the wrong one if the other clicks decide; else remove it.",
+            to=errors,
         )
 
 

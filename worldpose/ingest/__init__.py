@@ -7,6 +7,7 @@ Outputs: `MatchFolder`, `Registration`, `KeypointDetections` on match frames.
 
 from worldpose.formats.calibration_files import read_calibration, write_calibration_toml
 from worldpose.formats.keypoint_files import read_observations
+from worldpose.ingest.clicks import ImportedClicks, import_clicks
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
@@ -14,9 +15,11 @@ from worldpose.ingest.registration import register_match
 from worldpose.ingest.writing import MatchAnnotations, write_match
 
 __all__ = [
+    "ImportedClicks",
     "MatchAnnotations",
     "MatchFolder",
     "UnitFrames",
+    "import_clicks",
     "import_match",
     "import_videos",
     "read_calibration",

@@ -196,7 +196,8 @@ def _require_known(
                 f"{file}: {place}.name",
                 expected="every name once",
                 found=f"{name!r} again, after {places[name]}",
-                todo="Remove one, or put all places along one marking into one entry.",
+                todo="Which of the two is meant? Remove or rename the other; put all places along "
+                "one marking into one entry.",
             )
         places[name] = place
 

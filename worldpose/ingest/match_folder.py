@@ -68,7 +68,12 @@ def read_match(folder: Path) -> MatchFolder:
         return _read_match(folder)
 
 
-def _read_match(folder: Path) -> MatchFolder:
+def read_spec(folder: Path) -> MatchSpec:
+    """Return match.yaml of a match folder.
+
+    Raises:
+        InputError: the file is missing or invalid.
+    """
     file = folder / "match.yaml"
     if folder.is_dir() and not file.exists():
         raise InputError(
@@ -78,10 +83,14 @@ def _read_match(folder: Path) -> MatchFolder:
             todo="docs/reference/match_folder.md describes a match folder; worldpose import makes "
             "one from a calibration.",
         )
-    spec = validate_record(MatchSpec, read_yaml(file), str(file))
+    return validate_record(MatchSpec, read_yaml(file), str(file))
+
+
+def _read_match(folder: Path) -> MatchFolder:
+    spec = read_spec(folder)
     if not spec.static_cameras:
         raise InputError(
-            f"{file}: cameras",
+            f"{folder / 'match.yaml'}: cameras",
             expected="at least one camera of kind static",
             found=f"{len(spec.cameras)} broadcast",
             todo="Add the static cameras.",

@@ -1,0 +1,222 @@
+"""Clicks of annotation tools: the same markings from every form, and places by their metres."""
+
+import json
+import os
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats.annotations.marked_images import read_marked_images
+from worldpose.ingest import import_clicks
+from worldpose.ingest.annotations import read_clicked_markings
+from worldpose.ingest.match_folder import read_spec
+from worldpose.ingest.pitch_file import read_pitch
+
+SIZE = (1920, 1080)
+CLICKS = {"corner_left_near": (400.25, 900.5), "halfway_far": (960.0, 300.0)}
+LINE = [(100.0, 200.0), (300.0, 250.5)]
+
+
+def match(folder, *, pitch=None):
+    folder.mkdir()
+    lines = ["contract: 1", "match_id: m", "fps: 25", "cameras:"]
+    lines += [
+        "  - {id: east, width: 1920, height: 1080}",
+        "  - {id: west, width: 1920, height: 1080}",
+    ]
+    lines += ["  - {id: main, width: 1920, height: 1080, kind: broadcast}", "clips:"]
+    lines += ["  - {id: goal, first_frame: 0, frame_count: 50, broadcast: main}"]
+    (folder / "match.yaml").write_text("\n".join(lines) + "\n")
+    if pitch:
+        (folder / "pitch.json").write_text(json.dumps(pitch))
+    return folder
+
+
+def cvat(file, clicks, lines=(), *, name="east.png", size=SIZE):
+    shapes = [
+        f'<points label={quoteattr(label)} points="{x + 0.5},{y + 0.5}"/>'
+        for label, (x, y) in clicks
+    ]
+    for label, pixels in lines:
+        text = ";".join(f"{x + 0.5},{y + 0.5}" for x, y in pixels)
+        shapes.append(f'<polyline label={quoteattr(label)} points="{text}"/>')
+    file.write_text(
+        f'<annotations><image id="0" name="{name}" width="{size[0]}" '
+        f'height="{size[1]}">{"".join(shapes)}</image></annotations>'
+    )
+    return file
+
+
+def label_studio(file, clicks, lines=()):
+    percent = 100.0 / np.array(SIZE)
+    common = {"original_width": SIZE[0], "original_height": SIZE[1]}
+    result = [{"type": "choices", "value": {"choices": ["good"]}}]
+    for label, pixel in clicks:
+        x, y = (np.array(pixel) + 0.5) * percent
+        value = {"x": x, "y": y, "width": 0.4, "keypointlabels": [label]}
+        result.append({"type": "keypointlabels", "value": value, **common})
+    for label, pixels in lines:
+        value = {"points": ((np.array(pixels) + 0.5) * percent).tolist(), "polygonlabels": [label]}
+        result.append({"type": "polygonlabels", "value": value, **common})
+    task = {"data": {"image": "/data/upload/east.png"}, "annotations": [{"result": result}]}
+    file.write_text(json.dumps([task]))
+    return file
+
+
+def coco(file, clicks):
+    names = [label for label, _ in clicks] + ["not_clicked"]
+    numbers = [value for _, (x, y) in clicks for value in (x, y, 2)] + [0, 0, 0]
+    content = {
+        "images": [{"id": 7, "file_name": "east.png", "width": SIZE[0], "height": SIZE[1]}],
+        "annotations": [{"id": 1, "image_id": 7, "category_id": 3, "keypoints": numbers}],
+        "categories": [{"id": 3, "name": "pitch", "keypoints": names}],
+    }
+    file.write_text(json.dumps(content))
+    return file
+
+
+def clicked(folder, camera="east"):
+    spec = read_spec(folder)
+    file = folder / "annotations" / "static_calibration" / f"{camera}.json"
+    found = read_clicked_markings(file, spec.camera(camera), read_pitch(folder, spec))
+    return {point.name: point.xy for point in found.points}, found.drawn
+
+
+@pytest.mark.parametrize("write", [cvat, label_studio, coco])
+def test_every_form_gives_the_same_clicks(tmp_path, write):
+    folder = match(tmp_path / "m")
+    lines = [] if write is coco else [("touch_line_near", LINE)]
+    file = write(tmp_path / "clicks", [*CLICKS.items()], *([lines] if lines else []))
+    report = import_clicks(file, folder)
+    assert report.files == ["annotations/static_calibration/east.json"]
+    points, drawn = clicked(folder)
+    assert points.keys() == CLICKS.keys()
+    for name, pixel in CLICKS.items():
+        np.testing.assert_allclose(points[name], pixel, atol=1e-9)
+    for marking in drawn:
+        assert marking.name == "touch_line_near"
+        np.testing.assert_allclose(marking.xy, LINE, atol=1e-9)
+    assert len(drawn) == len(lines)
+
+
+def seen(places):
+    """Pixels of world places (n, 2) from a mast behind the near touch line, looking across."""
+    x, y = np.array(places).T
+    depth = y + 80.0
+    return np.stack([960.0 + 900.0 * x / depth, 300.0 + 900.0 * 20.0 / depth], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("label", "mirrored"),
+    [
+        (lambda x, y: (x + 52.5, y + 34.0), False),
+        (lambda x, y: (x + 52.5, 34.0 - y), True),
+        (lambda x, y: (x, y), False),
+        (lambda x, y: (x, -y), True),
+    ],
+)
+def test_labels_are_places_from_a_corner_or_the_centre_on_either_side(tmp_path, label, mirrored):
+    folder = match(tmp_path / "m")
+    world = [(-52.5, 34.0), (-36.0, 20.16), (0.0, -34.0), (5.5, 34.0), (-30.5, -34.0), (-41.5, 0.0)]
+    labels = ["({:g},{:g})".format(*label(*place)) for place in world]
+    pixels = map(tuple, seen(world))
+    report = import_clicks(cvat(tmp_path / "c.xml", zip(labels, pixels, strict=True)), folder)
+    assert report.mirrored is mirrored
+    assert clicked(folder)[0].keys() == {
+        *("corner_left_far", "penalty_area_left_far_front", "halfway_near", "penalty_mark_left"),
+        *("at_5.50_34.00", "at_-30.50_-34.00"),
+    }
+    pitch = json.loads((folder / "pitch.json").read_text())
+    assert pitch["points"]["at_5.50_34.00"] == [5.5, 34.0, -0.2]  # the crown falls to the line
+    assert read_pitch(folder, read_spec(folder)).points.keys() == report.own_points.keys()
+
+
+def test_a_label_clicked_twice_gives_two_points_at_one_place(tmp_path):
+    folder = match(tmp_path / "m")
+    clicks = [*CLICKS.items(), ("halfway_far", (10.0, 20.0))]
+    report = import_clicks(cvat(tmp_path / "c.xml", clicks), folder)
+    assert report.repeated == [("east.png", "halfway_far")]
+    assert clicked(folder)[0]["halfway_far.again"] == (10.0, 20.0)
+    assert report.own_points == {"halfway_far.again": (0.0, 34.0, -0.2)}
+
+
+def test_own_points_of_pitch_json_stay_and_are_labels(tmp_path):
+    own = {"width": 66.0, "points": {"stripe_3": [11.0, 33.0, -0.2]}}
+    folder = match(tmp_path / "m", pitch=own)
+    places = [(-9, 4), (3, -8), (8, 9), (1, 1)]
+    labels = [(f"({x},{y})", tuple(seen([(x, y)])[0])) for x, y in places]
+    import_clicks(cvat(tmp_path / "c.xml", [("stripe_3", (5.0, 6.0)), *labels]), folder)
+    pitch = json.loads((folder / "pitch.json").read_text())
+    assert pitch["width"] == 66.0
+    assert pitch["points"]["stripe_3"] == [11.0, 33.0, -0.2]
+    assert "at_-9.00_4.00" in pitch["points"]
+
+
+def test_images_of_a_clip_become_key_frames(tmp_path):
+    folder = match(tmp_path / "m")
+    file = cvat(tmp_path / "c.xml", CLICKS.items(), name="frame_000084.png")
+    text = file.read_text().replace("</annotations>", "")
+    other = cvat(tmp_path / "d.xml", CLICKS.items(), name="frame_000009.png").read_text()
+    file.write_text(text + other.replace("<annotations>", ""))
+    report = import_clicks(file, folder, "goal")
+    assert report.clicks == {"goal": 4}
+    written = json.loads((folder / report.files[0]).read_text())
+    assert [each["frame"] for each in written["key_frames"]] == [9, 84]
+
+
+@pytest.mark.parametrize(
+    ("change", "owner", "found"),
+    [
+        ({"clicks": [("corner_left_nera", (1.0, 2.0))]}, None, "corner_left_near"),
+        ({"clicks": [("(900,2)", (1.0, 2.0))]}, None, "four places"),
+        ({"clicks": [("(1,2)", (1.0, 2.0))]}, None, "four places"),
+        ({"lines": [("touch_line", LINE)]}, None, "touch_line_"),
+        ({"size": (960, 540)}, None, "960 x 540"),
+        ({"name": "north.png"}, None, "east, west"),
+        ({"name": "still.png"}, "goal", "ends in its frame number"),
+        ({}, "north", "goal"),
+        ({"clicks": []}, None, "no labelled point"),
+        ({"clicks": [("halfway_far", (np.nan, 2.0))]}, None, "points are"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, change, owner, found):
+    folder = match(tmp_path / "m")
+    file = cvat(tmp_path / "c.xml", **{"clicks": CLICKS.items(), **change})
+    with pytest.raises(InputError, match=found):
+        import_clicks(file, folder, owner)
+    assert {each.name for each in folder.iterdir()} == {"match.yaml"}
+
+
+def test_present_clicks_are_not_overwritten(tmp_path):
+    folder = match(tmp_path / "m")
+    file = cvat(tmp_path / "c.xml", CLICKS.items())
+    import_clicks(file, folder)
+    with pytest.raises(InputError, match="no clicks there yet"):
+        import_clicks(file, folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"<html></html>", b"[1]", b"{}", b"{", b"\xff\xfe"])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / "c").write_bytes(content)
+    with pytest.raises(InputError, match="CVAT for images"):
+        read_marked_images(tmp_path / "c")
+
+
+REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair")
+def test_real_cvat_clicks_with_places_become_a_match(tmp_path):
+    folder = match(tmp_path / "m")
+    text = (folder / "match.yaml").read_text().replace("1920", "3072").replace("1080", "1728")
+    (folder / "match.yaml").write_text(text)
+    east = import_clicks(REAL / "left_keypoints.xml", folder, "east")
+    west = import_clicks(REAL / "right_keypoints.xml", folder, "west")
+    assert east.clicks | west.clicks == {"east": 38, "west": 39}
+    assert east.mirrored and west.mirrored
+    # Both are the other one's label: they were swapped with places that were clicked as well.
+    assert [label for _, label in west.repeated] == ["(105,14.84)", "(99.5,0)"]
+    assert {"corner_left_far", "goal_area_left_far_front"} <= clicked(folder, "east")[0].keys()

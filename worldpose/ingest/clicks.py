@@ -1,0 +1,288 @@
+"""Clicks of an annotation tool as the clicked markings of a match folder."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
+from data_contracts.match import CameraSpec, MatchSpec
+from data_contracts.pitch import PitchSpec
+from data_contracts.records import Record
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
+from worldpose.formats import whole_file
+from worldpose.formats.annotations.marked_images import MarkedImage, read_marked_images
+from worldpose.ingest.annotations import clicked_file, key_frames_file
+from worldpose.ingest.match_folder import read_spec
+from worldpose.ingest.pitch_file import read_pitch, refuse_unread_pitch
+from worldpose.pitch import PitchTemplate
+from worldpose.pitch.laws import law_points
+
+COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
+"""A label that is a place, such as `(16.5, 13.84)` [m]."""
+SNAP: Final = 0.1
+"""A place closer to a point of the Laws than this is that point [m]: labels are rounded."""
+AGAIN: Final = ".again"
+"""Suffix of the second click with one label."""
+
+
+@dataclass
+class ImportedClicks:
+    """What an import wrote.
+
+    Attributes:
+        files: written, relative to the match folder.
+        clicks: number of clicks and drawn lines, by camera or clip.
+        own_points: points that the Laws do not name, with their places (3,) [m, world].
+        repeated: labels that were clicked more than once in one image, with the image.
+        mirrored: whether the labels' y axis points towards the near side; None without coordinates.
+    """
+
+    files: list[str] = field(default_factory=list)
+    clicks: dict[str, int] = field(default_factory=dict)
+    own_points: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    repeated: list[tuple[str, str]] = field(default_factory=list)
+    mirrored: bool | None = None
+
+
+def import_clicks(file: Path, folder: Path, owner: str | None = None) -> ImportedClicks:
+    """Write the labelled points of an annotation file into a match folder.
+
+    Labels are names of the pitch template, or places in metres: from a corner along the touch line
+    and the goal line, or, if some are negative, from the centre spot. On which side y is positive
+    follows from the clicks: no camera above a pitch sees it mirrored. Places that the Laws do not
+    name become points of pitch.json. A label that is clicked twice in one image gives two points at
+    one place, from which calibration tells the wrong one.
+
+    Args:
+        file: CVAT for images XML, Label Studio JSON or COCO keypoints JSON.
+        folder: the match folder, with match.yaml.
+        owner: the static camera, or the clip of the broadcast camera whose key frames are numbered
+            by the images' names; None: the images are named after cameras.
+
+    Raises:
+        InputError: the file has another form; a label is unknown; an image belongs to no camera, or
+            has another size; or clicks exist already.
+    """
+    images = read_marked_images(file)
+    spec = read_spec(folder)
+    pitch = read_pitch(folder, spec)
+    if pitch is None:
+        raise InputError(
+            f"{folder / 'match.yaml'}: pitch",
+            expected="a pitch, whose markings were clicked",
+            found="pitch: none",
+            todo="Remove the line `pitch: none`.",
+        )
+    by_owner = _assign_images(file, images, spec, owner)
+    report = ImportedClicks()
+    labels = _Labels(file, images, pitch, report)
+    records: dict[str, Record] = {}
+    for name, (camera, own) in by_owner.items():
+        for image in own:
+            if image.size != (camera.width, camera.height):
+                raise InputError(
+                    f"{file}: {image.name}",
+                    expected=f"{camera.width} x {camera.height} px, as match.yaml has it",
+                    found=f"{image.size[0]} x {image.size[1]} px",
+                    todo="Click in images of the camera's own size, or correct match.yaml.",
+                )
+        records |= _records(file, name, camera, own, labels)
+        report.clicks[name] = sum(len(image.points) + len(image.lines) for image in own)
+    for name in records:
+        if (folder / name).exists():
+            raise InputError(
+                str(folder / name),
+                expected="no clicks there yet",
+                found="a file",
+                todo="Move it away, or correct single clicks on the pages.",
+            )
+    if report.own_points:
+        refuse_unread_pitch(folder)
+        known = dict(pitch.points)
+        known.update(report.own_points)
+        records["pitch.json"] = pitch.model_copy(update={"points": known})
+    for name, record in records.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(folder / name) as draft:
+            text = record.model_dump_json(indent=2, exclude_defaults=True, exclude_none=True)
+            draft.write_text(text + "\n", encoding="utf-8")
+        report.files.append(name)
+    return report
+
+
+def _assign_images(
+    file: Path, images: Sequence[MarkedImage], spec: MatchSpec, owner: str | None
+) -> dict[str, tuple[CameraSpec, list[MarkedImage]]]:
+    """Return camera and images by static camera or clip."""
+    static = {camera.id: camera for camera in spec.static_cameras}
+    clips = {clip.id: spec.camera(clip.broadcast) for clip in spec.clips if clip.broadcast}
+    if owner in clips:
+        return {owner: (clips[owner], list(images))}
+    if owner is not None and owner not in static:
+        raise InputError(
+            "--camera",
+            expected=f"one of {', '.join([*static, *clips])}",
+            found=repr(owner),
+            todo="Name a static camera, or a clip of the broadcast camera.",
+        )
+    found: dict[str, tuple[CameraSpec, list[MarkedImage]]] = {}
+    for image in images:
+        name = owner or PurePosixPath(image.name.replace("\\", "/")).stem
+        if name not in static or name in found:
+            raise InputError(
+                f"{file}: {image.name}",
+                expected="one image per static camera, named <camera>.png or the like: "
+                + ", ".join(static),
+                found=f"{len(images)} images, of which this is no camera's or a second one",
+                todo="Rename the images, or import one camera: --camera NAME.",
+            )
+        found[name] = (static[name], [image])
+    return found
+
+
+def _records(
+    file: Path, owner: str, camera: CameraSpec, images: Sequence[MarkedImage], labels: _Labels
+) -> dict[str, Record]:
+    if camera.kind == "static":
+        return {clicked_file(owner): labels.markings(images[0])}
+    frames = {}
+    for image in images:
+        digits = re.findall(r"\d+", PurePosixPath(image.name).stem)
+        if not digits or int(digits[-1]) in frames:
+            raise InputError(
+                f"{file}: {image.name}",
+                expected="an image whose name ends in its frame number, such as frame_000084.png",
+                found="no number" if not digits else f"frame {int(digits[-1])} again",
+                todo="Name the images by the frames of the clip's video.",
+            )
+        frames[int(digits[-1])] = labels.markings(image)
+    return {
+        key_frames_file(owner): KeyFrames(
+            key_frames=tuple(
+                KeyFrame(frame=number, markings=frames[number]) for number in sorted(frames)
+            )
+        )
+    }
+
+
+class _Labels:
+    """Labels of a file as names of points on the pitch."""
+
+    def __init__(
+        self, file: Path, images: Sequence[MarkedImage], pitch: PitchSpec, report: ImportedClicks
+    ) -> None:
+        self._file, self._report = file, report
+        self._pitch, self._template = pitch, PitchTemplate.from_spec(pitch)
+        self._laws = {
+            name: np.array(place[:2])
+            for name, place in law_points(pitch.length, pitch.width).items()
+            if place[2] == 0.0
+        }
+        self._frame = _label_frame(file, images, pitch)
+        if self._frame is not None:
+            report.mirrored = bool(self._frame[1, 1] < 0)
+
+    def markings(self, image: MarkedImage) -> ClickedMarkings:
+        """Return the clicked markings of an image."""
+        points, seen = [], Counter[str]()
+        for label, pixel in image.points:
+            name = self._name(image, label)
+            seen[name] += 1
+            if seen[name] > 1:
+                self._report.repeated.append((image.name, label))
+                place = self._place(name)
+                name += AGAIN if seen[name] == 2 else f"{AGAIN}{seen[name]}"
+                self._report.own_points[name] = place
+            points.append({"name": name, "xy": pixel.tolist()})
+        drawn: dict[str, list[list[float]]] = {}
+        for label, pixels in image.lines:
+            drawn.setdefault(self._line(image, label), []).extend(pixels.tolist())
+        lines = [{"name": name, "xy": xy} for name, xy in drawn.items()]
+        return ClickedMarkings.model_validate({"points": points, "drawn": lines})
+
+    def _place(self, name: str) -> tuple[float, float, float]:
+        if name in self._report.own_points:
+            return self._report.own_points[name]
+        x, y, z = map(float, self._template.points[name])
+        return (x, y, z)
+
+    def _name(self, image: MarkedImage, label: str) -> str:
+        if label in self._template.points:
+            return label
+        found = COORDINATES.fullmatch(label.strip())
+        if found is None or self._frame is None:
+            raise self._unknown(image, label, self._template.points)
+        x, y = self._frame @ [float(found[1]), float(found[2]), 1.0]
+        if abs(x) > 0.5 * self._pitch.length + 30.0 or abs(y) > 0.5 * self._pitch.width + 30.0:
+            raise self._unknown(image, label, self._template.points)
+        for name, place in self._laws.items():
+            if np.hypot(*(place - [x, y])) < SNAP:
+                return name
+        name = f"at_{x:.2f}_{y:.2f}"
+        height = float(self._template.height(np.array(x), np.array(y)))
+        self._report.own_points[name] = (round(x, 4), round(y, 4), round(height, 4))
+        return name
+
+    def _line(self, image: MarkedImage, label: str) -> str:
+        if label not in self._template.marking_names:
+            raise self._unknown(image, label, self._template.marking_names)
+        return label
+
+    def _unknown(self, image: MarkedImage, label: str, known: Collection[str]) -> InputError:
+        close = get_close_matches(label, known, n=3)
+        return InputError(
+            f"{self._file}: {image.name}",
+            expected="names of the pitch, or places in metres such as (16.5, 13.84)",
+            found=repr(label[:60]) + (f"; did you mean {' or '.join(close)}?" if close else ""),
+            todo="Rename the label; docs/reference/match_folder.md lists the names.",
+        )
+
+
+def _label_frame(file: Path, images: Sequence[MarkedImage], pitch: PitchSpec) -> Floats | None:
+    """Return the transformation (2, 3) of the labels' places to the world [m]; None without any."""
+    import cv2  # imported here: most imports need no homography
+
+    given = []
+    for image in images:
+        found = [(COORDINATES.fullmatch(label.strip()), pixel) for label, pixel in image.points]
+        own = [((float(m[1]), float(m[2])), pixel) for m, pixel in found if m is not None]
+        given.append(own)
+    places = np.array([place for own in given for place, _ in own])
+    if not len(places):
+        return None
+    from_corner = bool((places >= 0.0).all())
+    signs = []
+    for own in given:
+        plane, pixels = np.array([p for p, _ in own]), np.array([q for _, q in own])
+        if len({tuple(p) for p in plane.tolist()}) < 4:
+            continue
+        homography, inliers = cv2.findHomography(plane, pixels, cv2.RANSAC, 20.0)
+        if homography is None or inliers.sum() < 4:
+            continue
+        # Of x along the touch line and y to the far side an image, y down, is a reflection.
+        depth = np.c_[plane, np.ones(len(plane))] @ homography[2]
+        jacobian = np.linalg.det(homography) / depth**3
+        signs.append(np.sign(np.median(jacobian[inliers.ravel() > 0])))
+    if not signs or len(set(signs)) > 1:
+        raise InputError(
+            f"{file}: labels with places",
+            expected="at least four places per image, not on one line, that agree on the side of y",
+            found="too few" if not signs else "images that contradict each other",
+            todo="Label the clicks by the names of the pitch template instead.",
+        )
+    mirrored = signs[0] > 0
+    shift = np.array([0.5 * pitch.length, 0.5 * pitch.width]) if from_corner else np.zeros(2)
+    frame = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])
+    if mirrored:
+        frame[1] = -frame[1]
+    return frame
