@@ -1,4 +1,4 @@
-"""`worldpose import --pitch`: a survey becomes a match's pitch.json, or one clear message."""
+"""`worldpose import` of a surveyed pitch and of clicks: files of a match, or a clear message."""
 
 import json
 
@@ -76,3 +76,24 @@ def test_a_match_needs_its_calibration_and_detections(tmp_path):
     answer = worldpose("import", "--out", tmp_path / "match", "--fps", 25)
     assert answer.code == 2
     assert "--calibration with --detections and --fps or with --videos" in answer.err
+
+
+def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
+    folder = tmp_path / "m"
+    folder.mkdir()
+    (folder / "match.yaml").write_text(
+        "contract: 1\nmatch_id: m\nfps: 25\ncameras:\n"
+        "  - {id: east, width: 1920, height: 1080}\n"
+        "clips:\n  - {id: c, first_frame: 0, frame_count: 50}\n"
+    )
+    file = tmp_path / "clicks.xml"
+    file.write_text(
+        '<annotations><image name="a.png" width="1920" height="1080">'
+        '<points label="halfway_far" points="10.5,20.5;30.5,40.5"/></image></annotations>'
+    )
+    command = ["import", "--clicks", str(file), "--out", str(folder)]
+    assert "one image per static camera" in worldpose(*command).err
+    done = succeed(*command, "--camera", "east")
+    assert "'halfway_far' is clicked more than once. Which one is meant?" in done.err
+    assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
+    assert worldpose(*command, "--fps", "25").code == 2
