@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast
@@ -13,6 +14,11 @@ from numba import njit
 from numba.core import config
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+_PACKAGE = Path(__file__).resolve().parent
+_IMPORT = re.compile(
+    rb"^\s*(?:from|import) (worldpose\.\w+|data_contracts\.\w+)", flags=re.MULTILINE
+)
 
 
 def compiled(function: Function) -> Function:
@@ -23,26 +29,40 @@ def compiled(function: Function) -> Function:
     """
     given = config.CACHE_DIR  # type: ignore[attr-defined]
     # Numba reads this setting while it decorates.
-    config.CACHE_DIR = given or str(_cache_folder())  # type: ignore[attr-defined]
+    config.CACHE_DIR = given or str(_cache_folder(_part_of(function)))  # type: ignore[attr-defined]
     try:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
     finally:
         config.CACHE_DIR = given  # type: ignore[attr-defined]
 
 
+def _part_of(function: Function) -> str:
+    """Return the part of worldpose that defines a function, such as `worldpose.tracking`."""
+    source = Path(function.__code__.co_filename).resolve()
+    return f"worldpose.{source.relative_to(_PACKAGE).parts[0].removesuffix('.py')}"
+
+
 @functools.cache
-def _cache_folder() -> Path:
-    """Return a cache folder that is unique to the state of the kernels' sources.
+def _cache_folder(part: str) -> Path:
+    """Return a cache folder that is unique to the sources on which kernels of `part` can depend.
 
     Numba recompiles a kernel when its own file changes, but not when a kernel or constant from
-    another file changes: it would then run machine code of the old source.
+    another file changes: it would then run machine code of the old source. A part, a folder of
+    worldpose or a module of data_contracts, depends on all parts that its sources import.
     """
-    package = Path(__file__).parent
-    digest = hashlib.sha256()
-    for folder in sorted(path for path in package.iterdir() if path.is_dir()):
-        sources = [source.read_bytes() for source in sorted(folder.rglob("*.py"))]
-        if any(b"@compiled" in source for source in sources):
-            for source in sources:
-                digest.update(source)
-    root = package if os.access(package, os.W_OK) else Path.home() / ".cache" / "worldpose"
+    sources = {part: _sources(part)}
+    waiting = [part]
+    while waiting:
+        for name in {each.decode() for each in _IMPORT.findall(sources[waiting.pop()])}:
+            if name not in sources:
+                sources[name] = _sources(name)
+                waiting.append(name)
+    digest = hashlib.sha256(b"".join(content for _, content in sorted(sources.items())))
+    root = _PACKAGE if os.access(_PACKAGE, os.W_OK) else Path.home() / ".cache" / "worldpose"
     return root / "__pycache__" / f"kernels-{digest.hexdigest()[:16]}"
+
+
+def _sources(part: str) -> bytes:
+    folder = _PACKAGE.parent.joinpath(*part.split("."))
+    files = [folder.with_suffix(".py"), *sorted(folder.rglob("*.py"))]
+    return b"".join(file.read_bytes() for file in files if file.is_file())
