@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 from command_line import succeed
 from hypothesis import settings
-from moto.server import ThreadedMotoServer
-from werkzeug.serving import WSGIRequestHandler
 
 from flows.orchestration.prefect_environment import prefect_server
 
@@ -76,6 +74,9 @@ def one_at_a_time(application):
 @pytest.fixture(scope="session")
 def bucket():
     """The URL of a bucket in an S3 server on loopback."""
+    from moto.server import ThreadedMotoServer  # late: most tests need no such server
+    from werkzeug.serving import WSGIRequestHandler
+
     # Connections that stay open halve the time of a request.
     WSGIRequestHandler.protocol_version = "HTTP/1.1"
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)

@@ -1,6 +1,7 @@
 """flows -> tasks -> worldpose -> data_contracts, and worldpose knows no orchestrator or network."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -50,13 +51,16 @@ ORDER_IN_WORLDPOSE = (
 """Order inside worldpose/: a package or module may import those before it, never one after it."""
 
 
+@functools.cache
 def imported_modules(path):
+    found = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide the direction"
-            yield node.module
+            found.append(node.module)
+    return found
 
 
 def backward_imports(package, forbidden, root=ROOT):

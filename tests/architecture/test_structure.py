@@ -6,6 +6,12 @@ import pytest
 from structure import MAX_ENGINE_FILES, ROOT, Structure
 
 
+@pytest.fixture(scope="module")
+def project():
+    """The structure of the project, whose files are parsed once."""
+    return Structure()
+
+
 @pytest.fixture
 def planted(tmp_path):
     """Return the structure of modules with the given sources, by path."""
@@ -63,20 +69,20 @@ def test_a_module_with_one_importer_long_signatures_and_starred_calls_are_found(
     assert [each.split(":")[0] for each in structure.starred_calls()] == ["one.a"]
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    assert Structure().cycles() == []
+def test_no_modules_import_each_other_in_a_circle(project):
+    assert project.cycles() == []
 
 
-def test_no_file_has_more_than_600_lines():
-    assert Structure().long_files() == []
+def test_no_file_has_more_than_600_lines(project):
+    assert project.long_files() == []
 
 
-def test_no_function_has_more_than_eight_parameters():
-    assert Structure().parameters() == []
+def test_no_function_has_more_than_eight_parameters(project):
+    assert project.parameters() == []
 
 
-def test_no_call_hides_the_names_of_its_arguments():
-    assert Structure().starred_calls() == []
+def test_no_call_hides_the_names_of_its_arguments(project):
+    assert project.starred_calls() == []
 
 
 def test_the_engine_of_flows_is_visible():
