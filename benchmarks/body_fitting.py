@@ -27,7 +27,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior, start_poses
 

@@ -32,7 +32,7 @@ from worldpose.broadcast_calibration.priors import build_prior, second_differenc
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, descend, equations_at, solve
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import move_broadcast_camera
+from worldpose.simulation.scene import move_broadcast_camera
 from worldpose.simulation.settings import BroadcastSettings
 
 SMOOTH = np.array([np.inf, np.inf, np.inf, 1e-4, 1e-3, 1e-2, 1e-2])

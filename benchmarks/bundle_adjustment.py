@@ -32,7 +32,7 @@ from scipy.sparse import csr_matrix
 
 from worldpose.bundle_adjustment import Problem, SolverSettings, solve
 from worldpose.geometry import Camera, Rigid
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 from worldpose.static_calibration import PARAMETERS, stepped
 
 Solution = tuple[Camera, np.ndarray]

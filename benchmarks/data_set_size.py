@@ -24,7 +24,7 @@ def write(folder: Path, clips: int, frames: int, people: int):
     """Write clips of people who run in circles at 2.4 m/s before a panning, zooming camera."""
     from worldpose.body import OPEN_BODY, BodyParameters, find_body
     from worldpose.formats.camera_file import write_moving_camera
-    from worldpose.formats.pose_file import write_poses
+    from worldpose.formats.joints_file import write_poses
     from worldpose.geometry import Camera, Rigid
 
     model = find_body(OPEN_BODY)

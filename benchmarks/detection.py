@@ -25,10 +25,10 @@ from worldpose.detection import People
 from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import gather
-from worldpose.simulation.footage import open_view, render_frame
+from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import RenderingSettings, RigSettings
 from worldpose.video import open_video, write_video
 

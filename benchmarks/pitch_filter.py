@@ -28,8 +28,8 @@ from worldpose.geometry.boxes import box_iou
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.cast import assign_roles, dress_people, place_bystanders
-from worldpose.simulation.footage import open_view, render_frame
 from worldpose.simulation.image_formation import RenderedFrame
+from worldpose.simulation.matches import open_view, render_frame
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
 

@@ -26,9 +26,9 @@ from scipy.optimize import least_squares
 from data_contracts.arrays import Floats
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_by_search, refine_on_lines
 from worldpose.static_calibration.line_samples import LineSamples, ProjectedLines

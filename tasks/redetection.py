@@ -48,7 +48,7 @@ from worldpose.redetection import (
 )
 from worldpose.store import Store
 from worldpose.video import open_video
-from worldpose.video.some import some_pictures
+from worldpose.video.folder import some_pictures
 
 FEW: Final = 500
 """Minimum number of keypoints to estimate a camera's spread; below it the stated one is used

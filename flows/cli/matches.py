@@ -295,8 +295,7 @@ def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -
     """Align a survey with the world frame, write pitch.json and print the residuals."""
     from worldpose.formats import whole_file
     from worldpose.ingest.pitch_file import refuse_unread_pitch
-    from worldpose.pitch.survey import SurveySettings, fit_survey
-    from worldpose.pitch.survey_file import read_survey
+    from worldpose.pitch.survey import SurveySettings, fit_survey, read_survey
 
     file = out / "pitch.json"
     if file.exists():

@@ -49,8 +49,8 @@ from worldpose.formats.challenge import (
     write_pitch_points,
     write_submission,
 )
+from worldpose.formats.joints_file import write_poses
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
-from worldpose.formats.pose_file import write_poses
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import read_match

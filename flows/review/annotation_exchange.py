@@ -26,8 +26,7 @@ from worldpose.formats.annotations import (
     write_annotations,
 )
 from worldpose.formats.annotations.annotated_images import SEEN
-from worldpose.review.annotation_changes import Changes, find_changes, image_name
-from worldpose.review.detections import DETECTION_EDITS
+from worldpose.review.detections import DETECTION_EDITS, Changes, find_changes, image_name
 from worldpose.store import Store
 
 EXPORTED: Final = "exported.json"

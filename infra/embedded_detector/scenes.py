@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.footage import RenderedFrame, open_view, render_frame
+from worldpose.simulation.matches import RenderedFrame, open_view, render_frame
+from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
     PATTERNS,
     CrowdSettings,

@@ -25,6 +25,7 @@ from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
+from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.metrics import (
     HEIGHTS,
     detect_labelled,
@@ -32,7 +33,6 @@ from worldpose.training.metrics import (
     score_keypoints,
     score_people,
 )
-from worldpose.training.training_loop import MIN_HEIGHT, train_keypoint_net, train_people_net
 
 Net = TypeVar("Net", PeopleNet, KeypointNet)
 

@@ -9,7 +9,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.disagreements import worst_views
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 
 FRAMES = np.arange(20, 24)
 

@@ -11,11 +11,11 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.release import BaselineSettings
 from flows.results.export import EXPORTS, Origin
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.skeletons import CHALLENGE15
+from worldpose.body.keypoints import CHALLENGE15
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats import read_camera
 from worldpose.formats.challenge import read_challenge, read_submission
-from worldpose.formats.pose_file import read_poses
+from worldpose.formats.joints_file import read_poses
 
 FRAMES = np.arange(100, 104)
 

@@ -14,7 +14,7 @@ from data_contracts.conventions import COCO17
 from worldpose import open_run
 from worldpose.body import fold_keypoints, load_open_body
 from worldpose.formats import read_camera, read_joints
-from worldpose.formats.pose_file import read_poses
+from worldpose.formats.joints_file import read_poses
 
 pytestmark = pytest.mark.usefixtures("server")
 

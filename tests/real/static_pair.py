@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import law_points
 
 CROWN = 0.1
 """Height of the long axis above the touch lines [m]; it fits both cameras better than 0.2."""

@@ -14,7 +14,7 @@ from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.cameras import camera_arrays
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 
 LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]
 

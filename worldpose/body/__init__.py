@@ -16,10 +16,17 @@ from worldpose.body.body_file import (
     load_open_body,
     save_body,
 )
-from worldpose.body.keypoints import FoldedKeypoints, fold_keypoints, fold_regressor
-from worldpose.body.model import BodyModel
-from worldpose.body.parameters import BodyParameters
-from worldpose.body.skeletons import BODY25, CHALLENGE15, EVALUATED14, SKELETONS, places_of
+from worldpose.body.keypoints import (
+    BODY25,
+    CHALLENGE15,
+    EVALUATED14,
+    SKELETONS,
+    FoldedKeypoints,
+    fold_keypoints,
+    fold_regressor,
+    places_of,
+)
+from worldpose.body.model import BodyModel, BodyParameters
 
 __all__ = [
     "BODY25",

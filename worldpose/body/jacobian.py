@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.body.keypoints import FoldedKeypoints
-from worldpose.body.model import JOINTS, BodyModel
-from worldpose.body.parameters import BodyParameters
+from worldpose.body.model import JOINTS, BodyModel, BodyParameters
 from worldpose.compiled import compiled
 
 

@@ -4,7 +4,14 @@ Input: triangulated joints with covariance, a body model, and the ground where k
 parameters, the bodies' keypoints with covariance, and the detector's systematic offsets.
 """
 
-from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.body_fit import (
+    BodyFit,
+    BodyFittingReport,
+    ClipEvidence,
+    Pictures,
+    fit_bodies,
+    report_fit,
+)
 from worldpose.body_fitting.bones import (
     BoneLengths,
     Shape,
@@ -25,7 +32,6 @@ from worldpose.body_fitting.ray_constraints import (
     identify_people,
     shift_frames,
 )
-from worldpose.body_fitting.report import BodyFittingReport, Pictures, report_fit
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import far_offsets
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.body import BodyModel
-from worldpose.body.parameters import BODY_POSE
-from worldpose.body.skeletons import JOINT_NAMES
+from worldpose.body.keypoints import JOINT_NAMES
+from worldpose.body.model import BODY_POSE
 from worldpose.geometry import Rigid
 
 COORDINATES: Final = (

@@ -20,7 +20,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.parameters import BODY_POSE
+from worldpose.body.model import BODY_POSE
 from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.objective import (

@@ -7,8 +7,13 @@ frame with one center, its covariance, and a report.
 from worldpose.broadcast_calibration.calibration import (
     BroadcastCalibration,
     BroadcastClip,
+    broadcast_arrays,
+    broadcast_attributes,
     calibrate_broadcast,
+    camera_before,
     follow_given_lens,
+    moving_arrays,
+    moving_from_arrays,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.players import FeedOffset, People, estimate_feed_offset
@@ -16,13 +21,6 @@ from worldpose.broadcast_calibration.report import BroadcastReport
 from worldpose.broadcast_calibration.settings import (
     BroadcastCalibrationSettings,
     BroadcastPrior,
-)
-from worldpose.broadcast_calibration.stored import (
-    broadcast_arrays,
-    broadcast_attributes,
-    camera_before,
-    moving_arrays,
-    moving_from_arrays,
 )
 from worldpose.broadcast_calibration.uncertainty import PooledCenter, drawn_to, pool_centers
 

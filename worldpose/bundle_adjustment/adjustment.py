@@ -15,7 +15,6 @@ from worldpose.bundle_adjustment.clip import (
     propose_frames,
     select_observations,
 )
-from worldpose.bundle_adjustment.gauge import align_points, relative_covariance
 from worldpose.bundle_adjustment.held_out_validation import (
     Contradictions,
     Evidence,
@@ -37,7 +36,12 @@ from worldpose.bundle_adjustment.problems import (
 )
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solver import Solution, solve
-from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
+from worldpose.bundle_adjustment.uncertainty import (
+    add_shared_errors,
+    align_points,
+    relative_covariance,
+    survey_response,
+)
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 

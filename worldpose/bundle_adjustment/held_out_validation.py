@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
-from worldpose.bundle_adjustment.gauge import Similarity, align_points
 from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution, solve
+from worldpose.bundle_adjustment.uncertainty import Similarity, align_points
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS

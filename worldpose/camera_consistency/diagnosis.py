@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.camera_consistency import FaultKind
-from worldpose.camera_consistency.comparison import Comparison, Trial, chance_noise
+from worldpose.camera_consistency.comparison import (
+    Comparison,
+    Trial,
+    chance_noise,
+)
 from worldpose.camera_consistency.hypotheses import (
     STATED,
     Hypothesis,

@@ -24,8 +24,7 @@ from worldpose.formats.challenge import (
     read_submission,
     submission_clips,
 )
-from worldpose.formats.joints_file import read_joints
-from worldpose.formats.pose_file import read_poses
+from worldpose.formats.joints_file import read_joints, read_poses
 from worldpose.geometry import Rigid
 
 

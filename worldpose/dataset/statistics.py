@@ -14,8 +14,7 @@ from data_contracts.release import ClipStatistics, DataSetStatistics
 from worldpose.errors import InputError
 from worldpose.formats.camera_file import read_camera_rows
 from worldpose.formats.challenge import read_submission
-from worldpose.formats.joints_file import read_joints
-from worldpose.formats.pose_file import read_poses
+from worldpose.formats.joints_file import read_joints, read_poses
 
 CameraKind = Literal["S", "M", "M+Z"]
 KINDS: Final[tuple[CameraKind, ...]] = ("S", "M", "M+Z")

@@ -12,8 +12,8 @@ from data_contracts.conventions import COCO17
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
 from worldpose.evaluation.alignment import align
-from worldpose.evaluation.identity import identity_scores
 from worldpose.evaluation.matching import (
+    identity_scores,
     joint_distances,
     match_people,
     match_tracks,

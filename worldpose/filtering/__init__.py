@@ -7,19 +7,19 @@ out and corrections to subtract in the next iteration, and prediction errors in 
 from worldpose.filtering.held_out import HeldOut, measure_held_out
 from worldpose.filtering.judging import (
     Judgement,
+    Spread,
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
 )
 from worldpose.filtering.settings import FilteringSettings
-from worldpose.filtering.spread import Spread
 from worldpose.filtering.systematic_errors import (
     BodyMotion,
     SystematicErrors,
+    ViewBias,
     learn_systematic_errors,
     watch_motion,
 )
-from worldpose.filtering.view_bias import ViewBias
 from worldpose.filtering.views import (
     BodyViews,
     perceived_covariance,

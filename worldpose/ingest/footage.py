@@ -17,7 +17,7 @@ from worldpose.formats.files import require_file
 from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.video import FrameIndex, index_video
-from worldpose.video.images import declared_size, decode_image
+from worldpose.video.folder import declared_size, decode_image
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,14 @@ Input: bodies of the previous iteration in one camera's frames, its detections, 
 Output: the people searched for, the estimator's results, and the accepted ones.
 """
 
-from worldpose.redetection.expected import Expected
-from worldpose.redetection.missing_people import (
-    MissingPeople,
-    find_detected_people,
-    select_missing_people,
-)
 from worldpose.redetection.search_results import (
+    Expected,
+    MissingPeople,
     Verdicts,
+    find_detected_people,
     judge_search_results,
     search_missing_people,
+    select_missing_people,
 )
 from worldpose.redetection.settings import RedetectionSettings
 

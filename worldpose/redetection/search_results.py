@@ -1,4 +1,4 @@
-"""Results of a pose estimator in predicted boxes, and their acceptance."""
+"""People missing from a camera's detections, the boxes to search, and acceptance of the results."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Flags, Floats, Image
+from data_contracts.conventions import COCO17_BONES, COCO17_TORSO
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import People, PoseEstimator
+from worldpose.detection import People, Place, PoseEstimator
+from worldpose.detection.pipeline import on_pitch
 from worldpose.detection.suppression import (
     combine_boxes,
     object_keypoint_similarity,
@@ -24,9 +27,173 @@ from worldpose.filtering import (
     judge_detections,
 )
 from worldpose.geometry.boxes import box_areas, box_iou
-from worldpose.redetection.expected import Expected
-from worldpose.redetection.missing_people import MissingPeople
 from worldpose.redetection.settings import RedetectionSettings
+
+AROUND: Final = (0.12, 0.20, 0.12, 0.10)
+"""Margins of a person beyond the joints: left, up to the top of the head, right, and down to the
+soles [m]."""
+BEHIND: Final = 0.2
+"""A body occludes joints that are farther away than it by more than this [m]."""
+
+
+def _capsules() -> tuple[NDArray[np.int64], Floats]:
+    """Return pairs of joints at the ends of a body's solid parts, and their radii [m]."""
+    left_shoulder, right_shoulder, left_hip, right_hip = COCO17_TORSO
+    trunk = set(COCO17_TORSO)
+    ends = [
+        *COCO17_BONES,
+        (left_shoulder, right_hip),
+        (right_shoulder, left_hip),
+        (3, 4),
+    ]
+    radius = [0.12 if a < 5 and b < 5 else 0.11 if {a, b} <= trunk else 0.06 for a, b in ends]
+    return np.array(ends), np.array(radius)
+
+
+_ENDS, _RADIUS = _capsules()
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Bodies in view of one camera, (frames, persons, 17) each; NaN without a body.
+
+    Attributes:
+        image: (..., 2) expected detections of joints [px].
+        variance: of `image` per axis [px^2], from the uncertainty of the bodies.
+        scale: pixels per metre there [px/m].
+        depth: along the camera's optical axis [m].
+    """
+
+    image: Floats
+    variance: Floats
+    scale: Floats
+    depth: Floats
+
+    @classmethod
+    def of(cls, views: BodyViews, beside: Floats, focal: float) -> Expected:
+        """Return the expected image of the bodies in the only camera of `views`.
+
+        Args:
+            views: bodies in the frames of one camera.
+            beside: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
+            focal: of the camera [px].
+        """
+        scale = views.scale[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.where(scale > 0.0, focal / scale, np.nan)
+        return cls(views.image[:, 0] + np.nan_to_num(beside), views.variance[:, 0], scale, depth)
+
+    @property
+    def boxes(self) -> Floats:
+        """Return bodies' boxes (frames, persons, 4) [px]: x0, y0, x1, y1; NaN if incomplete."""
+        left, up, right, down = (side * self.scale for side in AROUND)
+        x, y = self.image[..., 0], self.image[..., 1]
+        sides = [(x - left).min(-1), (y - up).min(-1), (x + right).max(-1), (y + down).max(-1)]
+        return np.stack(sides, axis=-1)
+
+    @property
+    def unsure(self) -> Floats:
+        """Return median standard deviations of joints across the view (frames, persons) [m]."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.median(np.sqrt(self.variance) / self.scale, axis=-1))
+
+    def hidden(self, frame: int) -> NDArray[np.bool_]:
+        """Return which joints (persons, 17) of a frame another person's body occludes."""
+        image, scale, depth = self.image[frame], self.scale[frame], self.depth[frame]
+        begin, end = image[:, _ENDS[:, 0]], image[:, _ENDS[:, 1]]
+        along = end - begin
+        radius = _RADIUS * scale[:, _ENDS].mean(-1)
+        near = depth[:, _ENDS].mean(-1)
+        off = image[:, :, None, None] - begin  # (persons, joints, others, capsules, 2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            part = (off * along).sum(-1) / np.square(along).sum(-1)
+            away = off - np.clip(np.nan_to_num(part), 0.0, 1.0)[..., None] * along
+            covered = np.square(away).sum(-1) < radius**2
+            covered &= near + BEHIND < depth[:, :, None, None]
+        persons = np.arange(len(image))
+        covered[persons, :, persons] = False
+        return np.asarray(covered.any(axis=(2, 3)))
+
+
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class MissingPeople:
+    """People to search for, one per row, by rising frames.
+
+    Attributes:
+        frame: (n,) index of the frame.
+        person: (n,) index of the person.
+        boxes: (n, 4) predicted boxes [px].
+        hidden: number of further people, left out because others occlude them.
+    """
+
+    frame: Places
+    person: Places
+    boxes: Floats
+    hidden: int
+
+
+def select_missing_people(
+    expected: Expected,
+    seen: Flags,
+    size: tuple[int, int],
+    settings: RedetectionSettings,
+    place: Place | None = None,
+    margin: float = 0.0,
+) -> MissingPeople:
+    """Return the people that should be visible and have no detection.
+
+    Args:
+        expected: the bodies in view of one camera.
+        seen: (frames, persons) whether the person was detected there.
+        size: width, height of the frames [px].
+        settings: thresholds of visibility.
+        place: camera and pitch; None where there is no pitch.
+        margin: largest distance outside of the lines that still counts as on the pitch [m].
+    """
+    boxes = expected.boxes
+    with np.errstate(invalid="ignore"):
+        tall = boxes[..., 3] - boxes[..., 1] >= settings.min_height_px
+        wanted = ~seen & tall & (expected.unsure <= settings.max_uncertainty_m)
+        within = (expected.image >= -0.5) & (expected.image <= np.array(size) - 0.5)
+    shown = np.asarray(within.all(axis=-1))
+    wanted &= shown.mean(axis=-1) >= settings.min_visible_share
+    frame, person = np.nonzero(wanted)
+    if place is not None and len(frame):
+        cut = np.minimum(boxes[frame, person], np.array([*size, *size]) - 0.5)
+        inside = on_pitch(cut, place.camera, size, place.pitch, margin)
+        frame, person = frame[inside], person[inside]
+    bare = np.ones(len(frame), dtype=np.bool_)
+    for each in np.unique(frame):
+        rows = np.flatnonzero(frame == each)
+        there = shown[each, person[rows]] & ~expected.hidden(int(each))[person[rows]]
+        bare[rows] = there.mean(axis=-1) >= settings.min_visible_share
+    frame, person = frame[bare], person[bare]
+    return MissingPeople(frame, person, boxes[frame, person], int(np.count_nonzero(~bare)))
+
+
+def find_detected_people(
+    index: NDArray[np.integer], fits: NDArray[np.integer], dropped: Flags
+) -> Flags:
+    """Return which people have detections (frames, persons) that fit or could not be judged.
+
+    Args:
+        index: (frames, persons), index of the camera's detection; -1 = not seen.
+        fits: (frames, detections), index of the person whose body each fits; -1 = none.
+        dropped: (frames, detections), that fit no body.
+    """
+    detections = fits.shape[1]
+    seen = np.zeros(index.shape, dtype=np.bool_)
+    frame, detection = np.nonzero(fits >= 0)
+    seen[frame, fits[frame, detection]] = True
+    frame, person = np.nonzero((index >= 0) & (index < detections))
+    at = frame, index[frame, person]
+    unjudged = (fits[at] < 0) & ~dropped[at]
+    seen[frame[unjudged], person[unjudged]] = True
+    return seen
+
 
 FEWEST: Final = 8
 """Least number of keypoints of a result [1]: half a body."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
-from worldpose.body.parameters import BODY_POSE
+from worldpose.body.model import BODY_POSE
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.bvh import Clip
 from worldpose.simulation.football import play

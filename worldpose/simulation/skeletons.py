@@ -16,8 +16,8 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, load_open_body
-from worldpose.body.parameters import BODY_POSE
-from worldpose.body.skeletons import VERTEX_OF_POINT
+from worldpose.body.keypoints import VERTEX_OF_POINT
+from worldpose.body.model import BODY_POSE
 from worldpose.geometry import Rigid
 
 BUILD: Final = (-1.0, 0.5)

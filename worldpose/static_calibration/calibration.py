@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import law_points
 from worldpose.static_calibration.adjustment import (
     Problem,
     adjust,

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.conventions import COCO17_TORSO
-from worldpose.tracking.limbs import limb_lengths
+from worldpose.tracking.epipolar import limb_lengths
 from worldpose.tracking.settings import TrackingSettings
 
 PLACE_NOISE = 0.1

@@ -16,8 +16,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
-from worldpose.tracking.epipolar import is_person, pair_distances
-from worldpose.tracking.limbs import size_ratios
+from worldpose.tracking.epipolar import is_person, pair_distances, size_ratios
 from worldpose.tracking.person import Sighting, separations
 from worldpose.tracking.ray_matching import intersect_people
 from worldpose.tracking.settings import TrackingSettings

@@ -1,31 +1,329 @@
-"""Fine-tuning of a net on reviewed labels, adopted only if it scores better (D5)."""
+"""Training of the bundled nets, and fine-tuning on reviewed labels, adopted if better (D5).
+
+Training is seeded, checkpointed, resumable, with early stopping. Checks evaluate and keep the
+running mean of the weights (Polyak averaging), which is better at any step than the weights of the
+step. The seed and the step's number alone determine the batch of a step. So a training that was
+killed and resumes from its checkpoint gives the weights of an uninterrupted one.
+"""
 
 from __future__ import annotations
 
+import copy
+import json
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
 
 from data_contracts.finetune import NetKind
+from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
+from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.models import BUNDLED_WEIGHTS
 from worldpose.errors import InputError
 from worldpose.training.augmentation import AugmentationSettings
-from worldpose.training.keypoint_training import KeypointCrops
-from worldpose.training.labels import LabelledPicture, PictureCache
-from worldpose.training.people_training import PeopleWindows
-from worldpose.training.settings import FineTuningSettings
-from worldpose.training.training_loop import (
-    keypoint_score,
-    people_score,
-    train_keypoint_net,
-    train_people_net,
+from worldpose.training.keypoint_training import (
+    KeypointCrops,
+    keypoint_batch,
+    keypoint_loss,
+    labelled_people,
 )
+from worldpose.training.labels import LabelledPicture, PictureCache
+from worldpose.training.metrics import detect_labelled, score_keypoints, score_people
+from worldpose.training.people_training import PeopleWindows, people_batch, people_loss
+from worldpose.training.settings import FineTuningSettings, TrainingSettings
 
+Net = TypeVar("Net", bound=nn.Module)
+Batch = TypeVar("Batch")
+Tensors = dict[str, Tensor]
 Pictures = Sequence[LabelledPicture]
+Progress = Callable[[str], None]
+
+WARM_UP: Final = 0.04
+"""Share of the steps in which the learning rate rises to its full value [1]."""
+LAST_RATE: Final = 0.02
+"""Share of the full rate at the end [1]."""
+MIN_HEIGHT: Final = 34.0
+"""Shortest person for training and scoring of the keypoint net [px]: limbs are 2 px wide."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Result of a check during training.
+
+    Attributes:
+        step: steps done.
+        loss: mean since the previous check.
+        score: metric of the net on held-out frames; higher is better.
+    """
+
+    step: int
+    loss: float
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """State from which a training resumes."""
+
+    mean: Tensors
+    step: int = 0
+    checks: tuple[Check, ...] = ()
+    best: Tensors = field(default_factory=dict)
+    losses: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Training(Generic[Net, Batch]):
+    """A net, its batches, loss and metric.
+
+    Attributes:
+        net: changed in place.
+        batch: draws a batch.
+        loss: of the net on a batch.
+        score: metric of the net on held-out frames; higher is better.
+        settings: rate, steps and seed.
+    """
+
+    net: Net
+    batch: Callable[[np.random.Generator], Batch]
+    loss: Callable[[Net, Batch], Tensor]
+    score: Callable[[Net], float]
+    settings: TrainingSettings
+
+
+def train(
+    training: Training[Net, Batch],
+    checkpoint: Path | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+) -> tuple[Check, ...]:
+    """Train a net and return its checks; the net then has the weights of the best one.
+
+    A check also runs before the first step: training that makes the net worse changes nothing.
+
+    Args:
+        training: net, batches, loss, metric and settings.
+        checkpoint: written at every check; if the file exists, training resumes from it.
+        progress: receives a line at every check.
+
+    Raises:
+        InputError: the checkpoint is of another training.
+    """
+    net, settings = training.net, training.settings
+    optimizer = torch.optim.AdamW(net.parameters(), lr=settings.rate, weight_decay=settings.decay)
+    state = _State(mean=_copy_tensors(net.state_dict()))
+    if checkpoint is not None and checkpoint.is_file():
+        state = _read(checkpoint, net, optimizer, settings)
+        progress(f"resumes after step {state.step}")
+    else:
+        state = _check(training, state)
+    while state.step < settings.steps and not _has_settled(state, settings):
+        loss = _step(training, optimizer, state.step)
+        _blend(
+            state.mean, net.state_dict(), min(settings.memory, (1 + state.step) / (10 + state.step))
+        )
+        state = replace(state, step=state.step + 1, losses=(*state.losses, loss))
+        if state.step % settings.check_every == 0 or state.step == settings.steps:
+            state = _check(training, state)
+            last = state.checks[-1]
+            progress(
+                f"step {last.step} of {settings.steps}: loss {last.loss:.4f}, "
+                f"held-out score {last.score:.4f}"
+            )
+            if checkpoint is not None:
+                _write(checkpoint, net, optimizer, state, settings)
+    net.load_state_dict(state.best)
+    net.eval()
+    return state.checks
+
+
+def _step(training: Training[Net, Batch], optimizer: torch.optim.Optimizer, step: int) -> float:
+    settings = training.settings
+    planned = settings.planned or settings.steps
+    rising = min((step + 1) / max(WARM_UP * planned, 1.0), 1.0)
+    done = min(step / planned, 1.0)
+    falling = LAST_RATE + (1.0 - LAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done))
+    for group in optimizer.param_groups:
+        group["lr"] = settings.rate * rising * falling
+    batch = training.batch(np.random.default_rng([settings.seed, step]))
+    training.net.train()
+    device = next(training.net.parameters()).device.type
+    with torch.autocast(device, torch.bfloat16, enabled=settings.bfloat16):
+        loss = training.loss(training.net, batch)
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(training.net.parameters(), settings.clip)
+    optimizer.step()
+    return float(loss.detach())
+
+
+def _check(training: Training[Net, Batch], state: _State) -> _State:
+    """Return the state after one more check."""
+    mean = copy.deepcopy(training.net).eval()
+    mean.load_state_dict(state.mean)
+    score = training.score(mean)
+    best = max((check.score for check in state.checks), default=-math.inf)
+    loss = float(np.mean(state.losses)) if state.losses else math.nan
+    return replace(
+        state,
+        checks=(*state.checks, Check(state.step, loss, score)),
+        best=_copy_tensors(state.mean) if score > best else state.best,
+        losses=(),
+    )
+
+
+def _has_settled(state: _State, settings: TrainingSettings) -> bool:
+    scores = [check.score for check in state.checks]
+    return len(scores) - 1 - scores.index(max(scores)) >= settings.patience
+
+
+@torch.no_grad()
+def _blend(mean: Tensors, now: Tensors, kept: float) -> None:
+    """Move a running mean towards the current weights, in place; integers are copied."""
+    for name, value in now.items():
+        if value.is_floating_point():
+            mean[name].lerp_(value, 1.0 - kept)
+        else:
+            mean[name].copy_(value)
+
+
+def _copy_tensors(tensors: Tensors) -> Tensors:
+    return {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+
+
+def _write(
+    path: Path,
+    net: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    state: _State,
+    settings: TrainingSettings,
+) -> None:
+    """Write a checkpoint atomically."""
+    tensors = {f"net.{name}": value for name, value in _copy_tensors(net.state_dict()).items()}
+    tensors |= {f"mean.{name}": value for name, value in state.mean.items()}
+    tensors |= {f"best.{name}": value for name, value in _copy_tensors(state.best).items()}
+    for number, moments in optimizer.state_dict()["state"].items():
+        tensors |= {
+            f"moment.{number}.{name}": value for name, value in _copy_tensors(moments).items()
+        }
+    about = {
+        "settings": settings.model_dump_json(),
+        "step": str(state.step),
+        "checks": json.dumps([[c.step, c.loss, c.score] for c in state.checks]),
+    }
+    draft = path.with_suffix(".part")
+    draft.write_bytes(save(tensors, about))
+    draft.replace(path)
+
+
+def _read(
+    path: Path, net: nn.Module, optimizer: torch.optim.Optimizer, settings: TrainingSettings
+) -> _State:
+    """Restore weights and moments of a checkpoint in place, and return its state.
+
+    Raises:
+        InputError: the file is no checkpoint, or that of another training.
+    """
+
+    def refusal(found: str) -> InputError:
+        return InputError(
+            str(path),
+            expected="a checkpoint of this training",
+            found=found,
+            todo="Remove the file to train from the start, or use the settings of the checkpoint.",
+        )
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise refusal(f"a file that cannot be read ({error})") from error
+    if about.get("settings") != settings.model_dump_json():
+        raise refusal(f"settings {about.get('settings', 'of something else')}")
+    parts: dict[str, Tensors] = {"net": {}, "mean": {}, "best": {}, "moment": {}}
+    for name, value in tensors.items():
+        kind, _, rest = name.partition(".")
+        parts.setdefault(kind, {})[rest] = value
+    moments: dict[int, Tensors] = {}
+    for name, value in parts["moment"].items():
+        number, _, moment = name.partition(".")
+        moments.setdefault(int(number), {})[moment] = value
+    try:
+        net.load_state_dict(parts["net"])
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+        checks = tuple(Check(int(s), float(v), float(f)) for s, v, f in json.loads(about["checks"]))
+        return _State(parts["mean"], int(about["step"]), checks, parts["best"])
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise refusal(f"{type(error).__name__}: {error}") from error
+
+
+def people_score(net: PeopleNet, pictures: Pictures, cache: PictureCache) -> float:
+    """Return AP50 [1] of a detector."""
+    found = detect_labelled(BundledDetector(copy.deepcopy(net)), pictures, cache)
+    return score_people(found, pictures)[0]
+
+
+def keypoint_score(net: KeypointNet, pictures: Pictures, cache: PictureCache) -> float:
+    """Return the share of visible keypoints [1] that a pose estimator puts within 0.2 torsos."""
+    estimator = BundledPoseEstimator(copy.deepcopy(net))
+    return score_keypoints(estimator, pictures, cache, (MIN_HEIGHT, float("inf"))).pck
+
+
+def train_people_net(
+    net: PeopleNet,
+    learned: Pictures,
+    checked: Pictures,
+    cache: PictureCache,
+    settings: TrainingSettings,
+    *,
+    windows: PeopleWindows | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = lambda line: None,
+) -> tuple[Check, ...]:
+    """Train a detector in place; arguments and result are those of `loop.train`."""
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    cut = windows or PeopleWindows()
+    training = Training(
+        net,
+        lambda rng: people_batch(learned, cache, cut, rng),
+        people_loss,
+        lambda net: people_score(net, checked, cache),
+        settings,
+    )
+    return train(training, checkpoint, progress)
+
+
+def train_keypoint_net(
+    net: KeypointNet,
+    learned: Pictures,
+    checked: Pictures,
+    cache: PictureCache,
+    settings: TrainingSettings,
+    *,
+    crops: KeypointCrops | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = lambda line: None,
+) -> tuple[Check, ...]:
+    """Train a pose estimator in place; arguments and result are those of `loop.train`."""
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    cut, people = crops or KeypointCrops(), labelled_people(learned, MIN_HEIGHT)
+    training = Training(
+        net,
+        lambda rng: keypoint_batch(people, cache, cut, rng),
+        keypoint_loss,
+        lambda net: keypoint_score(net, checked, cache),
+        settings,
+    )
+    return train(training, checkpoint, progress)
+
 
 NET_METRICS: dict[NetKind, str] = {"people": "ap50", "keypoints": "pck"}
 """Metric of each net: AP50 of boxes, share of keypoints within 0.2 torsos."""

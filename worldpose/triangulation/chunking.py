@@ -20,7 +20,6 @@ from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
 from worldpose.triangulation.detections import CHUNK, ClipDetections, check_shapes
 from worldpose.triangulation.left_right_swaps import undo_swaps
-from worldpose.triangulation.motion_model import MotionModel, choose_stretches, learn_motion
 from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
 from worldpose.triangulation.robust import (
     DetectorModel,
@@ -30,7 +29,13 @@ from worldpose.triangulation.robust import (
     triangulate_joints,
 )
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import Smoothing, smooth_joints
+from worldpose.triangulation.smoothing import (
+    MotionModel,
+    Smoothing,
+    choose_stretches,
+    learn_motion,
+    smooth_joints,
+)
 
 MARGIN: Final = 2.0
 """Margin on either side for smoothing [s]: frames farther away move a joint by less than the step

@@ -1,8 +1,12 @@
-"""Folders of numbered images, with the interface of videos."""
+"""Folders of numbered images, with the interface of videos, and selected frames of either.
+
+PNG and JPEG images are decoded in memory, after a check of the size in their header.
+"""
 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -13,8 +17,54 @@ from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 from worldpose.video.frame_index import FrameIndex, index_frames
-from worldpose.video.images import decode_image
 from worldpose.video.reading import VideoReader
+
+HEADER_BYTES: Final = 1 << 20
+"""First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""
+MAX_PIXELS: Final = 200_000_000
+"""No camera takes larger images; a few hundred bytes can declare gigabytes."""
+
+
+def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[np.uint8] | None:
+    """Return an image (height, width, 3) RGB, or (height, width) grey.
+
+    Args:
+        content: (bytes,) of a PNG or JPEG file.
+        grey: without colour.
+
+    Returns:
+        None if the bytes are no whole image, or declare more than `MAX_PIXELS`.
+    """
+    import cv2  # late: it takes a fifth of a second, and few commands open an image
+
+    width, height = declared_size(content) or (0, 0)
+    if not 0 < width * height <= MAX_PIXELS:
+        return None
+    try:
+        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB)
+    except cv2.error:
+        return None
+    return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def declared_size(content: NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Return width and height [px] in the header of a PNG or JPEG file; None for other files."""
+    header = content[:HEADER_BYTES].tobytes()
+    if header[:8] == b"\x89PNG\r\n\x1a\n" and header[12:16] == b"IHDR" and len(header) >= 24:
+        width, height = struct.unpack(">II", header[16:24])
+        return width, height
+    place = 2 if header[:2] == b"\xff\xd8" else len(header)
+    while place + 9 <= len(header) and header[place] == 0xFF:
+        marker, length = struct.unpack(">BH", header[place + 1 : place + 4])
+        if marker == 0xFF:  # padding before a marker
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            height, width = struct.unpack(">HH", header[place + 5 : place + 9])
+            return width, height
+        else:
+            place += 2 + length
+    return None
+
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 _DIGITS: Final = 18
@@ -164,3 +214,38 @@ def open_video(path: Path, index: FrameIndex | None = None) -> VideoReader | Ima
 def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
     """Return an image as displayed, RGB or grey; None if the file is no image."""
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)
+
+
+WORTH: Final = 8
+"""Frames that a jump to a key frame must save: a restart costs about as many."""
+
+
+def some_pictures(
+    video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Yield selected frames in order; None where one cannot be decoded.
+
+    Args:
+        video: their source.
+        numbers: (pictures,) rising.
+    """
+    for group in jumps(numbers, video.index.key):
+        wanted = set(group.tolist())
+        for number, picture in video.readable(int(group[0]), int(group[-1]) + 1):
+            if number in wanted:
+                yield number, picture
+
+
+def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
+    """Return groups of frames, each decoded in one pass.
+
+    Args:
+        numbers: (pictures,) selected, rising.
+        key: (all pictures,) whether decoding can begin there.
+    """
+    if not len(numbers):
+        return []
+    keys = np.flatnonzero(key)
+    begin = keys[np.maximum(np.searchsorted(keys, numbers, side="right") - 1, 0)]
+    saved = begin[1:] - numbers[:-1] - 1
+    return np.split(numbers, np.flatnonzero(saved >= WORTH) + 1)

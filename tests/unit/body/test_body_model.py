@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worldpose.body import BodyParameters
-from worldpose.body.skeletons import JOINT_NAMES
+from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 

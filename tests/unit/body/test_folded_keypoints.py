@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worldpose.body import SKELETONS, BodyParameters, fold_keypoints, fold_regressor
-from worldpose.body.skeletons import JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
 from worldpose.errors import InputError
 
 # 0.02 mm is asked for; double precision at tens of metres gives 1e-11.

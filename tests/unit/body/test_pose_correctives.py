@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worldpose.body import BodyParameters
-from worldpose.body.skeletons import JOINT_NAMES, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_NAMES, VERTEX_OF_POINT
 
 
 def bent(**turns):

@@ -3,7 +3,7 @@ import pytest
 
 from data_contracts.conventions import COCO17
 from worldpose.body import BODY25, CHALLENGE15, EVALUATED14, SKELETONS, places_of
-from worldpose.body.skeletons import JOINT_NAMES, JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_NAMES, JOINT_OF_POINT, VERTEX_OF_POINT
 from worldpose.errors import InputError
 
 

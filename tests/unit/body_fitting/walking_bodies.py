@@ -4,7 +4,7 @@ import numpy as np
 
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.parameters import BODY_POSE
+from worldpose.body.model import BODY_POSE
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
 
 MODEL = load_open_body()

@@ -8,10 +8,10 @@ from worldpose.broadcast_calibration.shots import find_shots, grass_and_people
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import look_at
 from worldpose.simulation.renderer import render_broadcast
+from worldpose.simulation.scene import look_at
 from worldpose.video import VideoReader, index_frames, write_video
-from worldpose.video.cutting import cut_video
+from worldpose.video.writing import cut_video
 
 SIZE = np.array([320, 180])
 FPS = 10.0

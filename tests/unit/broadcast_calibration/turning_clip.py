@@ -10,7 +10,7 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 
 PITCH = PitchTemplate.standard()
 SIZE = (960, 540)

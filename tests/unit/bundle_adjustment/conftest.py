@@ -4,7 +4,7 @@ import pytest
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.geometry import Camera, Rigid
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 from worldpose.static_calibration import PARAMETERS, stepped
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from lab import ring
 
-from worldpose.bundle_adjustment.gauge import (
+from worldpose.bundle_adjustment.uncertainty import (
     Similarity,
     align_points,
     relative_covariance,

@@ -11,7 +11,7 @@ from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.formats import JointTracks, coco_dataset, write_coco, write_joints
 from worldpose.formats.camera_file import write_moving_camera, write_static_camera
 from worldpose.formats.challenge import challenge_truth, write_challenge, write_submission
-from worldpose.formats.pose_file import write_poses
+from worldpose.formats.joints_file import write_poses
 from worldpose.geometry import Camera, Rigid
 
 LENS = (0.05, 0.02, 0.004, -0.003, 0.03)

@@ -20,7 +20,7 @@ from worldpose.dataset.statistics import clip_statistics, data_set_statistics
 from worldpose.errors import InputError, UsageError
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.formats.challenge import write_submission
-from worldpose.formats.pose_file import write_poses
+from worldpose.formats.joints_file import write_poses
 from worldpose.geometry import Camera, Rigid
 from worldpose.reports.data_set import bin_edges, plot_statistics
 

@@ -7,7 +7,7 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
-from worldpose.detection.crowd import on_pitch
+from worldpose.detection.pipeline import on_pitch
 from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
 from worldpose.formats.calibration_files import build_camera
 from worldpose.geometry import Camera

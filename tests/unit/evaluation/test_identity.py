@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldpose.evaluation.identity import identity_scores
+from worldpose.evaluation.matching import identity_scores
 
 
 def scores(distances, gate=1.0):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worldpose.filtering.spread import LEAST, learn_spread
+from worldpose.filtering.judging import LEAST, learn_spread
 
 
 def test_the_spread_of_joints_and_confidences_is_found_among_wrong_ones():

@@ -8,16 +8,19 @@ from planted_errors import plant
 
 from data_contracts.conventions import COCO17
 from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
-from worldpose.filtering.residuals import Residuals
 from worldpose.filtering.systematic_errors import (
+    TERMS,
     ClockEquations,
     SystematicErrors,
+    ViewBias,
+    find_azimuths,
     learn_systematic_errors,
+    learn_view_bias,
     watch_motion,
 )
-from worldpose.filtering.view_bias import TERMS, ViewBias, find_azimuths, learn_view_bias
+from worldpose.filtering.views import Residuals
 from worldpose.geometry import Rigid
-from worldpose.simulation.occlusion import facing
+from worldpose.simulation.detector_errors import facing
 
 ROWS = 3000
 

@@ -5,7 +5,7 @@ import pytest
 
 from worldpose.body import BodyParameters
 from worldpose.errors import InputError
-from worldpose.formats.pose_file import read_poses, write_poses
+from worldpose.formats.joints_file import read_poses, write_poses
 
 
 @pytest.fixture

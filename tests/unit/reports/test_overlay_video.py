@@ -9,7 +9,7 @@ from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.overlay_video import overlay_frames
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 
 SIZE = (322, 182)
 

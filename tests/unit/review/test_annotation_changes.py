@@ -7,7 +7,7 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.formats.annotations import AnnotatedImage, AnnotatedPerson
-from worldpose.review.annotation_changes import find_changes, image_name
+from worldpose.review.detections import find_changes, image_name
 
 NAME = image_name("cam_03", 120)
 

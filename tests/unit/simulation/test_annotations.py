@@ -6,7 +6,7 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, CalibrationErrors
 from worldpose.simulation.annotations import BORDER, PIVOT, add_calibration_errors, click, every
-from worldpose.simulation.cameras import look_at, place_camera
+from worldpose.simulation.scene import look_at, place_camera
 from worldpose.simulation.settings import ClickSettings
 
 PITCH = PitchTemplate.standard()

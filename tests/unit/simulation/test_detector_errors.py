@@ -10,15 +10,17 @@ from worldpose.simulation.detector_errors import (
     DIFFICULTY,
     MAX_FALSE_POSITIVES,
     MIRRORED,
+    Bodies,
     Detections,
     SystematicErrors,
     detect,
     draw_false_positives,
     draw_systematic_errors,
+    facing,
     perceived_bias,
+    project_bodies,
     report,
 )
-from worldpose.simulation.occlusion import Bodies, facing, project_bodies
 
 FPS = 25.0
 FRAMES = 2000

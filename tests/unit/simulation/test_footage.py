@@ -9,11 +9,11 @@ from worldpose.geometry import Camera
 from worldpose.ingest import read_match
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.simulation.cameras import look_at
 from worldpose.simulation.cast import dress_people, place_bystanders
-from worldpose.simulation.footage import open_view, render_frame
 from worldpose.simulation.image_formation import cluster_boxes
 from worldpose.simulation.mannequins import open_mannequin, pose_people, shape_people
+from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.scene import look_at
 from worldpose.simulation.settings import RenderingSettings
 
 PITCH = PitchTemplate.standard()

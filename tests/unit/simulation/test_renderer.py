@@ -10,16 +10,16 @@ from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import RigSettings
-from worldpose.simulation.cameras import look_at, place_camera
 from worldpose.simulation.cast import dress_people, goals
-from worldpose.simulation.footage import open_view, render_frame
 from worldpose.simulation.image_formation import Moment
+from worldpose.simulation.matches import open_view, render_frame
 from worldpose.simulation.renderer import (
     RenderingSettings,
     film_broadcast,
     render_broadcast,
     render_pitch,
 )
+from worldpose.simulation.scene import look_at, place_camera
 from worldpose.simulation.surroundings import BOARD_HEIGHT, BOARD_SETBACK, scenery
 from worldpose.simulation.venues import build_venue
 

@@ -3,7 +3,7 @@ import pytest
 
 from data_contracts.conventions import COCO17
 from worldpose.body import OPEN_BODY, SKELETONS, BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.skeletons import JOINT_NAMES
+from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.formats import read_joints
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match

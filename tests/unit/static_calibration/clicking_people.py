@@ -7,8 +7,8 @@ import numpy as np
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import place_camera
 
 SIZE = (1920, 1080)
 PITCH = PitchTemplate.standard()

@@ -8,9 +8,9 @@ from scipy.stats import chi2
 from data_contracts.pitch import PitchSpec
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.annotations import click, survey
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.simulation.cameras import place_camera
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 from worldpose.static_calibration.adjustment import build_problem, camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, fit_with_curvature

@@ -8,7 +8,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import look_at
+from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.initialization import (
     camera_from_homography,

@@ -10,8 +10,8 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.cameras import look_at
 from worldpose.simulation.renderer import render_pitch
+from worldpose.simulation.scene import look_at
 from worldpose.simulation.settings import RenderingSettings
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_on_lines

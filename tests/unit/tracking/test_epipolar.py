@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from worldpose.tracking import TrackingSettings
-from worldpose.tracking.epipolar import associate, footprints, pair_distances
-from worldpose.tracking.limbs import has_adult_size
+from worldpose.tracking.epipolar import associate, footprints, has_adult_size, pair_distances
 
 SETTINGS = TrackingSettings(pair_evidence=0.0)
 ANYWHERE = np.array([[0.0, 0.0, np.inf]] * 2)

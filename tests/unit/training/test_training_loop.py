@@ -7,7 +7,7 @@ from torch import nn
 
 from worldpose.errors import InputError
 from worldpose.training import TrainingSettings
-from worldpose.training.training_loop import Training, train
+from worldpose.training.fine_tuning import Training, train
 
 SETTINGS = TrainingSettings(steps=12, check_every=4, rate=0.05, seed=3)
 

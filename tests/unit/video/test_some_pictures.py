@@ -4,7 +4,7 @@ import numpy as np
 from test_broken_videos import encode, number_of
 
 from worldpose.video import open_video
-from worldpose.video.some import jumps, some_pictures
+from worldpose.video.folder import jumps, some_pictures
 
 
 def groups(numbers, keys, count=100):

@@ -1,7 +1,7 @@
 """Exchange of detections with external annotation tools.
 
 Inputs and outputs: `AnnotatedImage`s; COCO keypoints JSON, CVAT for images XML 1.1 or Label Studio
-JSON. `worldpose.review.annotation_changes` finds an annotator's changes.
+JSON. `worldpose.review.detections` finds an annotator's changes.
 """
 
 from __future__ import annotations

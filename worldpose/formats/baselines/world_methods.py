@@ -29,7 +29,7 @@ from worldpose.formats.baselines.result import (
     project_boxes,
     rotation_vectors,
 )
-from worldpose.formats.pose_file import read_poses
+from worldpose.formats.joints_file import read_poses
 
 
 def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:

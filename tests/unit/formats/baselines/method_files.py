@@ -340,7 +340,7 @@ def write_prompthmr(folder, bodies, camera):
 
 
 def write_smpl(folder, bodies, camera):
-    from worldpose.formats.pose_file import write_poses
+    from worldpose.formats.joints_file import write_poses
 
     path = folder / "poses.npz"
     write_poses(path, y_up(bodies), model.name)
