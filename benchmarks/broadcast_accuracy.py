@@ -33,7 +33,7 @@ from worldpose.broadcast_calibration import (
 )
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
 from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.priors import roughness
+from worldpose.broadcast_calibration.priors import second_differences
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.formats import read_camera, read_joints
 from worldpose.geometry import Rigid
@@ -171,7 +171,8 @@ def main() -> None:
                 print(
                     "  {} {:.3f} px before, {:.3f} after".format(name, *getattr(found.report, name))
                 )
-            rough = "  ".join(f"{value:.3g}" for value in roughness(found.camera)[3:6])
+            spreads = np.sqrt((second_differences(found.camera) ** 2).mean(axis=0))
+            rough = "  ".join(f"{value:.3g}" for value in spreads[3:6])
             print(f"  rough    {rough}", flush=True)
             for name, shares in distances(found.camera, found.uncertainty, true, joints).items():
                 told.setdefault(name, []).append(shares)

@@ -13,10 +13,11 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
 
+import numpy as np
 import torch
 from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
@@ -24,12 +25,12 @@ from worldpose.detection import DetectionSettings
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.detection.bundled_pose import BundledPoseEstimator
+from worldpose.geometry.boxes import box_iou
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.metrics import (
     HEIGHTS,
     detect_labelled,
-    ignore_crowded,
     score_keypoints,
     score_people,
 )
@@ -44,6 +45,24 @@ SCENES: Final = {
     "held_out": (HELD_OUT, 10, 4, 2),
 }
 """Kind, scenes, views of each and moments of each view."""
+
+
+def ignore_crowded(
+    pictures: Sequence[LabelledPicture], share: float = 0.3
+) -> list[LabelledPicture]:
+    """Return the images with people ignored whose box overlaps another's more than `share`.
+
+    Args:
+        pictures: with the truth.
+        share: intersection over union of two people's boxes [1].
+    """
+    kept = []
+    for picture in pictures:
+        common = box_iou(picture.boxes, picture.boxes)
+        np.fill_diagonal(common, 0.0)
+        crowded = (common > share).any(axis=1)
+        kept.append(replace(picture, ignored=picture.ignored | crowded))
+    return kept
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 from collections import Counter
 from datetime import timedelta
 
-from worldpose.store import Store, compare_stores, verify
+from store_comparison import compare_stores
+
+from worldpose.store import Store, verify
 from worldpose.store.garbage import collect, plan_gc
 
 

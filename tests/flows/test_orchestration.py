@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 from command_line import TINY, succeed, worldpose
+from store_comparison import compare_stores
 
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, authorization
-from worldpose.store import Store, compare_stores
+from worldpose.store import Store
 
 LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))
 

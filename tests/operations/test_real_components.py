@@ -8,6 +8,7 @@ import uuid
 
 import pytest
 from command_line import TINY, succeed
+from store_comparison import compare_stores
 
 from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
@@ -17,7 +18,7 @@ from flows.orchestration.prefect_environment import (
 )
 from flows.service.plan import ServePlan
 from flows.service.serving import answers
-from worldpose.store import Store, compare_stores, verify
+from worldpose.store import Store, verify
 
 LOGIN = new_login()
 START_SECONDS = 300

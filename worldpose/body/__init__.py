@@ -24,7 +24,6 @@ from worldpose.body.keypoints import (
     FoldedKeypoints,
     fold_keypoints,
     fold_regressor,
-    places_of,
 )
 from worldpose.body.model import BodyModel, BodyParameters
 
@@ -46,6 +45,5 @@ __all__ = [
     "install_body",
     "load_body",
     "load_open_body",
-    "places_of",
     "save_body",
 ]

@@ -145,23 +145,6 @@ SKELETONS: Final = MappingProxyType(
 """The sets by name."""
 
 
-def places_of(points: tuple[str, ...], skeleton: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the index of each of `points` in `skeleton` (points,).
-
-    Raises:
-        InputError: the skeleton lacks a point.
-    """
-    lacking = [point for point in points if point not in skeleton]
-    if lacking:
-        raise InputError(
-            "skeleton",
-            expected=f"the points {', '.join(points)}",
-            found=f"none named {', '.join(lacking)}",
-            todo="Take the points from a skeleton that has them, such as body25.",
-        )
-    return np.array([skeleton.index(point) for point in points], dtype=np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class FoldedKeypoints:
     """Keypoints of one body model, precomputed for many poses."""

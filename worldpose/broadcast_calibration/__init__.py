@@ -11,7 +11,6 @@ from worldpose.broadcast_calibration.calibration import (
     broadcast_attributes,
     calibrate_broadcast,
     camera_before,
-    follow_given_lens,
     moving_arrays,
     moving_from_arrays,
 )
@@ -40,7 +39,6 @@ __all__ = [
     "camera_before",
     "drawn_to",
     "estimate_feed_offset",
-    "follow_given_lens",
     "moving_arrays",
     "moving_from_arrays",
     "pool_centers",

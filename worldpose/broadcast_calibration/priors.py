@@ -217,8 +217,3 @@ def estimate_flow_share(
         gaps = np.diff(key_frames)[np.isfinite(links.drift)]
         drift = float(np.sqrt(np.mean(found**2 / gaps)))
     return float(min(1.0, (independent / max(drift, 1e-6)) ** 2))
-
-
-def roughness(camera: MovingCamera) -> Floats:
-    """Return root mean square second differences (7,) of a solution."""
-    return np.asarray(np.sqrt((second_differences(camera) ** 2).mean(axis=0)))

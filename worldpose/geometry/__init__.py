@@ -10,7 +10,6 @@ from worldpose.geometry.rays import (
     RayStatus,
     distance_to_rays,
     intersect_rays,
-    ray_to_ray_distance,
 )
 from worldpose.geometry.rigid import Rigid, nearest_rotation
 
@@ -24,5 +23,4 @@ __all__ = [
     "fold_radius",
     "intersect_rays",
     "nearest_rotation",
-    "ray_to_ray_distance",
 ]

@@ -86,30 +86,6 @@ def distance_to_rays(points: ArrayLike, rays: Rays) -> NDArray[np.float64]:
     return distance
 
 
-def ray_to_ray_distance(a: Rays, b: Rays) -> NDArray[np.float64]:
-    """Return the least distance between the points of two rays.
-
-    Args:
-        a: (...) rays.
-        b: (...) rays; the batches broadcast.
-
-    Returns:
-        (...) [m]; NaN where a ray is missing.
-    """
-    offset = b.origins - a.origins
-    normal = np.cross(a.directions, b.directions)
-    sine = np.linalg.norm(normal, axis=-1)
-    # The common perpendicular counts when its feet lie on both rays; else the nearest pair holds
-    # an origin, which is exact for parallel rays too. Below an angle of sqrt(epsilon) the
-    # rounding of the perpendicular, about epsilon |offset| / angle, exceeds what is lost.
-    along_a = np.einsum("...i,...i->...", np.cross(offset, b.directions), normal)
-    along_b = np.einsum("...i,...i->...", np.cross(offset, a.directions), normal)
-    apart = sine > np.sqrt(np.finfo(np.float64).eps)
-    gap = np.abs(np.einsum("...i,...i->...", offset, normal)) / np.where(apart, sine, 1.0)
-    at_origins = np.minimum(distance_to_rays(b.origins, a), distance_to_rays(a.origins, b))
-    return np.where(apart & (along_a >= 0.0) & (along_b >= 0.0), gap, at_origins)
-
-
 def intersect_rays(
     rays: Rays, weights: ArrayLike | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -4,7 +4,6 @@ Input: arrays that match a layout of `data_contracts`, and the recipe that they 
 Output: labelled arrays, the runs that used them, and the reasons for differences between results.
 """
 
-from worldpose.store.comparison import compare_stores
 from worldpose.store.garbage import Garbage, GcPlan, collect, plan_gc
 from worldpose.store.integrity import Finding, repair, verify
 from worldpose.store.paths import ResultId
@@ -31,7 +30,6 @@ __all__ = [
     "Store",
     "code_version",
     "collect",
-    "compare_stores",
     "explain_difference",
     "libraries",
     "list_pins",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -85,24 +85,6 @@ def stored_people(
     found = find_poses(estimator, picture, people, chosen)
     distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
     return People.from_detections(distinct)
-
-
-def ignore_crowded(
-    pictures: Sequence[LabelledPicture], share: float = 0.3
-) -> list[LabelledPicture]:
-    """Return the images with people ignored whose box overlaps another's more than `share`.
-
-    Args:
-        pictures: with the truth.
-        share: intersection over union of two people's boxes [1].
-    """
-    kept = []
-    for picture in pictures:
-        common = box_iou(picture.boxes, picture.boxes)
-        np.fill_diagonal(common, 0.0)
-        crowded = (common > share).any(axis=1)
-        kept.append(replace(picture, ignored=picture.ignored | crowded))
-    return kept
 
 
 def score_keypoints(

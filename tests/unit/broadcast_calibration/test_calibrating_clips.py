@@ -1,7 +1,5 @@
 """Whole clips of rendered pictures: every frame's camera against the true one."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import turning_clip as clip
@@ -19,7 +17,6 @@ from worldpose.broadcast_calibration import (
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
-    follow_given_lens,
     moving_from_arrays,
 )
 from worldpose.errors import InputError
@@ -283,27 +280,3 @@ def test_a_cut_is_found_and_refused(true, pictures):
         calibrate_broadcast(
             clip.PITCH, BroadcastClip([clicks(true, 2)], lambda: iter(cut), FPS), SETTINGS
         )
-
-
-@pytest.mark.parametrize("lines", [False, True])
-def test_a_known_lens_needs_one_rotation(true, pictures, lines):
-    start = replace(true, rotation=np.repeat(true.rotation[:1], FRAMES, axis=0))
-    found, uncertainty = follow_given_lens(
-        start,
-        lambda: iter(pictures),
-        pitch=clip.PITCH if lines else None,
-        settings=SETTINGS,
-    )
-    np.testing.assert_array_equal(found.focal, true.focal)
-    np.testing.assert_allclose(found.rotation[0], true.rotation[0], atol=1e-12)
-    # 15 steps of hundredths of a pixel; with lines no steps add up.
-    assert np.percentile(place_errors(found, true), 95.0) < (0.3 if lines else 1.5)
-    spread = np.sqrt(np.trace(uncertainty.frame[:, :3, :3], axis1=1, axis2=2))
-    assert spread[1] > 0.0 and np.isfinite(spread).all()
-    # What was given is exact.
-    assert not uncertainty.frame[0].any() and not uncertainty.frame[:, 3:].any()
-
-
-def test_a_lens_of_other_frames_is_refused(true, pictures):
-    with pytest.raises(InputError, match="16 frames"):
-        follow_given_lens(true, lambda: iter(pictures[:9]), settings=SETTINGS)

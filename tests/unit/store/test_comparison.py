@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from store_comparison import compare_stores
 from store_samples import (
     place,
     publish,
@@ -12,7 +13,7 @@ from store_samples import (
     sample_registration,
 )
 
-from worldpose.store import ResultId, Store, compare_stores
+from worldpose.store import ResultId, Store
 
 
 def filled(store: Store, folder: str) -> Store:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from store_comparison import compare_stores
 from store_samples import (
     FRAMES,
     place,
@@ -21,7 +22,7 @@ from store_samples import (
     sample_arrays,
 )
 
-from worldpose.store import ResultId, Store, collect, compare_stores, plan_gc, verify
+from worldpose.store import ResultId, Store, collect, plan_gc, verify
 from worldpose.store.blobs import COMMIT_POINTS, LocalBlobs, install_fault_hook, pass_commit_point
 from worldpose.store.objects import ObjectBlobs
 from worldpose.store.runs import may_be_running
