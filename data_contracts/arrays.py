@@ -36,7 +36,7 @@ class ClipArray(Protocol):
 Missing = Literal["nan", "-1", "0", "none"]
 
 CHUNK_BYTES = 1 << 20
-"""Least size of a full chunk before compression: smaller ones halve the throughput."""
+"""Minimum size of a full chunk before compression [byte]: smaller chunks halve the throughput."""
 
 
 class ArrayLayout(Record):
@@ -50,7 +50,7 @@ class ArrayLayout(Record):
     """m, px, rad, s, m^2, frame, or 1 for a pure number."""
     missing: Missing
     about: str
-    """What the numbers are, with their frame of reference."""
+    """Meaning of the numbers, with their coordinate frame."""
     chunk_dim: str | None = None
     """The dimension that is cut into chunks of at least `CHUNK_BYTES`; None = one chunk."""
 
@@ -65,7 +65,7 @@ class ArrayLayout(Record):
         return (*whole[:axis], min(whole[axis], rows), *whole[axis + 1 :])
 
     def attributes(self) -> dict[str, Any]:
-        """Attributes stored beside the array."""
+        """Attributes stored with the array."""
         return {"unit": self.unit, "missing": self.missing, "about": self.about}
 
 
@@ -81,7 +81,7 @@ class GroupLayout(Record):
     labels: dict[str, tuple[str, ...]] = {}
     """Dimensions with fixed names, such as joint = COCO-17."""
     attributes: dict[str, str] = {}
-    """Group attributes that a writer must give, and what each says."""
+    """Group attributes that a writer must give, with their meaning."""
     optional: tuple[str, ...] = ()
     """Names of arrays that may be absent."""
 

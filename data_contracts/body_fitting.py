@@ -22,7 +22,7 @@ def _pose_array(name: str, length: str, unit: str, about: str) -> ArrayLayout:
 
 BODY_FITTING = GroupLayout(
     stage="body_fitting",
-    about="Shape, pose, orientation and place of every person's body model.",
+    about="Shape, pose, orientation and translation of every person's body model.",
     coordinates=(FRAME, PERSON),
     arrays=(
         ArrayLayout(
@@ -59,8 +59,8 @@ BODY_FITTING = GroupLayout(
             dtype="float64",
             unit="m^2",
             missing="nan",
-            about="covariance of `joints`: poses, the detector's offsets, each person's own, and "
-            "what all views err in common",
+            about="covariance of `joints`: from poses, the detector's offsets, individual offsets "
+            "and the bias that all views share",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -69,7 +69,7 @@ BODY_FITTING = GroupLayout(
             dtype="bool",
             unit="1",
             missing="none",
-            about="a body in a frame without any joint of the person: filled by motion",
+            about="the frame has no joint of the person; the motion model filled the body",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -78,7 +78,7 @@ BODY_FITTING = GroupLayout(
             dtype="bool",
             unit="1",
             missing="none",
-            about="a body that pictures of one camera had a say in",
+            about="a monocular estimate contributed to the body",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -87,7 +87,7 @@ BODY_FITTING = GroupLayout(
             dtype="float64",
             unit="m",
             missing="none",
-            about="from a joint to what the detector takes for it, the same for everybody",
+            about="offset from the body's joint to the detector's joint, the same for all persons",
         ),
     ),
     labels={

@@ -1,4 +1,4 @@
-"""What people click in a clip's key frames, and the result of stage `broadcast_calibration`."""
+"""Clicks in the key frames of a clip, and the result of stage `broadcast_calibration`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from data_contracts.static_calibration import ClickedMarkings
 
 
 class KeyFrame(Record):
-    """One picked frame of a clip."""
+    """Clicks in one frame of a broadcast clip."""
 
     frame: int = Field(ge=0, le=FRAME_LIMIT)
     """Number in the video, from 0."""
     markings: ClickedMarkings
-    """Points and drawn markings of its picture."""
+    """Points and drawn markings in its image."""
 
 
 class KeyFrames(Record):
-    """annotations/broadcast_calibration/<clip>.json: everything clicked in one clip (M2)."""
+    """annotations/broadcast_calibration/<clip>.json: all clicks of one clip (M2)."""
 
     contract: Literal[1] = CONTRACT_VERSION
     key_frames: tuple[KeyFrame, ...] = Field(min_length=1)
@@ -38,8 +38,8 @@ CLIP_STEP = ("x", "y", "z", "cx", "cy")
 """A small change of what all frames share: center, world [m], and principal point [px]."""
 
 FRAME_STATUS = ("missing", "bridged", "followed", "players", "lines", "key_frame")
-"""What a frame's camera rests on, the best of it: nothing, and there is no camera; neighbouring
-frames alone; motion of the background; players; painted lines found in the picture; clicks."""
+"""Best evidence for a frame's camera: none (there is no camera), neighbouring frames alone, motion
+of the background, players, painted lines detected in the image, or clicks."""
 
 
 def _by_frame(
@@ -62,11 +62,11 @@ def _counted(name: str, about: str) -> ArrayLayout:
     )
 
 
-_BEFORE = "the same before players and all frames together: each frame on its painted lines"
+_BEFORE = "the same before the joint fit with players: each frame from its painted lines alone"
 
 BROADCAST_CALIBRATION = GroupLayout(
     stage="broadcast_calibration",
-    about="The broadcast camera in every frame of a clip, how well it is known and why.",
+    about="The broadcast camera in every frame of a clip, with covariance and evidence.",
     coordinates=(FRAME,),
     arrays=(
         _by_frame("focal", ("axis",), "px", "focal lengths fx, fy"),
@@ -88,7 +88,7 @@ BROADCAST_CALIBRATION = GroupLayout(
             dtype="float64",
             unit="m",
             missing="none",
-            about="the camera's place, world, one for the clip",
+            about="the camera's center, world, one for the clip",
         ),
         _by_frame(
             "covariance",
@@ -122,20 +122,24 @@ BROADCAST_CALIBRATION = GroupLayout(
             dtype="uint8",
             unit="1",
             missing="0",
-            about="what the frame's camera rests on, a number of the attribute `status_names`",
+            about="evidence for the frame's camera, an index into the attribute `status_names`",
         ),
         _by_frame(
             "reprojection_error",
             (),
             "px",
-            "expected error of where a player stands in the picture, root mean square over the "
-            "seen pitch",
+            "expected image error of a player's position, root mean square over the visible pitch",
         ),
-        _by_frame("marking_rms", (), "px", "of painted lines found, across them"),
-        _by_frame("player_rms", (), "px", "of the keypoints of matched players"),
-        _counted("marking_count", "samples of painted lines that the frame rests on"),
-        _counted("player_count", "players matched with people of the static cameras"),
-        _counted("flow_count", "points followed from this frame to the next"),
+        _by_frame(
+            "marking_rms",
+            (),
+            "px",
+            "rms distance of detected painted lines, across them",
+        ),
+        _by_frame("player_rms", (), "px", "rms residual of the keypoints of matched players"),
+        _counted("marking_count", "samples of painted lines used in the frame"),
+        _counted("player_count", "players matched with people from the static cameras"),
+        _counted("flow_count", "points tracked from this frame to the next"),
     ),
     labels={
         **CAMERA_LABELS,
@@ -147,18 +151,18 @@ BROADCAST_CALIBRATION = GroupLayout(
     attributes={
         "clip_id": "clip of the match",
         "status_names": "meanings of `status`",
-        "key_frames": "frames that were clicked and used, as the clip's video numbers them, from 0",
-        "refused_key_frames": "frames clicked that could not be used, numbered alike, and why",
-        "weights": "weights and noise of the terms, and the rule that each follows",
-        "feed_offset": "the clip's frame t shows what static cameras show at t + `frames`, with "
-        "its standard error [frame], from so many pairs; `frames` is null where it cannot be "
-        "told, all of it where there are no people",
-        "drift": "by how much tracking from one key frame missed the next [px], by gap",
-        "pick_next": "frames whose clicks would help most, numbered alike, the best first",
-        "markings_off": "median distance of painted lines from their projection [px], before "
-        "players and all frames together and after",
-        "players_off": "the same of people, by the mean over a person's keypoints",
-        "decisions": "what was chosen, and the figures that decided",
-        "reasons": "why a person must look at it; empty where nobody must",
+        "key_frames": "clicked frames that were used, by their number in the clip's video, from 0",
+        "refused_key_frames": "clicked frames that could not be used, with the reason",
+        "weights": "weights and noise of the loss terms, with the rule of each",
+        "feed_offset": "frame t of the clip shows the moment t + `frames` of the static cameras, "
+        "with standard error [frame] and number of pairs; `frames` is null if undetermined, the "
+        "whole entry is null without people",
+        "drift": "error of tracking from one key frame at the next one [px], by gap",
+        "pick_next": "frames whose clicks would reduce the error most, the best first",
+        "markings_off": "median distance of painted lines from their projection [px], before and "
+        "after the joint fit with players",
+        "players_off": "the same for people, by the mean over a person's keypoints",
+        "decisions": "choices made, with the metrics that decided",
+        "reasons": "reasons for a manual review; empty if none is needed",
     },
 )

@@ -1,4 +1,4 @@
-"""Result of stage `broadcast_pooling`: the cameras of `broadcast_calibration`, of one place."""
+"""Result of stage `broadcast_pooling`: the broadcast cameras with one common center."""
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION
@@ -10,15 +10,14 @@ _CAMERA = (
 
 BROADCAST_POOLING = GroupLayout(
     stage="broadcast_pooling",
-    about="A clip's broadcast camera at the place that it has in all clips of the match.",
+    about="The broadcast camera of a clip, with the center that all clips of the match share.",
     coordinates=BROADCAST_CALIBRATION.coordinates,
     arrays=tuple(BROADCAST_CALIBRATION.layout(name) for name in _CAMERA),
     labels=BROADCAST_CALIBRATION.labels,
     attributes={
         "clip_id": "clip of the match",
-        "clips": "clips of the same camera, this one among them",
-        "distance": "how far each of them is from the place they have in common [standard "
-        "deviations]",
-        "agree": "whether one place explains all of them; else the camera is as it was",
+        "clips": "clips of the same camera, including this one",
+        "distance": "distance of each clip's own center from the common one [standard deviations]",
+        "agree": "whether one center explains all clips; otherwise the camera is unchanged",
     },
 )

@@ -28,9 +28,8 @@ _ACCEPTANCE = (
         dtype="float64",
         unit="1",
         missing="none",
-        about="covariance of a step of each camera, in the units of its parameters; all zero for "
-        "a given camera whose change was refused, and relative to all cameras together where all "
-        "are given",
+        about="covariance of a step of each camera, in the units of its parameters; zero for a "
+        "given camera whose change was refused; relative to the rig if all cameras are given",
     ),
     ArrayLayout(
         name="accepted",
@@ -38,7 +37,7 @@ _ACCEPTANCE = (
         dtype="bool",
         unit="1",
         missing="none",
-        about="was the camera changed; else it is as `static_calibration` has it",
+        about="the adjusted camera was accepted; otherwise it is that of `static_calibration`",
     ),
     *(
         ArrayLayout(
@@ -61,7 +60,7 @@ _ACCEPTANCE = (
         dtype="int64",
         unit="1",
         missing="0",
-        about="keypoints of left-out people that judged the camera",
+        about="keypoints of held-out people that validated the camera",
     ),
     _of_cameras("held_out_loss", "side", "1", "nan", "mean loss of these keypoints, which decides"),
     _of_cameras("held_out_error", "side", "px", "nan", "median error of these keypoints"),
@@ -70,14 +69,14 @@ _ACCEPTANCE = (
         "side",
         "px",
         "nan",
-        "root mean square error per axis of the clicked points that calibration rests on",
+        "root mean square error per axis of the clicked points that calibration uses",
     ),
     _of_cameras(
         "weak_step",
         "parameter",
         "1",
         "none",
-        "one standard deviation along the direction in which the camera is known least",
+        "one standard deviation along the least certain direction of the camera",
     ),
 )
 _REVIEW = (
@@ -88,13 +87,13 @@ _REVIEW = (
             dtype="int64",
             unit="frame" if name == "frame" else "1",
             missing="-1" if name == "joint" else "none",
-            about=f"{about} of a keypoint that disagrees, the most surprising first",
+            about=f"{about} of an outlier keypoint, the largest Mahalanobis distance first",
         )
         for name, about in (
             ("frame", "match frame"),
-            ("camera", "place among the cameras"),
+            ("camera", "index of the camera"),
             ("person", "person id"),
-            ("joint", "joint, missing where most of the person in this picture is off,"),
+            ("joint", "joint, missing if most joints of the person in this image are outliers,"),
         )
     ),
     ArrayLayout(
@@ -103,7 +102,7 @@ _REVIEW = (
         dtype="float64",
         unit="1",
         missing="none",
-        about="its distance to where the other cameras put it, in standard deviations",
+        about="its Mahalanobis distance to the position from the other cameras",
     ),
     ArrayLayout(
         name="click_camera",
@@ -111,7 +110,7 @@ _REVIEW = (
         dtype="int64",
         unit="1",
         missing="none",
-        about="place among the cameras of a clicked point, the most surprising first",
+        about="camera index of a clicked point, the largest Mahalanobis distance first",
     ),
     ArrayLayout(
         name="click_residual",
@@ -119,7 +118,7 @@ _REVIEW = (
         dtype="float64",
         unit="px",
         missing="nan",
-        about="projected minus clicked, after adjustment; missing where the camera cannot image it",
+        about="projected minus clicked, after adjustment; missing if the camera cannot image it",
     ),
     ArrayLayout(
         name="click_surprise",
@@ -127,8 +126,8 @@ _REVIEW = (
         dtype="float64",
         unit="1",
         missing="nan",
-        about="residual in standard deviations of what everything else predicts; missing where the "
-        "camera cannot image it",
+        about="Mahalanobis distance of the residual, given all other evidence; missing if the "
+        "camera cannot image the point",
     ),
     ArrayLayout(
         name="click_wrong",
@@ -136,13 +135,13 @@ _REVIEW = (
         dtype="bool",
         unit="1",
         missing="none",
-        about="is it proposed for removal; a person decides",
+        about="proposed for removal; a person decides",
     ),
 )
 
 BUNDLE_ADJUSTMENT = GroupLayout(
     stage="bundle_adjustment",
-    about="All static cameras of a match, adjusted to its people and markings.",
+    about="All static cameras of the match, adjusted to its people and markings.",
     arrays=(*_CAMERAS, *_ACCEPTANCE, *_REVIEW),
     labels={
         **CAMERA_LABELS,
@@ -152,18 +151,18 @@ BUNDLE_ADJUSTMENT = GroupLayout(
     },
     attributes={
         "camera": "camera ids in the order of the camera dimension",
-        "reasons": "why each camera was changed or not",
-        "held_out_gain": "part of their loss that the change spares left-out people",
+        "reasons": "why each camera's change was accepted or refused",
+        "held_out_gain": "relative decrease of the loss of held-out people",
         "held_out_significance": "the same in standard errors",
-        "people_shift": "distance by which left-out people moved together [m]",
+        "people_shift": "common displacement of held-out people [m]",
         "weak": "parameters that make up each camera's weakest direction",
-        "proposed_frames": "match frames that suit adjustment best",
-        "used_frames": "match frames that people were taken from",
-        "judged_frames": "match frames in which left-out people judged",
-        "noise_scale": "factor on the stated noise of keypoints that they show",
-        "noise_correlation": "keypoints that are worth one independent one",
-        "outliers_found": "keypoints and people that disagree, also beyond the list",
+        "proposed_frames": "match frames with the most information for the adjustment",
+        "used_frames": "match frames whose people are used",
+        "judged_frames": "match frames whose held-out people validated",
+        "noise_scale": "factor from the stated to the observed noise of keypoints",
+        "noise_correlation": "number of keypoints with the information of one independent keypoint",
+        "outliers_found": "number of outlier keypoints and people, including those not listed",
         "click": "names of the clicked points",
-        "click_problem": "for each clicked point that its camera cannot image, why; else empty",
+        "click_problem": "why the camera cannot image a clicked point; otherwise empty",
     },
 )

@@ -19,7 +19,7 @@ FaultKind = Literal[
     "pose",
     "contradiction",
 ]
-"""What is wrong: a pose turned by 180 degrees about the world's z axis, a pose or image mirrored,
+"""Kind of fault: a pose turned by 180 degrees about the world's z axis, a pose or image mirrored,
 the focal length, the distortion, the clock, the frame rate, another camera's video, the same video
 as another camera's, a pose in other units or conventions, or two cameras that contradict each
 other."""
@@ -31,21 +31,21 @@ class CameraFault(Record):
     camera: Name
     kind: FaultKind
     reason: str
-    """What is wrong and what to do, as a sentence about this camera."""
+    """The fault and its remedy, as a sentence about this camera."""
     value: Number | None = None
-    """Stated over right focal length, frames to add to its offset, or right over stated frame
-    rate; None for the other kinds."""
+    """Stated over true focal length, frames to add to its offset, or true over stated frame rate;
+    None for the other kinds."""
     other: Name | None = None
     """The other camera of a swap, duplicate or contradiction."""
     share_now: Share
     """Share of its detections that agree with other cameras as stated [1]."""
     share_corrected: Share | None
-    """The same with the fault corrected; None where no correction is known."""
+    """The same with the fault corrected; None if no correction is known."""
 
 
 CAMERA_CONSISTENCY = GroupLayout(
     stage="camera_consistency",
-    about="How static cameras agree on the people of a clip.",
+    about="Agreement of the static cameras on the people of the clip.",
     arrays=(
         ArrayLayout(
             name="agreement",
@@ -59,8 +59,8 @@ CAMERA_CONSISTENCY = GroupLayout(
     attributes={
         "camera": "camera ids in the order of the camera dimensions",
         "faults": "a `camera_fault` record for each camera that contradicts the others",
-        "left_out": "ids of cameras that later stages do without",
+        "left_out": "ids of cameras that later stages leave out",
         "confirmed": "ids of cameras that others agree with",
-        "unconfirmed": "ids of cameras that share nobody with others",
+        "unconfirmed": "ids of cameras that share no person with others",
     },
 )

@@ -37,7 +37,7 @@ class CameraCalibration(Record):
     rotation: tuple[Vector3, Vector3, Vector3]
     """Rows of R in x_cam = R x_world + t."""
     translation: tuple[_Metres, _Metres, _Metres]
-    """t in x_cam = R x_world + t, as far as the Earth is large [m]."""
+    """t in x_cam = R x_world + t [m]."""
 
 
 CAMERA_LABELS: dict[str, tuple[str, ...]] = {

@@ -100,7 +100,7 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
 
 class Conventions(Record):
-    """What every number in a result means."""
+    """Coordinate frames, units and orders of all results."""
 
     contract: int = CONTRACT_VERSION
     world: str = (

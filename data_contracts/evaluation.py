@@ -1,4 +1,4 @@
-"""Result of stage `evaluation`: figures against truth; an absent figure could not be computed."""
+"""Result of stage `evaluation`: metrics against truth; an absent metric could not be computed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class CameraErrors(Record):
     ground_error_p95_m: Amount | None = None
     """The same; 95 % of the points are better [m]."""
     reprojection_error_median_px: Amount | None = None
-    """In the picture, over the pitch at player height [px]."""
+    """In the image, over the pitch at player height [px]."""
     reprojection_error_p95_px: Amount | None = None
     """The same; 95 % of the points are better [px]."""
     center_error_m: Amount | None = None
@@ -75,7 +75,7 @@ class Evaluation(Record):
     acceleration_error_m_s2: Amount | None = None
     """Mean error of joint acceleration [m/s^2]."""
     track_coverage: Share | None = None
-    """Share of true person-frames that the scores of whole tracks are taken on [0..1]."""
+    """Share of true person-frames in the scores of whole tracks [0..1]."""
     pcp3d: float | None = Field(default=None, ge=0, le=100)
     """Share of correct limbs at alpha 0.5, missing limbs counted wrong [%]."""
     coverage: Share | None = None
@@ -83,21 +83,21 @@ class Evaluation(Record):
     joint_coverage: Share | None = None
     """Share of true joints that have a predicted joint [0..1]."""
     false_persons_per_frame: Amount | None = None
-    """Predicted people in a frame that match no true one, mean."""
+    """Mean number of predicted people per frame that match no true person."""
     idf1: Share | None = None
     """Share of person-frames on either side that carry the right id [0..1]."""
     hota: Share | None = None
-    """Geometric mean of finding people and keeping them apart, over 19 distances [0..1]."""
+    """HOTA: geometric mean of detection and association accuracy over 19 distances [0..1]."""
     detection_accuracy: Share | None = None
-    """The part of HOTA that is finding people [0..1]."""
+    """Detection part of HOTA [0..1]."""
     association_accuracy: Share | None = None
-    """The part of HOTA that is keeping them apart [0..1]."""
+    """Association part of HOTA [0..1]."""
     switches: Count | None = None
-    """Times that a true person changes from one predicted id to another."""
+    """Number of changes of a true person from one predicted id to another."""
     switches_per_minute: Amount | None = None
-    """The same in a minute of the match, all people together [1/min]."""
+    """The same per minute of the match, all people together [1/min]."""
     fragmentations: Count | None = None
-    """Times that a true person is lost and found again."""
+    """Number of times that the track of a true person is interrupted."""
     persons: Count | None = None
     """True people."""
     frames: Count | None = None
@@ -107,25 +107,25 @@ class Evaluation(Record):
 
 
 class MethodScore(Record):
-    """How well another method's result agrees with the truth, and under which settings."""
+    """Scores of a baseline method against the truth, with the settings of the evaluation."""
 
     method: str
     """Name of the method."""
     title: str
-    """What tables call it."""
+    """Title in tables."""
     source: str
     """File or folder of its result."""
     world: Literal["shared", "own", "camera"]
-    """Where it puts people: in one world, each in one of his own, or relative to the camera. What
-    then means nothing is absent from the scores."""
+    """Frame of its people: one world, one world per person, or the camera. Scores without a meaning
+    in that frame are absent."""
     body_model: str
-    """Body that its poses were put on."""
+    """Body model that its poses are applied to."""
     notes: dict[str, str]
-    """What was done beyond reading."""
+    """Conversions beyond reading the files."""
     match_in: str | None
-    """Camera in whose picture tracks were matched; None = by distance in the world."""
+    """Camera in whose image tracks were matched; None = by distance in the world."""
     first_frame: Frame
-    """Match frame of the method's first picture."""
+    """Match frame of the method's first image."""
     settings: dict[str, JsonValue]
     """Settings of the evaluation."""
     evaluation: Evaluation

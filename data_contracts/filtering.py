@@ -1,4 +1,4 @@
-"""Result of stage `filtering`: what the fitted bodies say of every detection (R2)."""
+"""Result of stage `filtering`: detections classified by the fitted bodies (R2)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def _array(
 
 FILTERING = GroupLayout(
     stage="filtering",
-    about="What fitted bodies say of detections: what the next iteration leaves out or takes off.",
+    about="Detections compared with fitted bodies: keypoints that the next iteration leaves out, "
+    "and systematic errors that it subtracts.",
     coordinates=(FRAME, PERSON),
     arrays=(
         _array(
@@ -47,29 +48,29 @@ FILTERING = GroupLayout(
             (*_DETECTION, "joint"),
             "float32",
             "nan",
-            "distance of a keypoint to the body it is judged by, in standard deviations",
+            "Mahalanobis distance of a keypoint to the body that it is compared with",
         ),
         _array(
             "dropped",
             _DETECTION,
             "bool",
             "none",
-            "boxes that were taken for a person and fit nobody: all their keypoints are rejected",
+            "tracked boxes that fit no person: all their keypoints are rejected",
         ),
         _array(
             "fits",
             _DETECTION,
             "int16",
             "-1",
-            "place among the persons of the body that a box fits, also where `tracking` took it "
-            "for another or for nobody",
+            "index of the person whose body a box fits, also if `tracking` assigned the box to "
+            "another person or to none",
         ),
         _array(
             "similarity",
             _DETECTION,
             "float32",
             "nan",
-            "mean cosine between the bones of a box and of the body it is judged by",
+            "mean cosine between the bones of a box and of the body that it is compared with",
         ),
         ArrayLayout(
             name="shift",
@@ -77,8 +78,8 @@ FILTERING = GroupLayout(
             dtype="float32",
             unit="px",
             missing="0",
-            about="by how far a keypoint is beside its joint for lasting reasons, the side that "
-            "the body is seen from and the camera's clock; the next iteration takes it off",
+            about="systematic error of a keypoint, from the viewing direction of the body and the "
+            "camera's clock offset; the next iteration subtracts it",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -87,7 +88,7 @@ FILTERING = GroupLayout(
             dtype="float64",
             unit="m",
             missing="none",
-            about="the part of `shift` that goes with the azimuth of the camera seen from the body",
+            about="the part of `shift` that depends on the camera's azimuth around the body",
         ),
         ArrayLayout(
             name="clock_late",
@@ -95,8 +96,8 @@ FILTERING = GroupLayout(
             dtype="float64",
             unit="frame",
             missing="none",
-            about="frame t shows the time t + clock_late of the cameras' mean clock; told apart "
-            "from the cameras' places, unlike that of `triangulation`",
+            about="clock offset: frame t shows the time t + clock_late of the cameras' mean clock; "
+            "estimated together with camera positions, unlike that of `triangulation`",
         ),
     ),
     labels={
@@ -106,5 +107,5 @@ FILTERING = GroupLayout(
     },
     attributes={"camera": "camera ids in the order of the camera dimension"},
 )
-"""The detection dimension is the largest among the cameras; the order is that of `ingest` or
-`detection`."""
+"""The detection dimension has the largest length among the cameras; the order is that of `ingest`
+or `detection`."""

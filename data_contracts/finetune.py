@@ -1,4 +1,4 @@
-"""Versions of the embedded nets: what each was trained on, and whether it is better."""
+"""Versions of the bundled nets: training data of each, and whether it is better."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ NetKind = Literal["people", "keypoints"]
 
 
 class NetVersion(Record):
-    """A net that was fine-tuned on reviewed labels, beside the one it began from."""
+    """A net that was fine-tuned on reviewed labels, compared with its parent."""
 
     contract: Literal[1] = CONTRACT_VERSION
     net: NetKind
     parent: Digest
-    """SHA-256 of the weights' file that training began from."""
+    """SHA-256 of the weights file that training began from."""
     fingerprint: Digest
-    """SHA-256 of this version's weights' file; the parent's where training changed nothing."""
+    """SHA-256 of this version's weights file; the parent's if training changed nothing."""
     file: str
-    """Name of the weights' file beside this record."""
+    """Name of the weights file in the folder of this record."""
     labels: Digest
     """SHA-256 of the annotations."""
     learned: int = Field(ge=1, le=1 << 53)
-    """Pictures learned from."""
+    """Number of training images."""
     held_out: tuple[str, ...]
-    """Pictures that nothing was learned from or chosen by, which the figures are of."""
+    """Test images, used neither for training nor for choosing weights."""
     figure: str
-    """What `before` and `after` are: ap50 of people, pck of keypoints."""
+    """Metric of `before` and `after`: ap50 of people, pck of keypoints."""
     before: Number
-    """Of the parent, on the held-out pictures [1]."""
+    """Metric of the parent on the test images [1]."""
     after: Number
-    """Of this version [1]."""
+    """Metric of this version [1]."""
     steps: Count
-    """Done in training."""
+    """Training steps."""
     adopted: bool
-    """Is this version better: only then later runs are to use it."""
+    """Whether this version is better; later runs use it only then."""
     seed: Count
     trained_at: datetime

@@ -1,4 +1,4 @@
-"""Result of stage `ingest`: what a match folder brought in for one camera."""
+"""Result of stage `ingest`: the detections or the video index of one camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ VIDEO_ARRAYS = (
         dtype="int64",
         unit="1",
         missing="-1",
-        about="number of the video's picture that shows this match frame",
+        about="number of the video image that shows this match frame",
     ),
     ArrayLayout(
         name="picture_stamp",
@@ -20,7 +20,7 @@ VIDEO_ARRAYS = (
         dtype="int64",
         unit="1",
         missing="none",
-        about="presentation time stamp of each picture as shown, in units of the time base",
+        about="presentation time stamp of each image in display order, in units of the time base",
     ),
     ArrayLayout(
         name="picture_key",
@@ -28,20 +28,20 @@ VIDEO_ARRAYS = (
         dtype="bool",
         unit="1",
         missing="none",
-        about="whether decoding can begin at this picture",
+        about="whether decoding can begin at this image",
     ),
 )
-"""The index of a video, and how it lies on the match's clock."""
+"""The index of a video, and its mapping to match frames."""
 
 INGEST = GroupLayout(
     stage="ingest",
-    about="Given 2D poses of one camera, or the index of its video, on the match's clock.",
+    about="Given 2D poses of one camera, or the index of its video, by match frame.",
     coordinates=(FRAME,),
     arrays=(*KEYPOINT_ARRAYS, *VIDEO_ARRAYS),
     labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or clip of its broadcast camera",
-        "video": "null, or a video's time_base [1, units a second], size [px], missing_frames",
+        "video": "null, or a video's time_base [1, units per second], size [px], missing_frames",
     },
     optional=tuple(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)),
 )

@@ -176,7 +176,7 @@ KEYPOINT_ARRAYS = (
         dtype="float32",
         unit="px",
         missing="nan",
-        about="detected 2D joints; a detection's place in its frame is its identity",
+        about="detected 2D joints; the index of a detection in its frame identifies it",
         chunk_dim="frame",
     ),
     ArrayLayout(

@@ -39,11 +39,11 @@ class CameraSpec(Record):
     video: str | None = None
     """Video file or folder of images, relative to the match folder."""
     still: str | None = None
-    """One picture of a static camera where there is no video, relative to the match folder."""
+    """One image of a static camera without a video, relative to the match folder."""
 
 
 class ClipSpec(Record):
-    """A stretch of the match that is reconstructed as one piece."""
+    """An interval of the match that is reconstructed as a whole."""
 
     id: Name
     first_frame: Frame = 0
@@ -56,7 +56,7 @@ class ClipSpec(Record):
     broadcast_offset_frames: FrameOffset = 0.0
     """Frame of the broadcast clip's own video at the clip's first frame."""
     people: dict[PersonId, Name] = {}
-    """Person ids of the clip's tracks, and whom of the roster they are, as far as is known."""
+    """Person ids of the clip's tracks, with their ids in the roster, where known."""
 
 
 class PlayerSpec(Record):
@@ -64,7 +64,7 @@ class PlayerSpec(Record):
 
     id: Name
     name: str = ""
-    """As shown to people."""
+    """As displayed."""
     team: str = ""
     """Name of the team; empty for officials."""
     role: Literal["player", "goalkeeper", "official"] = "player"
@@ -152,7 +152,7 @@ class SourceFile(Record):
 
 
 class Registration(Record):
-    """A match known to a project: what it is and where its folder lies."""
+    """A match that a project knows: its content and its folder."""
 
     contract: Literal[1] = CONTRACT_VERSION
     spec: MatchSpec

@@ -1,4 +1,4 @@
-"""What a served project keeps beside its results: arrivals and where its services are."""
+"""State of a served project: arrivals in the inbox and addresses of its services."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Literal
 from data_contracts.records import CONTRACT_VERSION, Amount, Count, ProcessId, Record
 
 ArrivalState = Literal["arriving", "incomplete", "refused", "taken"]
-"""arriving: it changed a moment ago; incomplete: something is missing; refused: it can never be a
-match as it is; taken: it is a registered match."""
+"""arriving: changed recently; incomplete: something is missing; refused: invalid as a match; taken:
+a registered match."""
 
 Priority = Literal["urgent", "normal", "background"]
-"""Which matches run first."""
+"""Order in which matches run."""
 
 
 class Arrival(Record):
@@ -23,23 +23,23 @@ class Arrival(Record):
     """Path below the inbox; characters that are not plain ASCII are escaped."""
     state: ArrivalState
     reason: str = ""
-    """Why it is where it is, for people."""
+    """Reason of the state."""
     priority: Priority = "normal"
     fingerprint: str = ""
-    """Digest of the names, sizes and times of all its files as they were last seen."""
+    """Digest of the names, sizes and times of all its files at the last scan."""
     unchanged_since: Amount = 0.0
-    """When it was first seen like this, on this machine's clock that only goes forward [s]."""
+    """Time of the first scan with these files, on the machine's monotonic clock [s]."""
     is_begun: bool = False
-    """Whether taking it in has begun and not ended; written before the first of its files is read.
+    """Whether registration has begun and not ended; written before the first of its files is read.
     """
     deaths: Count = 0
-    """How often the process that took it in, as it is now, ended in the middle of that."""
+    """How often the registering process died with these files."""
     match_id: str | None = None
-    """The match that it became."""
+    """Id of the registered match."""
     flow_run: str | None = None
-    """Prefect's id of the run that it was given."""
+    """Prefect's id of its run."""
     changed_at: datetime
-    """When its state last changed."""
+    """Time of the last change of state."""
 
 
 class Service(Record):
@@ -47,19 +47,19 @@ class Service(Record):
 
     pid: ProcessId
     address: str | None = None
-    """Where it answers; None for one that only works."""
+    """Address of its server; None if it serves nothing."""
 
 
 class Serving(Record):
-    """serve.json: what `worldpose serve` has started, without any secret."""
+    """serve.json: the processes that `worldpose serve` has started, without secrets."""
 
     contract: Literal[1] = CONTRACT_VERSION
     project: str
     """Folder or URL of the store."""
     inbox: str
-    """The folder that is watched."""
+    """The watched folder."""
     name: str
-    """Of the deployments and pools at the Prefect server."""
+    """Name of the deployments and pools at the Prefect server."""
     prefect: str
     """Address of Prefect's API."""
     owns_prefect: bool

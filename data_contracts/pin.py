@@ -9,12 +9,12 @@ from data_contracts.records import CONTRACT_VERSION, Name, Record
 
 
 class Pin(Record):
-    """pins/<match>/<name>.json: a run is kept under a name, whatever else is forgotten."""
+    """pins/<match>/<name>.json: a run that is kept under a name and never collected."""
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
     name: Name
-    """What people call the run; no number, and not `latest`."""
+    """Name of the run; neither a number nor `latest`."""
     run_id: Name
     """Its number."""
     who: str

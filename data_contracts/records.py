@@ -32,25 +32,25 @@ Frame = Annotated[int, Field(ge=-FRAME_LIMIT, le=FRAME_LIMIT)]
 """A frame number; negative before match frame 0 [frame]."""
 
 FrameOffset = Annotated[float, Field(ge=-FRAME_LIMIT, le=FRAME_LIMIT)]
-"""A distance of two clocks [frame]."""
+"""An offset of two clocks [frame]."""
 
 ImageLength = Annotated[int, Field(gt=0, le=1 << 16)]
 """Width or height of an image; most image libraries read no more [px]."""
 
 FramesPerSecond = Annotated[float, Field(ge=1, le=1000)]
-"""From time lapses to high-speed cameras [1/s]."""
+"""Frame rate, from time lapses to high-speed cameras [1/s]."""
 
 PixelCoordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 """x or y; (0, 0) is the centre of the top-left pixel [px]."""
 
 DetectionIndex = Annotated[int, Field(ge=0, le=100_000)]
-"""Place among a camera's detections of a frame."""
+"""Index among the detections of a camera in one frame."""
 
 Count = Annotated[int, Field(ge=0, le=1 << 53)]
-"""How many; readers of JSON round larger numbers."""
+"""A count; readers of JSON round larger numbers."""
 
 Amount = Annotated[float, Field(ge=0, le=1e15)]
-"""How much, in the unit that the field's docstring names."""
+"""A non-negative value, in the unit that the field's docstring names."""
 
 Number = Annotated[float, Field(ge=-1e15, le=1e15)]
 """A signed value, in the unit that the field's docstring names."""
@@ -59,13 +59,13 @@ Positive = Annotated[float, Field(ge=1e-9, le=1e6)]
 """A size above 0, in the unit that the field's docstring names."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
-"""Of a whole [0..1]."""
+"""A share of a whole [0..1]."""
 
 ProcessId = Annotated[int, Field(ge=1, le=1 << 32)]
-"""Of the operating system."""
+"""Process id of the operating system."""
 
 PersonId = Annotated[int, Field(ge=0, le=FRAME_LIMIT)]
-"""Id of a person's track in a clip."""
+"""Id of the track of a person, unique in its clip."""
 
 
 class Record(BaseModel):

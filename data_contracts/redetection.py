@@ -1,4 +1,4 @@
-"""Result of stage `redetection`: those detected, and who was looked for again and found (R2)."""
+"""Result of stage `redetection`: detections, with people found by a second search (R2)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
 
 REDETECTION = GroupLayout(
     stage="redetection",
-    about="The people of `detection` in their places, and after them those who were found where "
-    "the iteration before says that they must be.",
+    about="The detections of `detection`, unchanged, followed by people found where the previous "
+    "iteration predicts them.",
     coordinates=(FRAME,),
     arrays=(
         *KEYPOINT_ARRAYS,
@@ -18,8 +18,8 @@ REDETECTION = GroupLayout(
             dtype="int32",
             unit="1",
             missing="-1",
-            about="who was looked for and found: person id of the iteration before; missing of "
-            "those whom `detection` has",
+            about="person id of the previous iteration for a redetected person; missing for the "
+            "detections of `detection`",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -28,8 +28,7 @@ REDETECTION = GroupLayout(
             dtype="float32",
             unit="px",
             missing="0",
-            about="by how far keypoints of those found again are beside their joints for lasting "
-            "reasons, as `filtering` has it of the others",
+            about="systematic error of the keypoints of redetected people, as in `filtering`",
             chunk_dim="frame",
         ),
     ),
@@ -39,9 +38,6 @@ REDETECTION = GroupLayout(
 
 
 def redetection_name(detections: str) -> str:
-    """The name of the result with those found again, by that of whom a camera saw.
-
-    Of given ones there is none.
-    """
+    """Return the name of the redetection result of a detection result; empty for given poses."""
     stage, _, unit = detections.partition("/")
     return f"redetection/{unit}" if stage == "detection" else ""

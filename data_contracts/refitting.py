@@ -1,4 +1,4 @@
-"""Result of stage `refitting`: the arrays of `body_fitting`, and what more they rest on."""
+"""Result of stage `refitting`: the arrays of `body_fitting`, from additional evidence."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from data_contracts.body_fitting import BODY_FITTING
 REFITTING = BODY_FITTING.model_copy(
     update={
         "stage": "refitting",
-        "about": "Every person's body fitted again with what the broadcast camera and other clips "
-        "say.",
+        "about": "Every person's body, fitted again with keypoints of the broadcast camera and "
+        "shapes of other clips.",
         "arrays": (
             *BODY_FITTING.arrays,
             ArrayLayout(
@@ -18,7 +18,7 @@ REFITTING = BODY_FITTING.model_copy(
                 dtype="bool",
                 unit="1",
                 missing="none",
-                about="a person whom the broadcast camera saw, as one more view",
+                about="the broadcast camera contributed a view of the person",
                 chunk_dim="frame",
             ),
             ArrayLayout(
@@ -27,7 +27,7 @@ REFITTING = BODY_FITTING.model_copy(
                 dtype="bool",
                 unit="1",
                 missing="none",
-                about="a person whose shape other clips had a say in",
+                about="other clips contributed to the person's shape",
             ),
         ),
     }

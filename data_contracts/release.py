@@ -1,4 +1,4 @@
-"""What leaves the project: releases, their checks, their statistics, what other methods are fed."""
+"""Releases, their checks and statistics, and the settings of baseline methods."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ReleasedClip(Record):
     person_ids: tuple[PersonId, ...]
     """People in the order of every person dimension."""
     origins: dict[str, Count]
-    """How many joints are of which origin; each joint's is in origins/<clip>.npz."""
+    """Number of joints by origin; the origin of each joint is in origins/<clip>.npz."""
 
 
 class ReleaseManifest(Record):
@@ -55,19 +55,19 @@ class ReleaseManifest(Record):
     run_id: Name
     formats: tuple[str, ...]
     stage: str | None = None
-    """Whose joints were asked for; None = the best there are."""
+    """Requested stage of the joints; None = the best available."""
     fps: FramesPerSecond
     """[1/s]"""
     clips: dict[str, ReleasedClip]
     pictures: dict[str, tuple[ImageLength, ImageLength]]
-    """Width and height [px] of every camera's picture."""
+    """Width and height [px] of every camera's images."""
     pitch: bool
-    """Whether the world is a pitch's; without one it is that of the cameras' calibration."""
+    """Whether the world frame is that of a pitch; otherwise it is that of the calibration."""
     body_model: str | None
-    """Name and version of the body model of all poses; betas of another mean nothing."""
+    """Name and version of the body model of all poses; betas are valid for it alone."""
     conventions: Conventions = CONVENTIONS
     licence: str = Field(min_length=1)
-    """The text under which the owner of the data gives it out."""
+    """Licence text of the data."""
     worldpose: str
     """Version that wrote the release."""
     versions: dict[str, str]
@@ -75,12 +75,12 @@ class ReleaseManifest(Record):
     settings: dict[str, dict[str, JsonValue]]
     """Stage to all its settings."""
     results: dict[str, Key]
-    """Stored results that it was made from: `stage/unit` to key."""
+    """Stored results in the release: `stage/unit` to key."""
     files: tuple[ReleasedFile, ...]
 
 
 class Finding(Record):
-    """One thing that is wrong with a data set."""
+    """One fault of a data set."""
 
     fault: str
     """Its name, such as `transposed_rotation`; docs/reference/formats.md lists them."""
@@ -88,13 +88,13 @@ class Finding(Record):
     where: tuple[str, ...]
     """Files or clips, and cameras."""
     says: str
-    """What was found, in a sentence."""
+    """Description of the fault, a sentence."""
     figures: dict[str, Number] = {}
-    """What decided, with the unit in the name."""
+    """Metrics that decided, with the unit in the name."""
 
 
 class ClipFigures(Record):
-    """What was measured in one clip."""
+    """Metrics of one clip."""
 
     frames: Count
     persons: Count
@@ -104,7 +104,7 @@ class ClipFigures(Record):
     compared: Count
     """2D points that were compared with 3D points."""
     reprojection_median_px: Amount | None = None
-    """Of the worst pair of a source and a camera; None where there is no 2D, or nothing is seen."""
+    """Of the worst pair of a source and a camera; None without visible 2D points."""
     plausible_share: Share | None = None
     """Of bodies near the ground, head up, within the pitch's bounds."""
 
@@ -115,65 +115,65 @@ class CheckReport(Record):
     contract: Literal[1] = CONTRACT_VERSION
     clips: dict[str, ClipFigures]
     findings: tuple[Finding, ...]
-    """Empty where nothing is wrong."""
+    """Empty if there is no fault."""
 
 
 class BaselineSettings(Record):
-    """How the paper ran the methods that it compares with (E6)."""
+    """The paper's settings of the baseline methods (E6)."""
 
     boxes: str = "tracks/<clip>.txt"
-    """Boxes that GLAMR and SLAHMR get instead of finding people themselves."""
+    """Boxes given to GLAMR and SLAHMR instead of their own detection."""
     cameras: str = "slahmr/cameras/<clip>/shot-0/cameras.npz"
-    """Cameras that SLAHMR gets in its variant with true ones."""
+    """Cameras given to SLAHMR in its variant with true cameras."""
     glamr_pictures: Literal["whole video"] = "whole video"
-    """GLAMR optimises all pictures of a clip together."""
+    """GLAMR optimises all images of a clip together."""
     slahmr_max_num_tracks: Count = 30
-    """MAX_NUM_TRACKS of SLAHMR's preprocessing, 12 as it comes: all players are to be kept."""
+    """MAX_NUM_TRACKS of SLAHMR's preprocessing, raised from 12 to keep all players."""
     humans4d_confidence: Share = 0.5
-    """Least confidence of 4DHumans' detections [0..1], lowered so that all players are found."""
+    """Minimum confidence of 4DHumans' detections [0..1], lowered so that all players are found."""
     slahmr_floor_type: Literal["shared"] = "shared"
-    """One floor for everybody."""
+    """One floor for all people."""
     slahmr_est_floor: bool = True
     """The floor's normal is estimated: the camera looks down a little."""
     slahmr_cameras: Literal["DROID-SLAM over the whole video"] = "DROID-SLAM over the whole video"
     """Where SLAHMR's own cameras come from."""
     slahmr_chunk_frames: Count = 100
-    """Pictures that SLAHMR optimises at a time, each piece on its own."""
+    """Images that SLAHMR optimises at a time, each chunk independently."""
 
 
 class ClipStatistics(Record):
-    """How much there is in one clip."""
+    """Size of one clip."""
 
     frames: Count
     seconds: Amount
     """[s]"""
     persons: Count
-    """People who are there in at least one frame."""
+    """People present in at least one frame."""
     poses: Count
     """Bodies of all people in all frames."""
     trajectories_m: tuple[Amount, ...]
-    """Length of every person's way over the ground [m]."""
+    """Path length of every person over the ground [m]."""
     camera: Literal["S", "M", "M+Z"] | None = None
-    """Whether the camera of the pictures stands still, moves, or moves and zooms."""
+    """Whether the camera of the images is static, moves, or moves and zooms."""
 
 
 class DataSetStatistics(Record):
-    """How much there is in a data set, as the paper counts (X1, X2)."""
+    """Size of a data set, as the paper counts (X1, X2)."""
 
     contract: Literal[1] = CONTRACT_VERSION
     clips: dict[str, ClipStatistics]
     frames: Count
-    """Pictures, several views counted once."""
+    """Frames; several views of one frame count once."""
     minutes: Amount
     """[min]"""
     poses: Count
     distance_km: Amount
-    """That all people went, while they are in the data [km]."""
+    """Path length of all people while they are in the data [km]."""
     subjects_per_frame: Amount | None
-    """Mean number of people in a frame; None without frames."""
+    """Mean number of people per frame; None without frames."""
     speed_m_s: Amount | None
-    """Mean over all poses of how fast their person goes [m/s]; None without poses."""
+    """Mean speed of the person, over all poses [m/s]; None without poses."""
     longest_trajectory_m: Amount | None
     """[m]"""
     camera: Literal["S", "M", "M+Z"] | None
-    """The most that any clip's camera does."""
+    """The most general motion among the clips' cameras."""

@@ -7,6 +7,6 @@ from data_contracts.triangulation import TRIANGULATION
 RETRIANGULATION = TRIANGULATION.model_copy(
     update={
         "stage": "retriangulation",
-        "about": "3D joints of every person placed again with the adjusted cameras.",
+        "about": "3D joints of every person, triangulated again with the adjusted cameras.",
     }
 )

@@ -1,4 +1,4 @@
-"""Review gates as data: requests, decisions and corrections (design: gates are records first)."""
+"""Review gates as data: requests, decisions and corrections."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from data_contracts.records import (
 from data_contracts.static_calibration import Pixel
 
 Origin = Literal["automatic", "corrected", "filled", "rejected"]
-"""Where a value comes from: computed from what was seen, from what a person corrected, from motion
-alone, or computed and refused by a person."""
+"""Origin of a value: computed from observations, computed from corrected observations, filled by
+the motion model alone, or computed and rejected in a review."""
 
 
 class ReviewRequest(Record):
-    """What a person is asked to look at, and why."""
+    """A question to a reviewer: the results under review, and the reasons."""
 
     kind: Literal["request"] = "request"
     contract: Literal[1] = CONTRACT_VERSION
@@ -34,22 +34,22 @@ class ReviewRequest(Record):
     match_id: Name
     run_id: Name
     gate: Name
-    """The stage whose result waits."""
+    """The stage whose result is under review."""
     keys: dict[str, Key]
     """Results under review: `stage/unit` to key."""
     contents: dict[str, Digest]
-    """The same results' contents: a verdict holds for the bytes, whatever key gives them again."""
+    """Digests of the same results' contents: a verdict is valid for equal bytes under any key."""
     reasons: tuple[str, ...]
-    """One line each: figures beyond their limits, or that every result is asked about."""
+    """One line each: metrics beyond their limits, or that every result is reviewed."""
     figures: dict[str, float]
-    """All figures of the results, with the unit in the name."""
+    """All metrics of the results, with the unit in the name."""
     pictures: tuple[str, ...] = ()
     """Paths in the store."""
     created_at: datetime
 
 
 class ReviewDecision(Record):
-    """A person's verdict. It has no default: an empty answer never approves."""
+    """A reviewer's verdict. It has no default: an empty answer never approves."""
 
     kind: Literal["decision"] = "decision"
     contract: Literal[1] = CONTRACT_VERSION
@@ -58,14 +58,14 @@ class ReviewDecision(Record):
     """Id of the `ReviewRequest`."""
     verdict: Literal["approve", "reject"]
     who: str = Field(min_length=1)
-    """Name or login of the person."""
+    """Name or login of the reviewer."""
     why: str = ""
-    """In the person's words."""
+    """Reason, as written by the reviewer."""
     decided_at: datetime
 
 
 class MovedPoint(Record):
-    """A clicked pitch point put elsewhere in a camera's picture, added or removed."""
+    """A clicked pitch point that is moved, added or removed."""
 
     kind: Literal["moved_point"] = "moved_point"
     camera: Name
@@ -75,13 +75,13 @@ class MovedPoint(Record):
     frame: Frame | None = None
     """Frame of the clip's video; None for a static camera."""
     was: Pixel | None = None
-    """Where it was when the person moved it [px]; None where it was not clicked."""
+    """Former pixel [px]; None if it was not clicked."""
     xy: Pixel | None
     """[px]; None removes it."""
 
 
 class RedrawnMarking(Record):
-    """A line or arc drawn anew in a camera's picture, added or removed."""
+    """A drawn line or arc that is replaced, added or removed."""
 
     kind: Literal["redrawn_marking"] = "redrawn_marking"
     camera: Name
@@ -91,7 +91,7 @@ class RedrawnMarking(Record):
     frame: Frame | None = None
     """Frame of the clip's video; None for a static camera."""
     was: tuple[Pixel, ...] = ()
-    """How it was drawn when the person drew it anew [px]; empty where it was not."""
+    """Former pixels [px]; empty if it was not drawn."""
     xy: tuple[Pixel, ...]
     """[px]; empty removes it."""
 
@@ -104,7 +104,7 @@ class DeletedDetection(Record):
     frame: Frame
     """Match frame."""
     detection: DetectionIndex
-    """Its place among the camera's detections of the frame."""
+    """Its index among the camera's detections of the frame."""
 
 
 class AddedDetection(Record):
@@ -115,15 +115,15 @@ class AddedDetection(Record):
     frame: Frame
     """Match frame."""
     detection: DetectionIndex
-    """The place that the person takes among the camera's detections of the frame: a free one."""
+    """Index that the new detection takes among the camera's detections of the frame: a free one."""
     box: tuple[PixelCoordinate, PixelCoordinate, PixelCoordinate, PixelCoordinate]
     """x0, y0, x1, y1 [px]."""
     keypoints: tuple[Pixel | None, ...] = Field(default=(None,) * 17, min_length=17, max_length=17)
-    """[px], in the order of COCO-17; None where a joint cannot be seen."""
+    """[px], in the order of COCO-17; None for an invisible joint."""
 
 
 class ChosenFrames(Record):
-    """The frames that a stage is to use, instead of those it proposed (B1)."""
+    """Frames that a stage uses instead of its own choice (B1)."""
 
     kind: Literal["chosen_frames"] = "chosen_frames"
     stage: Name
@@ -133,30 +133,30 @@ class ChosenFrames(Record):
 
 
 class MovedKeypoint(Record):
-    """A keypoint put elsewhere; `xy` None says that it cannot be seen."""
+    """A keypoint that is moved; `xy` None marks it as invisible."""
 
     kind: Literal["moved_keypoint"] = "moved_keypoint"
     camera: Name
     frame: Frame
     """Match frame."""
     detection: DetectionIndex
-    """Its place among the camera's detections of the frame."""
+    """Its index among the camera's detections of the frame."""
     joint: Name
     """Name in COCO-17."""
     was: Pixel | None = None
-    """Where it was when the person moved it [px]; None where it was not seen."""
+    """Former pixel [px]; None if it was not detected."""
     xy: Pixel | None
     """[px]"""
 
 
 class Sighting(Record):
-    """One detection that tells who is meant, whatever ids the tracker gives."""
+    """One detection that identifies a person, independent of the tracker's ids."""
 
     camera: Name
     frame: Frame
     """Match frame."""
     detection: DetectionIndex
-    """Its place among the camera's detections of the frame."""
+    """Its index among the camera's detections of the frame."""
 
 
 class MergedTracks(Record):
@@ -166,34 +166,37 @@ class MergedTracks(Record):
     clip: Name
     kept: PersonId
     kept_seen: Sighting | None = None
-    """Where the person saw who that is; no longer so, and the correction does not apply."""
+    """Detection of the person at the time of the correction; if it now belongs to another person,
+    the correction does not apply."""
     merged: PersonId
     merged_seen: Sighting | None = None
     """As `kept_seen`."""
 
 
 class SplitTrack(Record):
-    """One person id of a clip that is two people from a frame on."""
+    """One person id of a clip that is another person from some frame on."""
 
     kind: Literal["split_track"] = "split_track"
     clip: Name
     person: PersonId
     seen: Sighting | None = None
-    """Where the person saw who that is; no longer so, and the correction does not apply."""
+    """Detection of the person at the time of the correction; if it now belongs to another person,
+    the correction does not apply."""
     first_frame_of_new: Frame
     """Match frame."""
 
 
 class NamedTrack(Record):
-    """The roster's name of a person id of a clip."""
+    """The roster id of a track."""
 
     kind: Literal["named_track"] = "named_track"
     clip: Name
     person: PersonId
     seen: Sighting | None = None
-    """Where the person saw who that is; no longer so, and the correction does not apply."""
+    """Detection of the person at the time of the correction; if it now belongs to another person,
+    the correction does not apply."""
     name: Name | None
-    """Id in the roster; None takes it away."""
+    """Id in the roster; None removes it."""
 
 
 Edit = Annotated[
@@ -221,12 +224,12 @@ class Correction(Record):
     who: str = Field(min_length=1)
     made_at: datetime
     based_on: dict[str, Key]
-    """The results the person looked at: `stage/unit` to key."""
+    """The reviewed results: `stage/unit` to key."""
     note: JsonValue = None
 
 
 class Withdrawal(Record):
-    """A correction taken back."""
+    """The withdrawal of a correction."""
 
     kind: Literal["withdrawal"] = "withdrawal"
     contract: Literal[1] = CONTRACT_VERSION
@@ -239,9 +242,10 @@ class Withdrawal(Record):
 
 
 class Acceptance(Record):
-    """Detections that a person found right; it tells what is left to look at, and changes nothing.
+    """Detections that a reviewer accepted; this shortens the review queue and changes no result.
 
-    It holds for the results that it names: found anew with other bytes, they are to be looked at.
+    It is valid for the named results; if they are recomputed with other bytes, the review is open
+    again.
     """
 
     kind: Literal["acceptance"] = "acceptance"
@@ -249,11 +253,11 @@ class Acceptance(Record):
     id: Name
     match_id: Name
     results: dict[str, Key]
-    """Of one camera, as they are without corrections: `stage/unit` to key."""
+    """Results of one camera without corrections: `stage/unit` to key."""
     at_least: float | None = Field(default=None, ge=0, le=1)
-    """Everybody whose score is at least this [1]; None = nobody but those named."""
+    """Accept detections with at least this score [1]; None = only those in `people`."""
     people: tuple[tuple[Frame, DetectionIndex], ...] = ()
-    """Match frame, and place among the detections of the frame."""
+    """Match frame, and index among the detections of the frame."""
     who: str = Field(min_length=1)
     accepted_at: datetime
 
@@ -265,12 +269,12 @@ ReviewRecord = Annotated[
 
 
 class JournalEntry(Record):
-    """reviews/<match>/<number>.json: what was said at once; entries are added, never changed."""
+    """reviews/<match>/<number>.json: records written together; entries are only appended."""
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
     number: int = Field(ge=1, le=1 << 53)
-    """Its place in the journal."""
+    """Its number in the journal."""
     previous: Digest | None
-    """Checksum of the entry before it, None for the first: a lost or changed one is seen."""
+    """Checksum of the previous entry, None for the first: it reveals lost or changed entries."""
     records: tuple[ReviewRecord, ...] = Field(min_length=1)

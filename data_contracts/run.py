@@ -25,7 +25,7 @@ class Project(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     store_format: str
-    """Version of the way arrays are written as bytes."""
+    """Version of the encoding of arrays."""
 
 
 class StoredFile(Record):
@@ -39,24 +39,24 @@ class StoredFile(Record):
 
 
 class ResultManifest(Record):
-    """Written last: a result exists when this file names every other with its checksum."""
+    """Written last: a result exists once this file lists all others with their checksums."""
 
     contract: Literal[1] = CONTRACT_VERSION
     key: Key
     recipe: Recipe
     files: tuple[StoredFile, ...]
     content: Digest
-    """Digest of `files`: two honest computations of one key agree in it."""
+    """Digest of `files`; equal for repeated computations of one key."""
     figures: dict[str, float]
-    """Quality figures, with the unit in the name."""
+    """Quality metrics, with the unit in the name."""
     left_out: dict[Name, str] = {}
-    """Static cameras that no later stage may use, by id, and why."""
+    """Static cameras that later stages must not use, by id, with the reason."""
     warnings: tuple[str, ...] = ()
-    """What the run tells the user about this result at its end."""
+    """Warnings that the run prints at its end."""
     created_at: datetime
-    """When it was published."""
+    """Time of publication."""
     seconds: Amount
-    """How long it took to compute [s]."""
+    """Computing time [s]."""
     run_id: Name
     """The run that computed it."""
     checksum: Digest
@@ -64,93 +64,93 @@ class ResultManifest(Record):
 
 
 class UnitFailure(Record):
-    """Why a unit of a run has no result."""
+    """Failure of a unit, which has no result."""
 
     unit: str
     """Stage and unit: `tracking/clip`."""
     error: str
     """Name of the error's class."""
     message: str
-    """What the error said."""
+    """The error's message."""
     key: Key | None = None
-    """Of the result that it would have had: the same key would fail in the same way."""
+    """Key of the missing result: the same key would fail in the same way."""
 
 
 class Reservation(Record):
-    """<run>.open.json: a run's number is taken; alone, the run has not finished."""
+    """<run>.open.json: reserves a run's number; without <run>.json, the run has not finished."""
 
     contract: Literal[1] = CONTRACT_VERSION
     run_id: Name
     match_id: Name
     started_at: datetime
     host: str
-    """Name of the machine the run is on."""
+    """Name of the run's machine."""
     pid: ProcessId
-    """Its process there."""
+    """Process id on that machine."""
 
 
 class WaitingUnit(Record):
-    """A unit whose result is there, and may not be built upon before a person approves it."""
+    """A unit whose result later stages may not use before its approval."""
 
     unit: str
     """Stage and unit: `tracking/clip`."""
     request: Name
     """Id of its `ReviewRequest`."""
     reasons: tuple[str, ...]
-    """Why a person is asked."""
+    """Reasons for the review."""
     rejected: bool = False
-    """A person refused it: it waits for a correction."""
+    """A reviewer rejected it; it waits for a correction."""
 
 
 GatePolicy = Literal["auto", "always", "never"]
-"""When a person is asked: where figures are beyond their limits, for every result, not at all."""
+"""When results need approval: if metrics exceed their limits, always, or never."""
 
 RunState = Literal["complete", "waiting", "partial", "failed"]
 
 
 class RunRecord(Record):
-    """One run of a match: which result stands for which unit."""
+    """One run of a match, with the result of every unit."""
 
     contract: Literal[1] = CONTRACT_VERSION
     run_id: Name
-    """Its number, `0001` the first."""
+    """Its number, from `0001`."""
     match_id: Name
     parent: Name | None
-    """The run before this one."""
+    """The previous run."""
     iteration: int = Field(default=1, ge=1, le=1000)
-    """Which pass over the method; from the second on, results of the one before have a say."""
+    """Pass over the method; from the second on, results of the previous one are input."""
     state: RunState
-    """waiting: nothing failed, but a person has to approve results; partial: some units failed, but
-    units of the last stage asked for have results, or bodies where stages after `body_fitting` were
-    asked for too: those add to bodies that are there without them. Also partial: no unit failed,
-    but too few cameras are left for later stages (`left_out`)."""
+    """waiting: nothing failed, but results need approval; partial: some units failed, but units of
+    the last requested stage have results, or bodies if stages after `body_fitting` were requested,
+    which only add to bodies. Also partial: no unit failed, but too few cameras are left for later
+    stages (`left_out`)."""
     results: dict[str, Key]
     """Unit, as `stage/unit`, to key."""
     settings: dict[str, dict[str, JsonValue]]
     """Stage to all its settings."""
     overrides: dict[str, dict[str, JsonValue]]
-    """Stage to the settings that were asked for; the others are defaults."""
+    """Stage to the requested settings; the others are defaults."""
     executed: tuple[str, ...]
     """Units, as `stage/unit`, that this run computed."""
     reused: tuple[str, ...]
-    """Units whose results were there."""
+    """Units whose results existed."""
     failed: tuple[UnitFailure, ...]
     """Units that have no result because their task failed."""
     blocked: tuple[str, ...]
-    """Units that have no result because one that they are made from has none, or waits."""
+    """Units without a result because an input has none, or needs approval."""
     gates: GatePolicy = "never"
-    """When a person was to be asked."""
+    """When results needed approval."""
     waiting: tuple[WaitingUnit, ...] = ()
-    """Units that wait for review."""
+    """Units under review."""
     figures: dict[str, dict[str, float]]
-    """Unit, as `stage/unit`, to quality figures."""
+    """Unit, as `stage/unit`, to quality metrics."""
     left_out: dict[Name, str] = {}
-    """Static cameras that the run did without, by id, and why."""
+    """Static cameras that the run left out, by id, with the reason."""
     warnings: tuple[str, ...] = ()
-    """What the user must know about the results, one sentence each."""
+    """Warnings about the results, one sentence each."""
     versions: dict[str, str]
     """Python and numeric libraries."""
     started_at: datetime
     finished_at: datetime
     seconds: Amount
-    """How long the run took [s]."""
+    """Duration of the run [s]."""

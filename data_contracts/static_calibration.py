@@ -1,4 +1,4 @@
-"""What people click in a static camera's picture, and the result of stage `static_calibration`."""
+"""Clicks in the image of a static camera, and the result of stage `static_calibration`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pixel = tuple[PixelCoordinate, PixelCoordinate]
 
 
 class ClickedPoint(Record):
-    """A named point of the pitch template where a person saw it."""
+    """A named point of the pitch template, as clicked in the image."""
 
     name: Name
     """Point of the template, such as `corner_left_near`."""
@@ -23,7 +23,7 @@ class ClickedPoint(Record):
 
 
 class DrawnMarking(Record):
-    """Points along a line or arc of the pitch template; where along it they lie is not known."""
+    """Pixels along a line or arc of the pitch template, at unknown positions along it."""
 
     name: Name
     """Line or arc of the template, such as `touch_line_near` or `center_circle`, or a goal's
@@ -32,7 +32,7 @@ class DrawnMarking(Record):
 
 
 class ClickedMarkings(Record):
-    """annotations/static_calibration/<camera>.json: everything clicked for one camera."""
+    """annotations/static_calibration/<camera>.json: all clicks of one camera."""
 
     contract: Literal[1] = CONTRACT_VERSION
     points: tuple[ClickedPoint, ...] = ()
@@ -53,7 +53,7 @@ CAMERA_STEP = (
     "k2",
     "k3",
 )
-"""A small change of a camera: rotation about its center [rad] and shift [m] in its own axes, the
+"""A step of a camera: rotation about its center [rad] and shift [m] in its own axes, the
 logarithm of the focal length, principal point [px], distortion [1]."""
 
 _GROUND = tuple(
@@ -83,7 +83,7 @@ _EVIDENCE = (
         dtype="float64",
         unit="px",
         missing="none",
-        about="where it was clicked",
+        about="clicked pixel",
     ),
     ArrayLayout(
         name="point_residual",
@@ -91,7 +91,7 @@ _EVIDENCE = (
         dtype="float64",
         unit="px",
         missing="nan",
-        about="projected minus clicked; missing where the camera cannot image the point",
+        about="projected minus clicked; missing if the camera cannot image the point",
     ),
     ArrayLayout(
         name="point_surprise",
@@ -99,8 +99,8 @@ _EVIDENCE = (
         dtype="float64",
         unit="1",
         missing="nan",
-        about="residual in standard deviations of what the other evidence predicts; missing where "
-        "the camera cannot image the point",
+        about="Mahalanobis distance of the residual, given the other evidence; missing if the "
+        "camera cannot image the point",
     ),
     ArrayLayout(
         name="point_inlier",
@@ -108,7 +108,7 @@ _EVIDENCE = (
         dtype="bool",
         unit="1",
         missing="none",
-        about="does the camera rest on this click",
+        about="the click is an inlier",
     ),
     ArrayLayout(
         name="marking_rms",
@@ -132,7 +132,7 @@ _EVIDENCE = (
         dtype="bool",
         unit="1",
         missing="none",
-        about="does the camera rest on this drawn marking",
+        about="the drawn marking is an inlier",
     ),
     ArrayLayout(
         name="ground_error",
@@ -140,26 +140,26 @@ _EVIDENCE = (
         dtype="float64",
         unit="m",
         missing="nan",
-        about="expected distance on the surface between a place and where the camera puts its "
-        "true pixel; missing where the camera does not see",
+        about="expected distance on the surface between a place and the back-projection of its "
+        "true pixel; missing outside of the camera's view",
     ),
 )
 _ABOUT = {
-    "point": "names of the clicked points, the most surprising first",
-    "point_problem": "for each clicked point that the camera does not rest on, why; else empty",
+    "point": "names of the clicked points, the largest Mahalanobis distance first",
+    "point_problem": "why a clicked point is an outlier; otherwise empty",
     "marking": "names of the drawn markings, the worst first",
     "free": "parameters that were solved for",
-    "decisions": "what was chosen, and the figures that decided",
-    "reasons": "why the camera is weak, or why it is left out; empty where it is neither",
+    "decisions": "choices made, with the metrics that decided",
+    "reasons": "why the camera is weak or left out; otherwise empty",
     "add_next": "points and markings whose clicks would lower the expected error most",
-    "noise_scale": "factor on the stated noise that is taken; null for a given one",
-    "condition": "condition number of the free parameters' correlation; null for a given one",
+    "noise_scale": "factor on the stated click noise; null for a given camera",
+    "condition": "condition number of the free parameters' correlation; null for a given camera",
 }
 
 STATIC_CALIBRATION = GroupLayout(
     stage="static_calibration",
-    about="One static camera, and, unless it was given, how well it is known and why. A camera "
-    "that cannot be calibrated has no arrays, and its reasons say why it is left out.",
+    about="One static camera, with covariance and evidence unless it was given. A camera that "
+    "cannot be calibrated has no arrays; its `reasons` say why it is left out.",
     coordinates=_GROUND,
     arrays=(*CAMERA_ARRAYS, *_EVIDENCE),
     labels={**CAMERA_LABELS, "parameter": CAMERA_STEP, "parameter_": CAMERA_STEP},

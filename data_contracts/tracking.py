@@ -1,4 +1,4 @@
-"""Result of stage `tracking`: who is who, in every camera and over time (T1, T2)."""
+"""Result of stage `tracking`: identities across cameras and over time (T1, T2)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERSON = ArrayLayout(
 
 TRACKING = GroupLayout(
     stage="tracking",
-    about="Which detection of every camera is which person.",
+    about="The person of every camera's detections.",
     coordinates=(FRAME, PERSON),
     arrays=(
         ArrayLayout(
@@ -27,7 +27,7 @@ TRACKING = GroupLayout(
             dtype="int16",
             unit="1",
             missing="-1",
-            about="place among this camera's detections of the frame, in `ingest`, `detection` or, "
+            about="index among this camera's detections of the frame, in `ingest`, `detection` or, "
             "from the second iteration on, `redetection`",
             chunk_dim="frame",
         ),
@@ -46,23 +46,22 @@ TRACKING = GroupLayout(
             dtype="float32",
             unit="m",
             missing="nan",
-            about="the tracker's own quick 3D joints, world; `triangulation` has the good ones",
+            about="the tracker's fast 3D joints, world; those of `triangulation` are accurate",
             chunk_dim="frame",
         ),
     ),
     labels={"joint": COCO17, "coordinate": ("x", "y", "z")},
     attributes={
         "camera": "camera ids in the order of the camera dimension",
-        "tracks": "one `track` record a person",
-        "joins": "`join` records: the undecided first, then the dearest",
-        "objections": "of people's corrections, in order: why each does not apply, null where it "
-        "does",
+        "tracks": "one `track` record per person",
+        "joins": "`join` records: undecided ones first, then by falling cost",
+        "objections": "for each correction, in order: why it does not apply; null if it does",
     },
 )
 
 
 class Track(Record):
-    """One person's presence in a clip."""
+    """The track of one person in a clip."""
 
     person: PersonId
     first_frame: Frame
@@ -87,8 +86,8 @@ class Join(Record):
     first_frame: Frame
     """First frame of the second."""
     cost: Number
-    """Minus the logarithm of the odds that they are one person and not two strangers [1]."""
+    """Minus the logarithm of the odds that they are one person rather than two [1]."""
     margin: Number | None
     """Logarithm of the odds of this join against every other way [1]; None = beyond doubt."""
     decided: bool
-    """Whether they were joined; otherwise a person has to say."""
+    """Whether they were joined; otherwise a reviewer decides."""

@@ -1,4 +1,4 @@
-"""Result of stage `triangulation`: where every joint is, and how sure that is (T3)."""
+"""Result of stage `triangulation`: 3D joints with covariance (T3)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ EXCHANGED_PARTS = {
     "arms": ("shoulder", "elbow", "wrist"),
     "legs": ("hip", "knee", "ankle"),
 }
-"""Parts of a body whose left and right a detector exchanges together, and their joints."""
+"""Parts of a body whose left and right sides a detector swaps together, and their joints."""
 
 TRIANGULATION = GroupLayout(
     stage="triangulation",
-    about="3D joints of every person with covariance and the views that carry them.",
+    about="3D joints of every person, with covariance and inlier views.",
     coordinates=(FRAME, PERSON),
     arrays=(
         ArrayLayout(
@@ -44,7 +44,7 @@ TRIANGULATION = GroupLayout(
             dtype="float64",
             unit="m",
             missing="none",
-            about="standard deviation per axis of what all views of a joint err in common; "
+            about="standard deviation per axis of the error that all views of a joint share; "
             "`covariance` contains it",
         ),
         ArrayLayout(
@@ -53,7 +53,7 @@ TRIANGULATION = GroupLayout(
             dtype="uint8",
             unit="1",
             missing="0",
-            about="cameras whose observation agrees with the joint",
+            about="number of inlier cameras",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -62,7 +62,7 @@ TRIANGULATION = GroupLayout(
             dtype="float32",
             unit="rad",
             missing="nan",
-            about="widest angle between rays of agreeing cameras, at most a right one",
+            about="widest angle between rays of inlier cameras, at most a right angle",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -71,7 +71,7 @@ TRIANGULATION = GroupLayout(
             dtype="float32",
             unit="px",
             missing="nan",
-            about="root mean square over the agreeing cameras",
+            about="root mean square over the inlier cameras",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -80,7 +80,7 @@ TRIANGULATION = GroupLayout(
             dtype="bool",
             unit="1",
             missing="none",
-            about="does this camera's observation agree with the joint",
+            about="this camera's observation is an inlier of the joint",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -89,8 +89,8 @@ TRIANGULATION = GroupLayout(
             dtype="bool",
             unit="1",
             missing="none",
-            about="did this camera's detection have left and right of this part exchanged; the "
-            "joints and `inliers` are from it put right",
+            about="this camera's detection has left and right of this part swapped; joints and "
+            "`inliers` are computed after correction",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -99,7 +99,7 @@ TRIANGULATION = GroupLayout(
             dtype="float32",
             unit="px",
             missing="0",
-            about="by how much the camera sees the person beside where all cameras put him",
+            about="common image offset of the person in this camera, from calibration errors",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -108,7 +108,7 @@ TRIANGULATION = GroupLayout(
             dtype="float64",
             unit="m",
             missing="nan",
-            about="joints of the whole track, world: all its observations, little acceleration",
+            about="joints smoothed over the whole track, world",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -117,7 +117,7 @@ TRIANGULATION = GroupLayout(
             dtype="float64",
             unit="m^2",
             missing="nan",
-            about="covariance of `smoothed`, growing into gaps",
+            about="covariance of `smoothed`; it grows inside gaps",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -126,7 +126,7 @@ TRIANGULATION = GroupLayout(
             dtype="bool",
             unit="1",
             missing="none",
-            about="is `smoothed` there though `joints` is not",
+            about="`smoothed` is present and `joints` is missing",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -135,8 +135,8 @@ TRIANGULATION = GroupLayout(
             dtype="float64",
             unit="frame",
             missing="nan",
-            about="frame t shows the time t + clock_late of the cameras' mean clock; missing "
-            "where too little moves",
+            about="clock offset: frame t shows the time t + clock_late of the cameras' mean clock; "
+            "missing without enough motion",
         ),
         ArrayLayout(
             name="clock_error",

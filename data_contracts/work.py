@@ -1,7 +1,6 @@
-"""Work: what decides a result, and one unit as a task takes it.
+"""Recipe of a result, and the work order of a task.
 
-Apart from `run`, whose records tell of results and decide none: every task imports this module, so
-its code counts in every result's key.
+Separate from `run`: every task imports this module, so its code is part of every result's key.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from data_contracts.records import CONTRACT_VERSION, Amount, Key, Name, Record, 
 
 
 class Recipe(Record):
-    """Everything that decides a result; its digest is the result's key."""
+    """All that determines a result; its digest is the result's key."""
 
     contract: Literal[1] = CONTRACT_VERSION
     match_id: Name
     stage: Name
     unit: UnitName
     sources: dict[str, JsonValue]
-    """What the match folder gives: digests of files, and values such as the frame rate."""
+    """Input from the match folder: digests of files, and values such as the frame rate."""
     inputs: dict[str, Key]
-    """Results it is made from: `stage/unit` to key."""
+    """Input results: `stage/unit` to key."""
     settings: dict[str, JsonValue]
     code: dict[str, str]
     """Source modules that compute it: module name to digest."""
@@ -47,4 +46,4 @@ class Work(Record):
     key: Key
     run_id: Name
     seconds: Amount | None = None
-    """How long it may be at work; None = as long as it takes [s]."""
+    """Time limit; None = no limit [s]."""
