@@ -15,9 +15,8 @@ def _one_or_more(value: object) -> object:
 
 Zoom = Annotated[float, Field(gt=0, le=16)]
 """Factor on the size of an image [1]."""
-
-Class = Annotated[int, Field(ge=0, le=10000)]
-"""Number of a class of a detector."""
+ClassNumber = Annotated[int, Field(ge=0, le=10_000)]
+"""Class of a detector [1]."""
 
 
 class DetectionSettings(Record):
@@ -29,8 +28,8 @@ class DetectionSettings(Record):
     """Detectors of people: `embedded`, `embedded:FILE`, `transformers:FOLDER`, `onnx:FILE`, or
     `onnx-FORM:FILE` where the net's outputs do not tell its form, for example `onnx-rtmdet:FILE`;
     several form an ensemble whose boxes are fused."""
-    person_classes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
-        default=None, min_length=1
+    person_classes: tuple[ClassNumber, ...] | None = Field(
+        default=None, min_length=1, max_length=100
     )
     """Classes of people in ONNX detectors [1]; None: those whose names say so, or COCO's person."""
     pose: str = "embedded"
