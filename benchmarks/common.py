@@ -1,4 +1,4 @@
-"""What several benchmarks share: a rig in a stadium's stands, and timing in turns."""
+"""Code that several benchmarks share: a rig in a stadium's stands, and timing in turns."""
 
 from __future__ import annotations
 

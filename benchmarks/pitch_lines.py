@@ -260,7 +260,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--half", type=int, choices=(0, 1), default=1)
     parser.add_argument("--every", type=int, default=1, help="every n-th picture only")
-    parser.add_argument("--sheets", type=Path, help="where pictures of the ten worst are written")
+    parser.add_argument("--sheets", type=Path, help="folder for images of the ten worst")
     given = parser.parse_args()
     scorer = load_scorer(given.data)
     for name, (_, size) in SETS.items():

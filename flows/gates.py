@@ -33,7 +33,7 @@ class Gate:
 
     Attributes:
         stage: the stage that the gate follows, also the gate's name.
-        question: the decision that is asked of the reviewer.
+        question: the decision for the reviewer.
         limits: record of the largest metrics that `auto` lets pass.
         judged: maps a result's metrics to those that are compared with the limits.
         warned: metrics that a run without review warns of: beyond their limit, the result is
@@ -210,7 +210,10 @@ CAMERAS = Gate(
     "static_calibration", "Do the markings lie on the picture's, all over it?", CameraLimits()
 )
 PEOPLE = Gate(
-    "detection", "Is everybody on the pitch found, and nobody else?", PeopleLimits(), _of_people
+    "detection",
+    "Are exactly the people on the pitch detected?",
+    PeopleLimits(),
+    _of_people,
 )
 CONSISTENCY = Gate(
     "camera_consistency", "Are these cameras wrong, for this reason?", ConsistencyLimits()
@@ -229,7 +232,7 @@ JOINTS = Gate(
 )
 ADJUSTMENT = Gate(
     "bundle_adjustment",
-    "Did adjustment mend the cameras, and are its outliers outliers?",
+    "Did the adjustment improve the cameras, and are its outliers correct?",
     AdjustmentLimits(),
     _of_adjustment,
 )

@@ -72,7 +72,7 @@ def process_match(
         project: folder or URL of the store.
         match_id: a registered match.
         settings: stage to its settings that differ from their defaults.
-        from_stage: first stage to run; earlier results are taken from the latest run.
+        from_stage: first stage to run; the latest run supplies earlier results.
         until_stage: last stage to run.
         gates: when results need review; None is `auto` for a deployment, else `never`.
         iteration: iteration number; the previous iterations have their results.

@@ -41,7 +41,7 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
 
 @dataclass
 class RunLog:
-    """What a run has reused, computed and failed to compute so far.
+    """Units that a run has reused, computed and failed to compute so far.
 
     `close` turns it into the stored record; until then the run counts as unfinished.
 
@@ -81,7 +81,7 @@ class RunLog:
         gates: GatePolicy = "never",
         iteration: int = 1,
     ) -> Self:
-        """Reserve a new run; results of earlier stages are taken from the latest run.
+        """Reserve a new run; the latest run supplies the results of earlier stages.
 
         Raises:
             EditedMeanwhileError: the previous iteration lacks the inputs of this one.

@@ -173,7 +173,7 @@ def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None
 
 @dataclass(frozen=True)
 class RunStatus:
-    """What a match's latest run would recompute.
+    """The stages that a match's latest run would recompute.
 
     Attributes:
         match: with all current corrections and verdicts.

@@ -43,7 +43,7 @@ class RunRequest:
 
     Attributes:
         settings: stage to the settings that differ from their defaults.
-        from_stage: first stage; earlier results are taken from the latest run.
+        from_stage: first stage; the latest run supplies earlier results.
         until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
         workers: number of worker processes on this machine; None = one per core, as far as there is

@@ -46,7 +46,7 @@ RECONNECTIONS: Final = 3
 Prefect's 10, with a second in between, keep the events of an ended server for minutes."""
 
 _senders: OrderedDict[str, tuple[APILogWorker, EventsWorker]] = OrderedDict()
-"""What sends log lines and events of this process, by server, the least recently used first."""
+"""Senders of this process's log lines and events, by server, the least recently used first."""
 
 
 def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:

@@ -69,7 +69,7 @@ def diff(
     _print_compared(compared)
     if pictures:
         print_table(
-            "pictures in which people moved most",
+            "images with the largest changes of people",
             ("clip", "camera", ">frame", ">person", ">px"),
             [
                 (each.clip, each.camera, str(each.frame), str(each.person), f"{each.moved_px:.2f}")

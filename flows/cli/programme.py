@@ -34,7 +34,7 @@ def clips(
 ) -> None:
     """Propose clips of a programme: shots of the main camera, without a cut, with a pan.
 
-    A person looks at the sheet and takes those that are right; no picture is coded anew.
+    Check the sheet and take the right ones; images are not encoded again.
 
     Example: worldpose clips feed.mp4 --sheet feed.png
     """

@@ -39,7 +39,7 @@ def export_annotations(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Write whom cameras saw, with the pictures, for the annotator that you have.
+    """Write detections and images in the format of an annotation tool.
 
     Example: worldpose review export tiny-1 --format cvat --camera cam03 --out to_annotate
     """

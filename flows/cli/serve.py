@@ -80,7 +80,7 @@ def serve(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Serve a project until interrupted: dashboard, inbox, runs, pages, figures, alerts.
+    """Serve a project until interrupted: dashboard, inbox, runs, pages, metrics, alerts.
 
     Alerts go to the webhook in WORLDPOSE_ALERT_URL and by mail as WORLDPOSE_ALERT_MAIL says.
     PREFECT_API_URL names a Prefect server that runs already.
@@ -157,7 +157,7 @@ def serve(
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")
         line(f"figures        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
-        line("Ctrl-C ends it; begun again it goes on where it was")
+        line("Ctrl-C ends it; the next start resumes")
 
     serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
 

@@ -25,7 +25,7 @@ def timings(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Say how long each stage of a run took, and how long none was at work.
+    """Print the time of each stage of a run, and the idle time.
 
     Example: worldpose timings matches/tiny
     """

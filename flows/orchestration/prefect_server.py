@@ -58,7 +58,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
 
 
 def serve(host: str, port: int, names: Iterable[str]) -> None:
-    """Serve API and dashboard until this process is told to end.
+    """Serve API and dashboard until this process receives a signal to end.
 
     Args:
         host: address to listen at.

@@ -1,1 +1,1 @@
-"""What becomes of a run's results: exports and releases, metrics, comparisons, statistics."""
+"""Uses of a run's results: exports and releases, metrics, comparisons, statistics."""

@@ -54,7 +54,7 @@ Subject = tuple[Kind, str]
 
 @dataclass(frozen=True)
 class Change:
-    """One metric, as `stage/unit figure`, in two runs."""
+    """One metric, as `stage/unit metric`, in two runs."""
 
     figure: str
     before: float

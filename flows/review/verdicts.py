@@ -45,7 +45,7 @@ class Review:
 
     @property
     def question(self) -> str:
-        """The decision that is asked of the reviewer."""
+        """The decision for the reviewer."""
         gates = {gate.stage: gate.question for gate in GATES}
         return gates.get(self.request.gate, "Is it good enough to be built upon?")
 

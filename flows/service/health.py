@@ -65,7 +65,7 @@ def _processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     for name, service in serving.services.items():
         if name != "serve" and not is_alive(service.pid):
             log = state.logs / f"{name}.log"
-            mend = f"It is begun again by itself; if it keeps ending, see {log}."
+            mend = f"It restarts automatically; if it keeps ending, see {log}."
             yield Finding(name, False, "its process has ended", mend)
 
 

@@ -67,7 +67,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
         for run in await _runs(client, plan, (StateType.CRASHED, StateType.FAILED)):
             if may_begin_again(run):
                 why = KILLED if run.state_type == StateType.CRASHED else "its machines were lost"
-                LOG.warning("%s: %s; it begins again", run.name, why)
+                LOG.warning("%s: %s; it restarts", run.name, why)
                 state = Scheduled(name="AwaitingRetry", message=why)
                 await client.set_flow_run_state(run.id, state, force=True)
                 again.append(run.name)

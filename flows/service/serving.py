@@ -98,7 +98,7 @@ class _Supervisor:
                 part.due, part.process = now + part.pause, None
                 log = self.plan.state_folder.logs / f"{part.name}.log"
                 self.tell(
-                    f"{part.name} ended ({code}), see {log}; it begins again in {part.pause:.0f} s"
+                    f"{part.name} ended ({code}), see {log}; it restarts in {part.pause:.0f} s"
                 )
             elif part.process is None and now >= part.due:
                 self._begin(part)

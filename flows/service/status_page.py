@@ -156,7 +156,7 @@ def _details(match: MatchStatus) -> str:
     )
     if not rows:
         return ""
-    heads = "<tr><th>stage</th><th>camera or clip</th><th>state</th><th>time</th><th>figures</th>"
+    heads = "<tr><th>stage</th><th>camera or clip</th><th>state</th><th>time</th><th>metrics</th>"
     return (
         f"<details><summary>{escape(match.match_id)}, camera by camera</summary>"
         f'<div class="wide"><table>{heads}</tr>{rows}</table></div></details>'

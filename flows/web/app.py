@@ -314,7 +314,7 @@ class Guard:
             return refusal(403, "the page is of another session: load it again")
         length = headers.get("content-length", "")
         if not (length.isascii() and length.isdigit()):  # without a length, the size is unbounded
-            return refusal(411, "say how long it is")
+            return refusal(411, "state its length")
         if len(length) > 12 or int(length) > BODY_BYTES:
             return refusal(413, f"at most {BODY_BYTES} bytes are taken in")
         return None

@@ -71,7 +71,7 @@ def routes(context: PageContext) -> APIRouter:
         except InputError as error:
             raise HTTPException(404, error.found) from error
         if picture is None:
-            raise HTTPException(404, "there is no picture of this frame")
+            raise HTTPException(404, "there is no image of this frame")
         content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
         return Response(bytes(content), media_type="image/jpeg")
 

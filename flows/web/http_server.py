@@ -209,7 +209,7 @@ def serve_http(
     max_connections: int = MAX_CONNECTIONS,
     **options: Any,  # noqa: ANN401
 ) -> None:
-    """Serve an ASGI application until this process is told to end.
+    """Serve an ASGI application until this process receives a signal to end.
 
     Args:
         app: the application.

@@ -67,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
     def crop(match_id: str, clip: str, person: int, frame: int) -> Response:
         match, found = opened(match_id, clip)
         if person not in found.person or frame not in found.frame:
-            raise HTTPException(404, "nobody is there")
+            raise HTTPException(404, "the person is not present")
         return Response(_crop(context.store, match, found, person, frame), media_type="image/png")
 
     return router
@@ -116,7 +116,7 @@ def _crop(store: Store, match: Match, found: Identities, person: int, frame: int
     joints = found.joints[f, k].astype(np.float64)
     known = joints[np.isfinite(joints).all(axis=1)]
     if not len(known):
-        raise HTTPException(404, "nobody is there")
+        raise HTTPException(404, "the person is not present")
     middle = known.mean(axis=0)
     cameras = static_cameras(open_run(store.url, match.match_id), match.folder.spec)
     best: tuple[float, str, NDArray[np.float64]] | None = None

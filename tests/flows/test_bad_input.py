@@ -92,7 +92,7 @@ def click_outside(match):
     content = json.loads(path.read_text())
     content["points"][0]["xy"] = [5000, 3]
     path.write_text(json.dumps(content))
-    return [f"{path.name}: points[0].xy", "in the picture", "5000"]
+    return [f"{path.name}: points[0].xy", "in the image", "5000"]
 
 
 def unknown_key(match):

@@ -1,4 +1,4 @@
-"""What neither keypoints nor averaging over cameras can determine: the gauge and the survey.
+"""Uncertainty that neither keypoints nor averaging over cameras can reduce: gauge and survey.
 
 Gauge freedom is a similarity transform of all cameras and people, which no keypoint observes. If no
 camera was calibrated on markings, only the given cameras define position, orientation and scale of

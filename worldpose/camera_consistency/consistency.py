@@ -186,6 +186,6 @@ def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int, fps: f
         "duplicate": f"its video is the same as that of camera {other}: give its own",
         "pose": f"its calibration is wrong: {detail}"
         if detail
-        else "it does not see the people whom the other cameras see in its image: check its "
+        else "it does not detect the people that the other cameras see in its image: check its "
         "calibration, clock and video",
     }[kind]

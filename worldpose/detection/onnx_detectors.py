@@ -34,7 +34,7 @@ Decoder = Callable[[Outputs, tuple[int, int], Sequence[int]], People]
 
 @dataclass(frozen=True)
 class Form:
-    """What a family of nets takes and returns.
+    """Input and output of a family of nets.
 
     Attributes:
         outputs: description for messages.

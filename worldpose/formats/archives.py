@@ -78,7 +78,7 @@ def read_archive(
         raise wrong(str(path), "a whole npz file", f"{error}") from error
 
 
-def wrong(where: str, expected: str, found: str, todo: str = "Write the file anew.") -> InputError:
+def wrong(where: str, expected: str, found: str, todo: str = "Write the file again.") -> InputError:
     """Return the error about one place of a file."""
     return InputError(where, expected=expected, found=found, todo=todo)
 

@@ -297,6 +297,6 @@ def _read_npy(path: Path, kind: str) -> Floats:
             str(path),
             expected=f"float numbers of shape (frames, persons, {', '.join(map(str, tail))})",
             found=f"{array.dtype} of shape {array.shape}",
-            todo="Write the file anew.",
+            todo="Write the file again.",
         )
     return array.astype(np.float64)

@@ -150,7 +150,7 @@ def _parse(path: Path, form: str, parse: Callable[[str], Any], text: str) -> Any
         return parse(text)
     except RecursionError as error:
         raise InputError(
-            str(path), expected=form, found="nesting without end", todo="Write the file anew."
+            str(path), expected=form, found="nesting without end", todo="Write the file again."
         ) from error
     # ValueError: json and tomllib, and numbers or dates that Python's constructors reject.
     # The others: PyYAML, where a tag such as !!int or !!bool precedes text of another type.

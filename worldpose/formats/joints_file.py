@@ -63,7 +63,9 @@ class JointTracks:
         if np.any(np.diff(self.frames) <= 0):
             raise wrong("frames", "frame numbers that rise", f"{self.frames}", "Sort the frames.")
         if len(np.unique(self.person_ids)) < len(self.person_ids):
-            raise wrong("person_ids", "each id once", f"{self.person_ids}", "Number people anew.")
+            raise wrong(
+                "person_ids", "each id once", f"{self.person_ids}", "Number the people again."
+            )
         missing = np.isnan(self.joints)
         self._refuse(
             "joints", np.any(np.isinf(self.joints), axis=-1), "finite metres, NaN where missing"

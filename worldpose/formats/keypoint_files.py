@@ -118,7 +118,7 @@ def _frames(path: Path, results: list[dict[str, Any]], first: int) -> NDArray[np
     frames = [result.get("image_id") for result in results]
     for index, frame in enumerate(frames, first):
         if type(frame) is not int or not 0 <= frame <= FRAME_LIMIT:
-            todo = "Number the pictures from 0 in the order of the video."
+            todo = "Number the images from 0 in the order of the video."
             what = "the frame index, a whole number from 0"
             raise _result_error(path, index, "image_id", what, _shorten(frame), todo)
     return np.array(frames, dtype=np.int64)

@@ -123,7 +123,7 @@ def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> I
                 str(file),
                 expected=f"{expected}: {', '.join(known) or 'none here'}",
                 found=repr(name),
-                todo="Rename or remove the file, or mend match.yaml.",
+                todo="Rename or remove the file, or correct match.yaml.",
             )
         yield file
 
@@ -211,7 +211,7 @@ def _require_inside(where: str, pixel: Pixel, camera: CameraSpec) -> None:
     if not inside:
         raise InputError(
             where,
-            expected=f"a place in the picture of {camera.width} x {camera.height} px",
+            expected=f"a place in the image of {camera.width} x {camera.height} px",
             found=f"{list(pixel)}",
             todo="Remove it, or click it again in this camera's picture.",
         )

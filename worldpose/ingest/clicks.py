@@ -37,7 +37,7 @@ AGAIN: Final = ".again"
 
 @dataclass
 class ImportedClicks:
-    """What an import wrote.
+    """Report of an import.
 
     Attributes:
         files: written, relative to the match folder.

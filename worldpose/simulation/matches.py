@@ -284,7 +284,7 @@ BROADCAST_ID = "broadcast"
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """What a simulated match changes in its scenario, and which files it has."""
+    """Changes of a simulated match to its scenario, and the files to write."""
 
     duration: float | None = None
     """[s], instead of the scenario's."""

@@ -533,7 +533,7 @@ def _is_invertible(information: NDArray[np.float64]) -> bool:
 def _no_camera(problem: Problem, count: int) -> InputError:
     return InputError(
         problem.where,
-        expected="clicks that a camera beside or above the pitch can have made",
+        expected="clicks that a camera next to or above the pitch can see",
         found=f"{count} pixel coordinates that bring the camera down to a clicked point",
         todo="Check names and pixels of the clicks, and image_size.",
     )

@@ -50,7 +50,7 @@ def brightness(picture: Image) -> Image:
             "picture",
             expected="bytes of shape (height, width) or (height, width, 3)",
             found=f"{picture.dtype} of shape {picture.shape}",
-            todo="Read the picture as 8-bit grey or RGB.",
+            todo="Read the image as 8-bit grey or RGB.",
         )
     if picture.ndim == 3:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

@@ -195,7 +195,7 @@ def _select_runs(
 def _reservations(
     store: Store, match_id: str, known: Collection[str]
 ) -> Iterator[tuple[str, Reservation | None]]:
-    """Yield path and reservation of a match's runs; None marks one that nobody needs any more."""
+    """Yield path and reservation of a match's runs; None marks one that is no longer needed."""
     finished = store.runs(match_id)
     for run_id in finished:
         path = reservation_path(match_id, run_id)

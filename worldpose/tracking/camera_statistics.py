@@ -1,4 +1,4 @@
-"""What a tracker learns about its cameras: visibility of people, misses, and ray distances.
+"""Camera statistics of a tracker: visibility of people, misses, and ray distances.
 
 If a camera misses a person, a fixed gate wide enough for badly calibrated cameras would admit a
 neighbour's detection. The distances of matched detections give each camera's gate.

@@ -132,7 +132,7 @@ class ImageFolder:
                     str(self._files[number]),
                     expected="a PNG or JPEG picture",
                     found="none",
-                    todo="Write it anew.",
+                    todo="Write it again.",
                 )
             yield number, picture
 

@@ -82,7 +82,7 @@ class FrameIndex:
                 where,
                 expected=f"pictures within {MOST_FRAMES} frames, as numbers and time stamps say",
                 found=f"the last one {exact[-1]:.0f} frames after the first",
-                todo="Correct the numbers of the images, or write the video anew.",
+                todo="Correct the numbers of the images, or write the video again.",
             )
         slot = np.rint(exact).astype(np.int64)
         late = np.abs(exact - slot)
@@ -97,7 +97,7 @@ class FrameIndex:
                 where,
                 expected=f"{fps:g} frames a second, the rate in match.yaml",
                 found=f"{self.fps:.4g}",
-                todo="Correct fps in match.yaml, or write the video anew at that rate.",
+                todo="Correct fps in match.yaml, or convert the video to that rate.",
             )
         return picture
 
@@ -156,5 +156,5 @@ def _no_video(path: Path, found: str) -> InputError:
         str(path),
         expected="a video file with time stamps",
         found=found,
-        todo="Give an mp4, mov or mkv file; write others anew with any video tool.",
+        todo="Give an mp4, mov or mkv file; convert others with any video tool.",
     )

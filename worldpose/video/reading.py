@@ -162,7 +162,7 @@ class VideoReader:
             f"{self.path}: frame {number}",
             expected="a picture",
             found="one that cannot be decoded",
-            todo="Write the video anew with any video tool.",
+            todo="Convert the video with any video tool.",
         )
 
 

@@ -40,7 +40,7 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
             str(path),
             expected=f"a stretch within its {len(index)} pictures",
             found=f"{start} to {stop}",
-            todo="Ask for pictures that the video has.",
+            todo="Request images that the video has.",
         )
     begin = int(np.flatnonzero(index.key[: start + 1])[-1]) if index.key[: start + 1].any() else 0
     first, end = int(index.stamps[begin]), int(index.stamps[stop - 1])
@@ -98,7 +98,7 @@ def write_video(
             if picture.shape[:2] != size or size[0] % 2 or size[1] % 2:
                 raise InputError(
                     f"{path}: picture {count}",
-                    expected="pictures of one size, width and height even",
+                    expected="images of one size, with even width and height",
                     found=f"{picture.shape[1]} x {picture.shape[0]}",
                     todo="Cut or scale the pictures.",
                 )

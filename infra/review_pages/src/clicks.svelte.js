@@ -28,7 +28,7 @@ export class Clicks {
     );
   }
 
-  // What a picture's frame is told of the mouse.
+  // Mouse events of an image's frame.
   handlers = {
     click: (place) => this.#clicked(place),
     clickMark: (mark, vertex, place) => this.#clickedMark(mark, vertex, place),

@@ -1,4 +1,4 @@
-// What somebody clicked, how it came to be, and keeping it: undo, redo, autosave.
+// Clicks of a user, with undo, redo and autosave.
 //
 // Every change is an edit with what it changes (`was`). The server takes an edit in while that is
 // so still; otherwise somebody else was quicker, and the person decides whose it shall be. An edit

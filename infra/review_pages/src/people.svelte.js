@@ -8,7 +8,7 @@ export class People {
   who = $state(null); // number of a detection
   joint = $state(null); // its place in COCO-17
   views = $state(null); // what the other cameras say of the chosen person
-  queue = $state(null); // whom nobody has looked at
+  queue = $state(null); // unreviewed detections
   done = $state([]); // ids of corrections made here
   busy = $state(false);
 

@@ -1,8 +1,8 @@
-// The camera that the clicks make, asked anew with every change; the last answer counts.
+// The camera that the clicks make, requested after every change; the last answer counts.
 
 import { picturePath, post } from "./api.js";
 
-const QUIET = 500; // [ms] without a change before the painted lines are looked for
+const QUIET = 500; // [ms] without a change before the search for painted lines
 
 export class Preview {
   now = $state(null); // of the clicks alone

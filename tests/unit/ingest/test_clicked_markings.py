@@ -101,7 +101,7 @@ def entries(**changes):
         (
             entries(drawn=[{"name": "center_circle", "xy": [[1, 2], [3, -1.1]]}]),
             "drawn[0].xy[1]",
-            "in the picture",
+            "in the image",
         ),
         (entries(points=[{"name": "center_mark", "xy": [np.nan, 2]}]), "points[0].xy[0]", "finite"),
         (entries(points=[{"name": "center_mark", "xy": [1, 2]}] * 2), "points[1].name", "again"),

@@ -95,7 +95,7 @@ def read_annotations(path: Path, form: Format | None = None) -> list[AnnotatedIm
         form = form or detect_format(content)
         pictures = _CODECS[form].decode(content)
         if len({picture.name for picture in pictures}) < len(pictures):
-            raise ContentError("two pictures of one name")
+            raise ContentError("two images with one name")
         return pictures
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]

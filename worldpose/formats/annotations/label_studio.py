@@ -162,7 +162,7 @@ def _read(task: _Task) -> AnnotatedImage:
     ]
     for region in shapes:
         if (region.original_width, region.original_height) != size:
-            raise ContentError(f"{name}: a region of a picture of another size")
+            raise ContentError(f"{name}: a region of an image of another size")
         if region.image_rotation or region.value.rotation:
             raise ContentError(f"{name}: a region that is rotated")
     pixels = np.array(size, dtype=np.float64) / 100.0
