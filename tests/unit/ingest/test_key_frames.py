@@ -61,7 +61,7 @@ def test_frames_out_of_order_or_twice_are_refused(write, frames):
     ("markings", "place"),
     [
         (clicks("centre_mark"), r"key_frames\[0\]\.markings\.points\[0\]\.name.*center_mark"),
-        (clicks(xy=(5000.0, 2.0)), r"key_frames\[0\]\.markings\.points\[0\]\.xy.*picture of"),
+        (clicks(xy=(5000.0, 2.0)), r"key_frames\[0\]\.markings\.points\[0\]\.xy.*image of"),
         (ClickedMarkings(), r"key_frames\[0\]\.markings: .*Click some"),
     ],
 )
