@@ -9,7 +9,7 @@ from command_line import TINY, succeed, worldpose
 
 from worldpose.dataset.manifest import read_origins
 from worldpose.errors import InputError
-from worldpose.simulation.bvh import read_bvh
+from worldpose.simulation.recordings import read_bvh
 from worldpose.store import Store, list_pins
 from worldpose.store.garbage import plan_gc
 

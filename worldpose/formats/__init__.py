@@ -6,9 +6,9 @@ Joints, cameras, body poses, COCO keypoints, the FIFA skeletal tracking challeng
 
 from worldpose.formats.archives import Member, read_archive, write_archive
 from worldpose.formats.camera_file import read_camera, write_moving_camera, write_static_camera
-from worldpose.formats.coco import coco_dataset, write_coco
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks, read_joints, write_joints
+from worldpose.formats.motion_capture import coco_dataset, write_coco
 
 __all__ = [
     "JointTracks",

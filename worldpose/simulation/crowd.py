@@ -17,11 +17,10 @@ from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
 from worldpose.body.model import BODY_POSE
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation.bvh import Clip
 from worldpose.simulation.football import play
 from worldpose.simulation.gait import tread
 from worldpose.simulation.motions import Action, jump
-from worldpose.simulation.paths import MARGIN, STEP, GroundPath, stand_about, wander
+from worldpose.simulation.paths import MARGIN, STEP, Clip, GroundPath, stand_about, wander
 from worldpose.simulation.recordings import clip_path
 from worldpose.simulation.settings import CrowdSettings, Scenario
 from worldpose.simulation.skeletons import Body, PosedBody, draw_body, solve_body

@@ -28,7 +28,6 @@ from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_mat
 from worldpose.ingest.footage import write_still
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.annotations import click_key_frames
-from worldpose.simulation.bvh import Clip
 from worldpose.simulation.cast import (
     BALL,
     Cast,
@@ -49,7 +48,7 @@ from worldpose.simulation.image_formation import (
     to_bytes,
 )
 from worldpose.simulation.mannequins import Surfaces
-from worldpose.simulation.paths import GroundPath
+from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.recordings import read_clip, read_trajectories
 from worldpose.simulation.renderer import film_broadcast, render_broadcast, render_pitch
 from worldpose.simulation.scene import Scene, simulate_scene

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.simulation.bvh import Clip
 from worldpose.simulation.falls import draw_actions, steady_speed
 from worldpose.simulation.motions import (
     STANDING,
@@ -118,6 +117,20 @@ SHOVE: Final = 9.0
 """Speed that pushes a person out of another's middle [m/s]; smaller overlap pushes less."""
 START_SPACE: Final = 2.5
 """Minimum distance between people at the start of their paths [m], where there is room."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A person's captured motion.
+
+    Attributes:
+        time: (frames,) [s], from 0.
+        points: (frames, 13, 3) [m], z up, above the ground, in the order of
+            `worldpose.simulation.recordings.NAMES`.
+    """
+
+    time: Floats
+    points: Floats
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
-from worldpose.simulation.bvh import Clip
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.detector_errors import (
     MAX_FALSE_POSITIVES,
@@ -33,7 +32,7 @@ from worldpose.simulation.detector_errors import (
     project_bodies,
     report,
 )
-from worldpose.simulation.paths import GroundPath
+from worldpose.simulation.paths import Clip, GroundPath
 from worldpose.simulation.random_processes import bursts, drift
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 

@@ -6,7 +6,7 @@ import pytest
 from worldpose.body import SKELETONS, BodyParameters, load_open_body
 from worldpose.errors import InputError
 from worldpose.formats.motion_capture import stretches, write_motion
-from worldpose.simulation.bvh import read_bvh
+from worldpose.simulation.recordings import read_bvh
 
 FRAMES = 40
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.simulation.bvh import read_bvh
+from worldpose.simulation.recordings import read_bvh
 
 ARM = """HIERARCHY
 ROOT hip

@@ -7,11 +7,10 @@ from rigid_bones import RIGID_BONES
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, MatchOptions, read_trajectories, simulate_match
-from worldpose.simulation.bvh import read_bvh
 from worldpose.simulation.crowd import gather
 from worldpose.simulation.gait import walk
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
-from worldpose.simulation.recordings import NAMES, clip_path, read_clip
+from worldpose.simulation.recordings import NAMES, clip_path, read_bvh, read_clip
 from worldpose.simulation.skeletons import draw_body
 
 CHANNELS = "CHANNELS 3 Zrotation Yrotation Xrotation"

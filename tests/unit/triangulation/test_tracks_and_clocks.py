@@ -13,8 +13,7 @@ from worldpose.triangulation import (
     triangulate_joints,
 )
 from worldpose.triangulation.clocks import _Sums
-from worldpose.triangulation.smoothing import segments
-from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
+from worldpose.triangulation.smoothing import _factorize, _invert, _substitute, segments
 
 SETTINGS = TriangulationSettings(common_bias=0.0, offsets="none")
 
