@@ -46,7 +46,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
 
 def driven(file: Path) -> tuple[Scenario, Scene]:
     """Return `match` with people on recorded paths."""
-    paths, length = read_trajectories(file, LONGEST, most=MOST)
+    paths, length = read_trajectories(file, LONGEST, max_people=MOST)
     base = SCENARIOS["match"]
     crowd = base.crowd.model_copy(update={"people": len(paths), "officials": 0})
     changes = {"duration": min(length, LONGEST), "crowd": crowd, "broadcast": None}
