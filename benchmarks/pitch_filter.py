@@ -1,4 +1,4 @@
-"""Prints errors of the pitch filter (D2), which removes crowd, in rendered images of a match.
+"""Prints errors of the pitch filter (D2), which removes spectators, in rendered images.
 
     python benchmarks/pitch_filter.py [--scenario match] [--seeds 3] [--pictures FOLDER]
 

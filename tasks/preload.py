@@ -1,7 +1,7 @@
 """Setup and teardown of a Dask worker: `dask worker --preload tasks.preload`.
 
 Runs with their own workers use it. It is the first preloaded module: garbage collection, a fifth of
-the import time, is off until all modules are imported.
+the import time, is disabled until all modules are imported.
 """
 
 from __future__ import annotations

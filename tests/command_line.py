@@ -14,7 +14,7 @@ WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command said."""
+    """Output of a command."""
 
     code: int
     out: str

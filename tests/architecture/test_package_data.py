@@ -1,4 +1,4 @@
-"""What an installation holds: every file of the packages, since users do not install in place."""
+"""An installation contains every file of the packages, since users do not install in place."""
 
 import tomllib
 from pathlib import Path

@@ -25,7 +25,7 @@ from flows.service.plan import ServePlan
 from flows.service.serving import answers
 
 START_SECONDS = 300.0
-"""What a part may take to begin: machines are busy."""
+"""Time limit for starting a process: machines are busy."""
 
 
 class Link:

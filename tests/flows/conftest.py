@@ -1,4 +1,4 @@
-"""What tests of the review pages share: their server, and who looks at them."""
+"""Fixtures that tests of the review pages share: the server and the browser."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What people say of who is who lies over the tracker's output, whichever way that came to be."""
+"""Identity corrections override the tracker's output, however the run produced it."""
 
 import pytest
 from command_line import TINY

@@ -1,4 +1,4 @@
-"""What people are told of matches, without running one."""
+"""Commands that report on matches without running one."""
 
 import json
 import shutil

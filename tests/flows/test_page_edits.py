@@ -1,4 +1,4 @@
-"""What people correct on a page is kept, shown to all, and overwrites nobody."""
+"""A correction on a page is stored, shown to all users, and overwrites no other user's edit."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What people decide on a page lets the run go on, once."""
+"""A decision on a page resumes the run, once."""
 
 import sys
 import time

@@ -35,5 +35,5 @@ def test_a_pan_is_proposed_and_cut_out_as_it_is(tmp_path):
     with VideoReader(video) as one, VideoReader(out) as two:
         same = two.frame(clip["broadcast_offset_frames"])
         assert np.array_equal(one.frame(23), same)
-    # What is there is not written over.
+    # Existing files are not overwritten.
     assert worldpose("clips", video, "--take", "23:48", "--out", out).code == 2

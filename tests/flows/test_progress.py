@@ -1,4 +1,4 @@
-"""What is told of a run under way."""
+"""Progress reports of a running run."""
 
 import pytest
 

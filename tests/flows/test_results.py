@@ -1,4 +1,4 @@
-"""What comes out of a run: figures against truth, files for others, a page, labelled arrays."""
+"""Outputs of a run: metrics against ground truth, exported files, a page, labelled arrays."""
 
 import json
 import re

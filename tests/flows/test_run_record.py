@@ -1,4 +1,4 @@
-"""What a run's record says when units fail, and when the match is edited under it."""
+"""A run's record when units fail, and when the match is edited during the run."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a kind of mutation is, and the list of all of them."""
+"""Definition of a mutation kind, and the list of all kinds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
