@@ -45,7 +45,7 @@ def true_camera(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Fl
     at = np.arange(-2.0, times[-1] + 1.0, 0.1)
     action = np.stack([25.0 * np.sin(0.25 * at), 8.0 * np.sin(0.4 * at)], axis=1)
     camera = move_broadcast_camera(
-        BroadcastSettings(sweep=10.0), times, action, at, (1920, 1080), rng
+        BroadcastSettings(sweep_m=10.0), times, action, at, (1920, 1080), rng
     )
     where = np.stack([np.interp(times, at, axis) for axis in action.T], axis=-1)
     return MovingCamera.of(camera, camera.center[0], camera.principal_point[0]), where
@@ -128,10 +128,10 @@ def by_scipy(start: MovingCamera, problem: Problem, seconds: float) -> tuple[Mov
         off = (pixels - points.image) / NOISE
         off *= LOSS / np.sqrt(LOSS**2 + (off**2).sum(axis=-1, keepdims=True))
         rough = (second_differences(camera)[:, 3:] / problem.smoothness[3:]).ravel()
-        lens = ((camera.distortion - prior.distortion) / prior.distortion_spread).ravel()
-        zoom = (np.log(camera.focal) - prior.log_focal) / prior.focal_spread
+        lens = ((camera.distortion - prior.distortion) / prior.distortion_std).ravel()
+        zoom = (np.log(camera.focal) - prior.log_focal) / prior.log_focal_std
         place = np.sqrt(np.diag(prior.center_information)) * (camera.center - prior.center)
-        middle = (camera.principal_point - prior.principal_point) / prior.principal_spread
+        middle = (camera.principal_point - prior.principal_point) / prior.principal_std
         value = np.concatenate([off.ravel(), rough, lens, zoom, place, middle])
         cost = 0.5 * float(value @ value)
         calls[0] += 1

@@ -60,14 +60,14 @@ def lines_of(
 ) -> PointEvidence:
     """Return emulated detections of painted lines in every frame."""
     painted = rng.standard_normal((int(samples.ends.max()) + 1, 3))
-    shift = settings.line_shift * rng.standard_normal(2)
+    shift = settings.line_shift_px * rng.standard_normal(2)
     parts = []
     for frame in range(len(true)):
         camera = true.camera[frame]
         seen = project_lines(camera, samples, 0.12, 0.0, 0.0)
         index = thin_samples(seen, samples, 4.0, settings.line_samples)
         world, ends = samples.points_world[index], samples.ends[index]
-        shares = settings.survey_error * samples.shares[index]
+        shares = settings.survey_error_m * samples.shares[index]
         hung = np.where(ends[..., None] >= 0, shares[..., None] * painted[ends], 0.0)
         pixels = camera.project(world + hung.sum(axis=1)) + shift
         parts.append(
@@ -82,8 +82,8 @@ def lines_of(
                     shares=shares,
                 ),
                 seen.normals[index],
-                np.full(len(index), np.hypot(NOISE, settings.line_noise)),
-                settings.loss,
+                np.full(len(index), np.hypot(NOISE, settings.line_noise_px)),
+                settings.loss_scale,
             )
         )
     return together(parts)
@@ -113,10 +113,10 @@ def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats
         prior=build_prior(settings.prior, true.focal, true.image_size),
         smoothness=estimate_smoothness(true, fps),
     )
-    solution = solve(true, problem, settings.iterations)
+    solution = solve(true, problem, settings.max_iterations)
     lasting = correlation_time(true, fps)
     known = compute_uncertainty(
-        solution, problem, settings.line_shift, settings.player_shift, lasting
+        solution, problem, settings.line_shift_px, settings.player_shift, lasting
     )
     print(f"{name} {seed}: {errors(solution.camera, true, joints)}", flush=True)
     return distances(solution.camera, known, true, joints)

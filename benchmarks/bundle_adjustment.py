@@ -130,7 +130,7 @@ def ours(problem: Problem) -> Run:
     """Return the solver of this package."""
 
     def run() -> Solution:
-        solved = solve(problem, SolverSettings(cost_change=1e-8), covariance=False)
+        solved = solve(problem, SolverSettings(min_cost_change=1e-8), covariance=False)
         return solved.cameras, solved.points
 
     return run

@@ -95,12 +95,12 @@ def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
     )
     times = 1.0 + np.arange(frames) / FPS
     looks = RenderingSettings()
-    poses, later = crowd.poses(times), crowd.poses(times + looks.shutter)
+    poses, later = crowd.poses(times), crowd.poses(times + looks.exposure_s)
     cast = dress_people(
         poses.betas[:, 0], assign_roles(scenario.crowd, len(crowd.paths)), 5, looks.patterns
     )
     middle = np.median(crowd.joints(times[:1])[0, :, 11], axis=0)
-    rig = RigSettings(person_height=60.0, image_size=(1920, 1080))
+    rig = RigSettings(person_height_px=60.0, image_size_px=(1920, 1080))
     camera = place_camera(rig, 3, middle, scenario.pitch, np.random.default_rng(5))
     view = open_view(camera, pitch, 5, looks)
 

@@ -44,23 +44,23 @@ PITCH = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 BROADCAST = StaticCalibrationSettings(
     prior=CameraPrior(
         focal=2.6,
-        focal_spread=0.4,
-        principal_point_spread=0.03,
+        log_focal_std=0.4,
+        principal_point_std=0.03,
         k1=0.033,
-        k1_spread=0.015,
-        k2_spread=0.0005,
-        lens_spread=(0.0, 0.0, 0.0),
-        height=15.0,
-        height_spread=0.35,
-        distance=70.0,
-        distance_spread=0.25,
-        roll_spread=0.008,
+        k1_std=0.015,
+        k2_std=0.0005,
+        lens_std=(0.0, 0.0, 0.0),
+        height_m=15.0,
+        log_height_std=0.35,
+        distance_m=70.0,
+        log_distance_std=0.25,
+        roll_std_rad=0.008,
     ),
     k3_gain=0.9,
 )
 SETS = {"wc14": ("wc14", (1280, 720)), "sn22": ("sn22_lines", (960, 540))}
 PIXELS = (5, 10, 20)
-FAR_OFF = BROADCAST.wrong_marking * BROADCAST.drawn_noise
+FAR_OFF = BROADCAST.wrong_marking * BROADCAST.drawn_noise_px
 CLEARLY_SEEN = 40.0  # pixels of a marking in the image that an annotator does not overlook
 
 

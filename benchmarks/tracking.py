@@ -24,7 +24,7 @@ from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, match_optimally, ray_affinity
 
 SETTINGS = TrackingSettings()
-CAMERAS, FPS, GATE = 16, 50.0, SETTINGS.gate
+CAMERAS, FPS, GATE = 16, 50.0, SETTINGS.gate_m
 SKELETON = np.array(
     [
         [(0.10, 0.00, 1.65), (0.08, 0.03, 1.69), (0.08, -0.03, 1.69), (0.02, 0.07, 1.67)],

@@ -24,7 +24,7 @@ from worldpose.simulation.annotations import add_calibration_errors
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
-SMALL = CalibrationErrors(rotation=3e-4, center=0.1, focal=1e-3)
+SMALL = CalibrationErrors(rotation_rad=3e-4, center_m=0.1, focal=1e-3)
 WAYS = ("none", "midhip", "body")
 WANTED = 0.05
 """Misplacement of people by the cameras [m]."""
@@ -46,7 +46,9 @@ def some_way_off(scene: Scene, seed: int) -> Camera:
     true, size, errors = Camera.stack(list(scene.cameras.values())), 1.0, SMALL
     for _ in range(5):
         errors = SMALL.model_copy(
-            update={name: size * getattr(SMALL, name) for name in ("rotation", "center", "focal")}
+            update={
+                name: size * getattr(SMALL, name) for name in ("rotation_rad", "center_m", "focal")
+            }
         )
         given = add_calibration_errors(scene.cameras, errors, np.random.default_rng(seed))
         off = misplaced(Camera.stack(list(given.values())), true, scene.truth.joints)

@@ -138,7 +138,7 @@ class BaselineSettings(Record):
     slahmr_cameras: Literal["DROID-SLAM over the whole video"] = "DROID-SLAM over the whole video"
     """Where SLAHMR's own cameras come from."""
     slahmr_chunk_frames: Count = 100
-    """Images that SLAHMR optimises at a time, each chunk independently."""
+    """Images that SLAHMR optimises at a time [frame], each chunk independently."""
 
 
 class ClipStatistics(Record):

@@ -36,7 +36,11 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
     if not store.runs(match_id):
         return None
     record = store.run(match_id)
-    return record.model_copy(update={"overrides": rename_settings(record.overrides)})
+    renamed = {
+        "settings": rename_settings(record.settings),
+        "overrides": rename_settings(record.overrides),
+    }
+    return record.model_copy(update=renamed)
 
 
 @dataclass

@@ -10,7 +10,7 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record
 from flows.method import METHOD
-from flows.renames import SETTINGS
+from flows.renames import former_names
 from flows.stage import Stage
 from worldpose.errors import UsageError
 
@@ -60,12 +60,12 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
                 todo="Write it as in: --set triangulation.min_views=3.",
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
-        _refuse_former_name(assignment, stage_name, field)
-        _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         try:
             value = json.loads(text)
         except (ValueError, RecursionError):  # not JSON, or unclosed brackets
             value = text
+        _refuse_former_name(assignment, stage_name, field, value)
+        _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
         settings_of(by_name[stage_name], overrides)
@@ -90,14 +90,15 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
         ) from None
 
 
-def _refuse_former_name(assignment: str, stage: str, field: str) -> None:
-    present = SETTINGS.get(stage, {}).get(field)
-    if present is not None:
+def _refuse_former_name(assignment: str, stage: str, field: str, value: JsonValue) -> None:
+    for former, present in former_names(stage, field, value):
+        group, dot, name = present.partition(".")
+        written = f'{group}={{"{name}": VALUE}}' if dot else f"{present}=VALUE"
         raise UsageError(
             f"--set {assignment}",
             expected=f"the present name of the setting, {present}",
-            found=f"its former name {field}",
-            todo=f"Write --set {stage}.{present}=VALUE.",
+            found=f"its former name {former}",
+            todo=f"Write --set {stage}.{written}.",
         )
 
 

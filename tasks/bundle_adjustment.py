@@ -73,7 +73,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
     whole = {
         clip: np.arange(first, first + count) for clip, (first, count) in sources["clips"].items()
     }
-    stride = -(-sum(map(len, whole.values())) // settings.candidates)
+    stride = -(-sum(map(len, whole.values())) // settings.max_candidates)
     frames = {
         clip: every[(np.arange(len(every)) % stride == 0) | np.isin(every, settings.chosen_frames)]
         for clip, every in sorted(whole.items(), key=lambda item: item[1][0])

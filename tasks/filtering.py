@@ -44,7 +44,7 @@ def filtering(work: Work) -> str:
     settings = FilteringSettings.model_validate(work.recipe.settings)
     with store.publishing(work) as result, spooling(store) as spool:
         case = _open(store, work)
-        chosen = _evenly(len(case.clip.frame), settings.held_out_frames)
+        chosen = _evenly(len(case.clip.frame), settings.max_held_out_frames)
         views, motion, suspects = case.at(chosen)
         systematic = learn_systematic_errors(
             case.clip.cameras,

@@ -81,7 +81,7 @@ def write_joints(
             f"{settings.min_views}"
             if most < settings.min_views
             else f"no {settings.min_views} views agree within max_deviation="
-            f"{settings.max_deviation:g} at an angle of min_angle={settings.min_angle:g} rad"
+            f"{settings.max_deviation:g} at an angle of min_angle_rad={settings.min_angle_rad:g}"
         )
         result.warnings.append(
             f"{work.recipe.name} placed no joint of {index.shape[2]} people: {reason}."

@@ -141,7 +141,7 @@ def run(
 
 
 def _stated_click_noise(record: RunRecord) -> float:
-    stated = record.settings.get("static_calibration", {}).get("click_noise")
+    stated = record.settings.get("static_calibration", {}).get("click_noise_px")
     return float(stated) if isinstance(stated, int | float) else 1.0
 
 

@@ -34,7 +34,7 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 SCENARIO: Final = "penalty-box"
 CLICKS: Final = {
     "few clicks": ClickSettings(
-        clustered=1.0, window=0.35, clustered_points=(5, 6), noise=1.5, wrong=0.0
+        clustered=1.0, window=0.35, clustered_points=(5, 6), noise_px=1.5, wrong=0.0
     ),
     "many clicks": ClickSettings(),
 }

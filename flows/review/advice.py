@@ -25,7 +25,7 @@ def click_advice(figures: Mapping[str, Mapping[str, float]], stated: float) -> l
 
     Args:
         figures: metrics of a run, by unit and name.
-        stated: `static_calibration.click_noise` of that run [px].
+        stated: `static_calibration.click_noise_px` of that run [px].
     """
     told = [
         (each["click_noise_px"], each["click_freedom"])
@@ -42,7 +42,7 @@ def click_advice(figures: Mapping[str, Mapping[str, float]], stated: float) -> l
     return [
         f"the clicks of {len(told)} cameras are {noise:.1f} px off (standard error {error:.1f} "
         f"px), stated are {stated:g} px: cameras with few clicks state too little uncertainty; run "
-        f"with --set static_calibration.click_noise={noise:.2g}"
+        f"with --set static_calibration.click_noise_px={noise:.2g}"
     ]
 
 

@@ -110,7 +110,7 @@ def _scene(
     crowd = gather(scenario, pitch, np.random.SeedSequence(seed))
     times = np.sort(rng.uniform(0.2, scenario.duration - 0.2, frames))
     settings = _rendering(kind, rng)
-    poses, later = crowd.poses(times), crowd.poses(times + settings.shutter)
+    poses, later = crowd.poses(times), crowd.poses(times + settings.exposure_s)
     joints = crowd.joints(times)
     roles = assign_roles(scenario.crowd, len(crowd.paths))
     cast = dress_people(poses.betas[:, 0], roles, seed, settings.patterns)
@@ -177,11 +177,11 @@ def _scenario(kind: SceneKind, rng: np.random.Generator) -> Scenario:
         people=people,
         movement=movement,
         officials=3 if movement == "football" else 0,
-        area_center=center,
-        area_size=(11.0, 15.0) if movement == "corner" else (side, 0.7 * side),
-        speed=(float(rng.uniform(-0.8, 1.0)), float(rng.uniform(3.5, 6.5))),
-        personal_space=float(rng.uniform(0.8, 1.6)),
-        height=kind.heights,
+        area_center_m=center,
+        area_size_m=(11.0, 15.0) if movement == "corner" else (side, 0.7 * side),
+        speed_m_s=(float(rng.uniform(-0.8, 1.0)), float(rng.uniform(3.5, 6.5))),
+        personal_space_m=float(rng.uniform(0.8, 1.6)),
+        height_m=kind.heights,
     )
     return Scenario(name="scene", about="To learn from.", duration=4.0, crowd=crowd)
 
@@ -192,10 +192,10 @@ def _rendering(kind: SceneKind, rng: np.random.Generator) -> RenderingSettings:
         paint=float(rng.uniform(0.7, 1.0)),
         light="sun" if rng.random() < 0.55 else "floodlights",
         stand_shadow=float(rng.choice([0.0, 0.3, 0.45, 0.6])),
-        fog=float(rng.uniform(0.4, 1.0) * kind.fog) if rng.random() < kind.hazy else 0.0,
-        exposure=float(np.exp(rng.uniform(*kind.exposure))),
+        fog_per_m=float(rng.uniform(0.4, 1.0) * kind.fog) if rng.random() < kind.hazy else 0.0,
+        brightness=float(np.exp(rng.uniform(*kind.exposure))),
         patterns=kind.patterns,
-        blur=float(rng.uniform(*kind.blur)),
+        blur_px=float(rng.uniform(*kind.blur)),
         noise=float(rng.uniform(*kind.noise)),
     )
 
@@ -211,8 +211,8 @@ def _camera(
     target = joints[int(rng.integers(len(joints))), 11] + [*rng.uniform(-3.0, 3.0, 2), 0.0]
     target = np.clip(target, [-50.0, -32.0, 0.0], [50.0, 32.0, 0.0])
     rig = RigSettings(
-        person_height=float(np.exp(rng.uniform(*np.log(kind.person_height)))),
-        height=(7.0, 30.0),
-        image_size=SIZE,
+        person_height_px=float(np.exp(rng.uniform(*np.log(kind.person_height)))),
+        height_m=(7.0, 30.0),
+        image_size_px=SIZE,
     )
     return place_camera(rig, int(rng.integers(1000)), target, pitch, rng)

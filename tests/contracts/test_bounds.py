@@ -71,8 +71,8 @@ def test_every_number_that_is_stated_has_both_bounds():
 
 def test_a_number_beyond_its_bound_is_refused_with_the_bound():
     with pytest.raises(ValidationError, match="less than or equal to 100"):
-        StaticCalibrationSettings(click_noise=1e9)
+        StaticCalibrationSettings(click_noise_px=1e9)
     with pytest.raises(ValidationError, match="greater than or equal to"):
-        StaticCalibrationSettings(click_noise=1e-308)
+        StaticCalibrationSettings(click_noise_px=1e-308)
     with pytest.raises(ValidationError, match="less than or equal to 10000"):
-        SolverSettings(iterations=10**9)
+        SolverSettings(max_iterations=10**9)

@@ -282,11 +282,11 @@ def test_a_bug_is_called_one_and_its_traceback_is_kept(monkeypatch, capsys, flag
 
 
 def test_a_run_without_people_is_partial_and_says_why(tiny, tmp_path):
-    asked = ("--until", "tracking", "--set", "tracking.min_angle=1.57")
+    asked = ("--until", "tracking", "--set", "tracking.min_angle_rad=1.57")
     answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
     assert answer.code == 4
     assert "tracking/clip found no person" in answer.err
-    assert "tracking.min_angle asks for 90 (1.57 rad)" in answer.err
+    assert "tracking.min_angle_rad asks for 90 (1.57 rad)" in answer.err
 
 
 def test_a_run_without_joints_is_partial_and_says_why(tiny, tmp_path):

@@ -58,7 +58,7 @@ def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
     latest = iterate(store, match, {}, 2)
     stages = selected_stages("body_fitting", None)
     for tail in (3.0, 4.0):
-        asked = {"body_fitting": {"tail": tail}}
+        asked = {"body_fitting": {"loss_scale": tail}}
         log = RunLog.begin(store, match, stages, asked, iteration=1)
         assert log.plan.iteration == 2
         for stage in stages:

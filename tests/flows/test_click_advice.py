@@ -14,7 +14,7 @@ def test_noisy_clicks_of_several_cameras_are_told_with_the_setting():
     (text,) = click_advice(run(3.0, 10), 1.0)
     # 80 degrees of freedom: 3 / sqrt(160).
     assert "10 cameras are 3.0 px off (standard error 0.2 px), stated are 1 px" in text
-    assert text.endswith("--set static_calibration.click_noise=3")
+    assert text.endswith("--set static_calibration.click_noise_px=3")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The table of commands: every entry loads, and listing them imports none."""
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -105,16 +106,27 @@ def test_a_former_name_is_refused_with_the_present_one(arguments, present):
 def test_a_former_setting_is_refused_with_the_present_one():
     for stage, names in renames.SETTINGS.items():
         for former, present in names.items():
-            with pytest.raises(UsageError, match=f"{stage}.{present}=VALUE"):
+            with pytest.raises(UsageError, match=re.escape(f"of the setting, {present}, found")):
                 parse_overrides([f"{stage}.{former}=1"])
+
+
+def test_a_former_name_in_a_group_of_settings_is_refused_with_the_present_one():
+    with pytest.raises(UsageError, match=re.escape('.given={"rotation_rad": VALUE}')):
+        parse_overrides(['bundle_adjustment.given={"rotation": 0.001}'])
+
+
+def is_setting(settings, name):
+    """Return whether settings have a field of this name; a dot leads into a group."""
+    field, dot, rest = name.partition(".")
+    found = settings.model_fields.get(field)
+    return found is not None and (not dot or is_setting(found.annotation, rest))
 
 
 def test_every_present_name_exists():
     for stage in METHOD:
-        fields = stage.settings.model_fields
         for former, present in renames.SETTINGS.get(stage.name, {}).items():
-            assert present in fields, (stage.name, present)
-            assert former not in fields, (stage.name, former)
+            assert is_setting(stage.settings, present), (stage.name, present)
+            assert not is_setting(stage.settings, former), (stage.name, former)
     assert set(renames.COMMANDS.values()) <= set(COMMANDS)
     assert not set(renames.COMMANDS) & set(COMMANDS)
     for command, options in renames.OPTIONS.items():
@@ -128,4 +140,12 @@ def test_settings_in_the_record_of_an_earlier_version_get_their_present_names():
     former, present = next(iter(renames.SETTINGS["triangulation"].items()))
     recorded = {"triangulation": {former: False, "min_views": 3}, "ingest": {}}
     renamed = {"triangulation": {present: False, "min_views": 3}, "ingest": {}}
+    assert renames.rename_settings(recorded) == renamed
+
+
+def test_settings_of_a_group_get_their_present_names():
+    recorded = {"bundle_adjustment": {"frames": 9, "solver": {"iterations": 5, "damping": 0.1}}}
+    renamed = {
+        "bundle_adjustment": {"max_frames": 9, "solver": {"max_iterations": 5, "damping": 0.1}}
+    }
     assert renames.rename_settings(recorded) == renamed

@@ -106,7 +106,7 @@ def test_an_edit_recomputes_its_dependency_set_in_every_iteration(clips, edit):
         correct(store, match, [deleted], who="Ada", why="a shadow")
         starts = ["ingest/cam01"]
     else:
-        overrides = {"body_fitting": {"tail": 3.0}}
+        overrides = {"body_fitting": {"loss_scale": 3.0}}
         starts = ["body_fitting/first", "body_fitting/second"]
     after = keys(store, folder, 3, overrides)
     match, _ = register(store, folder)

@@ -48,7 +48,7 @@ def test_a_setting_reaches_its_dependency_set(filmed, stage):
     value = {
         "detection": {"high_score_threshold": 0.3},
         "redetection": {"min_confidence": 0.6},
-        "body_fitting": {"tail": 3.0},
+        "body_fitting": {"loss_scale": 3.0},
     }[stage]
     before = keys(store, folder, 3)
     after = keys(store, folder, 3, {stage: value})

@@ -78,7 +78,7 @@ def edit_identity(store):
 
 
 def edit_setting(store):
-    return {"body_fitting": {"tail": 3.0}}, ["body_fitting/clip"]
+    return {"body_fitting": {"loss_scale": 3.0}}, ["body_fitting/clip"]
 
 
 @pytest.mark.parametrize("edit", [edit_point, edit_box, edit_identity, edit_setting])

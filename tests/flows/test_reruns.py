@@ -129,7 +129,7 @@ def test_from_and_until_take_what_is_there(tiny, project_copy):
     until = run_json(tiny, "--project", project_copy, "--until", "tracking")
     assert (until["run"], until["executed"]) == ("0001", 0)
     joints = ("--until", "triangulation")
-    gated = run_json(tiny, "--project", project_copy, *joints, "--set", "tracking.gate=0.4")
+    gated = run_json(tiny, "--project", project_copy, *joints, "--set", "tracking.gate_m=0.4")
     assert (gated["run"], gated["executed"]) == ("0002", 2)
     # From triangulation on, tracking is taken as run 0002 has it, though not by default.
     start = (tiny, "--project", project_copy, "--from", "triangulation")
@@ -138,10 +138,10 @@ def test_from_and_until_take_what_is_there(tiny, project_copy):
     store = Store.open(project_copy)
     second, third = store.run(TINY, "0002"), store.run(TINY, "0003")
     assert third.results["tracking/clip"] == second.results["tracking/clip"]
-    assert third.settings["tracking"]["gate"] == 0.4
-    assert third.overrides == {"tracking": {"gate": 0.4}, "triangulation": {"min_views": 3}}
+    assert third.settings["tracking"]["gate_m"] == 0.4
+    assert third.overrides == {"tracking": {"gate_m": 0.4}, "triangulation": {"min_views": 3}}
     # A setting of a stage that does not run would have no effect, so it is refused.
-    refused = worldpose("run", *start, "--set", "tracking.gate=0.3")
+    refused = worldpose("run", *start, "--set", "tracking.gate_m=0.3")
     assert refused.code == 2
 
 

@@ -287,7 +287,7 @@ class _Result:
         axes = body_axes(body.keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.
         shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
-        own = (solver.settings.own_bias**2 + self.common_bias**2)[:, None, None] * np.eye(3)
+        own = (solver.settings.own_bias_std_m**2 + self.common_bias**2)[:, None, None] * np.eye(3)
         turned = by_frame.swapaxes(-1, -2)
         self.covariance[span, person] = by_frame @ spread @ turned + shared + own
 

@@ -49,7 +49,7 @@ class Evidence:
     def of(
         cls, joints: Floats, covariance: Floats, fps: float, settings: BodyFittingSettings
     ) -> Evidence:
-        """Return the evidence of joints whose errors last for `noise_time`.
+        """Return the evidence of joints whose errors last for `noise_time_s`.
 
         Args:
             joints: (frames, 17, 3) [m], world.
@@ -60,9 +60,9 @@ class Evidence:
         seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
         stated = np.where(seen[..., None, None], covariance, np.eye(3))
         spread = settings.noise_scale**2 * JOINT_SPREAD[:, None, None] ** 2 * stated
-        spread = spread + settings.joint_floor**2 * np.eye(3)
+        spread = spread + settings.min_joint_std_m**2 * np.eye(3)
         # Correlated frames count as one observation.
-        spread *= 1.0 + settings.noise_time * fps
+        spread *= 1.0 + settings.noise_time_s * fps
         information: Floats = (np.linalg.inv(spread) * seen[..., None, None]).astype(np.float64)
         return cls(np.where(seen[..., None], joints, np.nan), information)
 
@@ -78,8 +78,8 @@ class Evidence:
             settings: standard deviation of a joint from its line.
         """
         seen = np.asarray(np.isfinite(points).all(-1))
-        spread = (settings.sight_spread * JOINT_SPREAD) ** 2 + settings.joint_floor**2
-        spread *= 1.0 + settings.noise_time * fps
+        spread = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2
+        spread *= 1.0 + settings.noise_time_s * fps
         line = np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
         information = self.information + line
         # From the point on the line towards the known joint; a lone line has no force along
@@ -132,8 +132,8 @@ def find_contacts(
     if len(joints) < 2:
         return Contacts(np.zeros(height.shape), np.zeros((0, 2)), height)
     speed = np.linalg.norm(np.diff(ankles, axis=0), axis=-1) * fps
-    low = ankles[..., 2] - height < settings.contact_height
-    slipping = (speed < settings.contact_speed) & low[1:] & low[:-1]
+    low = ankles[..., 2] - height < settings.contact_height_m
+    slipping = (speed < settings.contact_speed_m_s) & low[1:] & low[:-1]
     standing = np.zeros(low.shape, dtype=bool)
     standing[1:] |= slipping
     standing[:-1] |= slipping
@@ -264,8 +264,8 @@ class Track:
         seen_at = body.keypoints + np.einsum("fab,jb->fja", axes, offsets)
         residual = np.where(known[..., None], seen_at - self.evidence.joints, 0.0)
         weighted = np.einsum("fjab,fjb->fja", self.evidence.information, residual)
-        deviation = np.einsum("fja,fja->fj", residual, weighted) / settings.tail**2
-        cost = 0.5 * settings.tail**2 * float(np.log1p(deviation).sum())
+        deviation = np.einsum("fja,fja->fj", residual, weighted) / settings.loss_scale**2
+        cost = 0.5 * settings.loss_scale**2 * float(np.log1p(deviation).sum())
         weight = 1.0 / (1.0 + deviation)
         information = weight[..., None, None] * self.evidence.information
         weighted = weight[..., None] * weighted
@@ -318,7 +318,7 @@ class Track:
         if frames > 2:
             spread = self.acceleration * ACCELERATION_SCALE / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
-            tail = 3.0 * settings.acceleration_tail**2
+            tail = 3.0 * settings.acceleration_loss_scale**2
             deviation = (second**2).sum(-1) / spread**2 / tail
             cost = 0.5 * tail * float(np.log1p(deviation).sum())
             weight = 1.0 / (1.0 + deviation) / spread**2
@@ -331,7 +331,7 @@ class Track:
             bands[2][:-2] += weight
         if self.contacts is not None and frames > 1:
             slip = np.diff(keypoints[:, ANKLES], axis=0)
-            held = self.contacts.slipping / settings.slip_spread**2
+            held = self.contacts.slipping / settings.slip_std_m**2
             cost += 0.5 * float((held[..., None] * slip**2).sum())
             for side, ankle in enumerate(ANKLES):
                 slope[1:, ankle] += held[:, side, None] * slip[:, side]
@@ -346,7 +346,7 @@ class Track:
         prior = self.pose_weight * self.prior.precision
         away = angles - self.prior.mean
         beyond = np.maximum(angles - MAX_ANGLES, 0.0) + np.minimum(angles - MIN_ANGLES, 0.0)
-        stiff = 1.0 / self.settings.limit_spread**2
+        stiff = 1.0 / self.settings.limit_std_rad**2
         gradient[:, 6:] += away @ prior + stiff * beyond
         blocks[:, 6:, 6:] += prior
         places = np.arange(6, UNKNOWNS)
@@ -366,7 +366,7 @@ class Track:
         for side, ankle in enumerate(ANKLES):
             above = keypoints[:, ankle, 2] - contacts.height[:, side]
             weight = np.where(above < 0.0, 1.0, contacts.standing[:, side])
-            weight = weight / self.settings.contact_spread**2
+            weight = weight / self.settings.contact_std_m**2
             cost += 0.5 * float((weight * above**2).sum())
             row, column = by_frame[:, ankle, 2], by_betas[:, ankle, 2, :shapes]
             heavy = weight[:, None] * row

@@ -20,42 +20,42 @@ class BodyFittingSettings(Record):
     noise_scale: float = Field(default=1.3, ge=1e-6, le=1000)
     """Standard deviation of the joints over the stated one [1]: triangulation includes the noise of
     a detector, but no error of occluded joints or wrong views."""
-    noise_time: float = Field(default=0.1, ge=0, le=10)
+    noise_time_s: float = Field(default=0.1, ge=0, le=10)
     """Correlation time of a detector's error [s]: frames within it count as one observation,
     otherwise a slow error would pass for motion."""
-    joint_floor: float = Field(default=0.008, ge=0, le=1)
+    min_joint_std_m: float = Field(default=0.008, ge=0, le=1)
     """Minimum standard deviation of a joint [m]: calibration, and limits of the body model."""
-    sight_spread: float = Field(default=0.06, ge=1e-6, le=10)
+    ray_std_m: float = Field(default=0.06, ge=1e-6, le=10)
     """Distance of a joint that one camera alone sees from its line of sight, per axis, for a joint
     of average difficulty [m]: 2 % of a person's height, and half again since no other view reveals
-    errors, or those that last longer than `noise_time`."""
-    tail: float = Field(default=2.5, ge=1e-6, le=1000)
+    errors, or those that last longer than `noise_time_s`."""
+    loss_scale: float = Field(default=2.5, ge=1e-6, le=1000)
     """Deviation at which a joint has half its weight (Cauchy's loss) [standard deviations]."""
-    bias_spread: float = Field(default=0.02, ge=1e-6, le=10)
+    bias_std_m: float = Field(default=0.02, ge=1e-6, le=10)
     """Expected offset from the body's joint to the detector's, along each axis of the body [m]; the
     same for all persons and mirrored left to right. Both the offsets and, from the middle of the
     steps on, this spread are estimated."""
-    bias_time: float = Field(default=40.0, ge=1e-6, le=10000)
+    bias_time_s: float = Field(default=40.0, ge=1e-6, le=10000)
     """Time of all people together after which offsets get no more certain [s]. 22 people for 10 s,
     seen by a detector without offsets, have errors of 15 mm without that limit, 10 mm with it, as
     for 2 s."""
-    own_bias: float = Field(default=0.006, ge=0, le=1)
+    own_bias_std_m: float = Field(default=0.006, ge=0, le=1)
     """Additional individual offset of each person per axis of the body [m]: clothes and build. It
     is in the covariance only, since nothing separates it from the pose."""
-    shape_rate: float = Field(default=12.5, ge=1e-6, le=10000)
-    """Frame rate to estimate shape and offsets from [1/s]: more frames add no independent
+    shape_rate_hz: float = Field(default=12.5, ge=1e-6, le=10000)
+    """Frame rate to estimate shape and offsets from [Hz]: more frames add no independent
     observations."""
-    shape_acceleration: float = Field(default=50.0, ge=1e-6, le=10000)
+    shape_acceleration_m_s2: float = Field(default=50.0, ge=1e-6, le=10000)
     """Standard deviation of the hips' acceleration per axis while shape is estimated [m/s^2].
     Smoothing shortens swings, and shape would follow: with 6 the limbs come out 2 cm short."""
     shape_weight: float = Field(default=1.0, ge=1e-6, le=100)
     """Weight of the betas' normal distribution [1]: 1 assumes that people vary as the body model's
     components do."""
-    acceleration: float = Field(default=20.0, ge=1e-6, le=10000)
+    acceleration_m_s2: float = Field(default=20.0, ge=1e-6, le=10000)
     """Standard deviation of the hips' acceleration per axis [m/s^2]; other joints have multiples
     of it (`objective.ACCELERATION_SCALE`). Players have 2 to 4 on average;
     smoothing to that cuts swings short (G-MPJPE of a match 26 mm at 8, 23 mm at 12)."""
-    acceleration_tail: float = Field(default=6.0, ge=1e-6, le=1000)
+    acceleration_loss_scale: float = Field(default=6.0, ge=1e-6, le=1000)
     """Deviation at which an acceleration has half its weight [standard deviations]: kicks. Jerk
     where views change is 1.2 times the truth's at 3, 0.9 at 8."""
     pose_weight: float = Field(default=0.03, ge=1e-6, le=10)
@@ -66,18 +66,18 @@ class BodyFittingSettings(Record):
     """The same while shape is estimated [1]: the prior unbends limbs, and longer bones with
     compensating offsets would follow, increasing with clip length. With 20 mm of noise and no
     ground three people of 30 s come out 5 mm too tall at most, and 21 mm at 0.03."""
-    shape_time: float = Field(default=10.0, ge=1e-6, le=1000)
+    shape_time_s: float = Field(default=10.0, ge=1e-6, le=1000)
     """Time of each person to estimate shape from [s], evenly spread: detector errors by view and
     pose do not average out over more."""
-    limit_spread: float = Field(default=0.1, ge=1e-6, le=10)
+    limit_std_rad: float = Field(default=0.1, ge=1e-6, le=10)
     """Standard deviation of angles beyond the joint limits [rad]."""
-    contact_height: float = Field(default=0.04, ge=1e-6, le=10)
+    contact_height_m: float = Field(default=0.04, ge=1e-6, le=10)
     """An ankle less than this above that of a flat foot may stand [m]."""
-    contact_speed: float = Field(default=0.5, ge=1e-6, le=100)
+    contact_speed_m_s: float = Field(default=0.5, ge=1e-6, le=100)
     """An ankle slower than this may stand [m/s]."""
-    contact_spread: float = Field(default=0.01, ge=1e-6, le=1)
+    contact_std_m: float = Field(default=0.01, ge=1e-6, le=1)
     """Standard deviation of a standing ankle from the height of a flat foot's [m]."""
-    slip_spread: float = Field(default=0.001, ge=1e-6, le=0.1)
+    slip_std_m: float = Field(default=0.001, ge=1e-6, le=0.1)
     """Standard deviation of a standing ankle's motion per frame [m]."""
     shape_steps: int = Field(default=7, ge=1, le=1000)
     """Gauss-Newton steps for shape, offsets and coarse poses together [1]."""

@@ -77,7 +77,7 @@ class Solver:
             self.prior,
             settings,
             fps,
-            settings.acceleration,
+            settings.acceleration_m_s2,
             settings.pose_weight,
             monocular_prior=monocular_prior,
         )
@@ -183,7 +183,7 @@ Joints = tuple[Floats, Floats]
 PIECE: Final = 1.0
 """Length of the intervals sampled from long tracks [s]."""
 BIAS_PRIOR_WEIGHT: Final = 8.0
-"""Weight of `bias_spread` as a prior, in squared offsets [1]."""
+"""Weight of `bias_std_m` as a prior, in squared offsets [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,12 +227,12 @@ def fit_shapes(
     ]
     found = dict(prior_shapes)
     unknowns = np.zeros(MIRRORED_OFFSETS.shape[-1])
-    spread = settings.bias_spread**2 * np.eye(len(unknowns))
-    expected = settings.bias_spread**2
+    spread = settings.bias_std_m**2 * np.eye(len(unknowns))
+    expected = settings.bias_std_m**2
     # A posterior of limited precision (Miller and Dunson 2019): errors of the model push the same
     # way in the frames of all persons.
     seconds = sum(len(piece.pose.transl) / piece.track.fps for piece in pieces)
-    firmness = max(1.0, seconds / settings.bias_time)
+    firmness = max(1.0, seconds / settings.bias_time_s)
     for step in range(settings.shape_steps if pieces else 0):
         if solver.ground is not None and step == settings.shape_steps // 2:
             pieces = [
@@ -269,7 +269,7 @@ def fit_shapes(
         # Learn the spread of offsets together with the offsets (expectation-maximisation).
         if step >= settings.shape_steps // 2:
             size = float(unknowns @ unknowns + np.trace(spread))
-            prior = BIAS_PRIOR_WEIGHT * settings.bias_spread**2
+            prior = BIAS_PRIOR_WEIGHT * settings.bias_std_m**2
             expected = (size + prior) / (len(unknowns) + BIAS_PRIOR_WEIGHT)
         betas_change = {
             # Large steps of the first, roughest linearisation leave the range of human shapes.
@@ -297,10 +297,10 @@ def _sample_pieces(
 ) -> list[_Piece]:
     """Return intervals of a person's track for shape estimation, with initial bodies."""
     settings, model = solver.settings, solver.chained.model
-    stride = max(1, int(fps / settings.shape_rate))
+    stride = max(1, int(fps / settings.shape_rate_hz))
     rate = fps / stride
     scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
-    bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time * fps)
+    bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
     pieces = []
     for part in _spread_intervals(len(joints), fps, settings):
@@ -314,7 +314,7 @@ def _sample_pieces(
             solver.prior,
             settings,
             rate,
-            settings.shape_acceleration,
+            settings.shape_acceleration_m_s2,
             settings.shape_pose_weight,
         )
         pose = Pose(*start_poses(model, betas, interpolate_gaps(some), solver.prior), betas)
@@ -323,10 +323,10 @@ def _sample_pieces(
 
 
 def _spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
-    """Return evenly spread intervals of `frames`, `shape_time` in total; all frames if fewer."""
-    if frames <= settings.shape_time * fps:
+    """Return evenly spread intervals of `frames`, `shape_time_s` in total; all frames if fewer."""
+    if frames <= settings.shape_time_s * fps:
         return [slice(0, frames)]
     length = max(3, round(PIECE * fps))
-    count = max(1, round(settings.shape_time / PIECE))
+    count = max(1, round(settings.shape_time_s / PIECE))
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return [slice(int(start), int(start) + length) for start in starts]

@@ -186,12 +186,14 @@ def refine(
         spread[3:] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
     deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
-    share = estimate_flow_share(tracked.chain, tracked.keys.frames, deviation, settings.flow_drift)
+    share = estimate_flow_share(
+        tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
+    )
     noise, matches = PlayerNoise(0.0, 0.0), None
     solution: Solution | None = None
     offset: FeedOffset | None = None
     points, before = clicks, camera
-    for number in range(settings.rounds):
+    for number in range(settings.passes):
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
         parts = [clicks, lines.evidence]
@@ -206,14 +208,14 @@ def refine(
             parts.append(players)
         points = together(parts)
         problem = _problem(points, tracked.flow, share, lines.camera, spread, settings)
-        solution = solve(lines.camera, problem, settings.iterations)
+        solution = solve(lines.camera, problem, settings.max_iterations)
         camera = solution.camera
     assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
     lasting = correlation_time(tracked.chain.camera, fps)
     uncertainty = compute_uncertainty(
-        solution, problem, settings.line_shift, settings.player_shift, lasting
+        solution, problem, settings.line_shift_px, settings.player_shift, lasting
     )
     weights = Weights(
         flow_deviation_px=deviation,
@@ -244,7 +246,7 @@ def _problem(
         prior=build_prior(settings.prior, camera.focal, camera.image_size),
         smoothness=spread,
         flow_weight=share * settings.flow_weight,
-        flow_loss=settings.loss,
+        flow_loss=settings.loss_scale,
     )
 
 
@@ -262,7 +264,7 @@ def _select_flow(
         frame=np.repeat(np.arange(len(followed)), counts),
         start=_stacked([p.start[mine] for p, mine in zip(followed, kept, strict=True)]),
         end=_stacked([p.end[mine] for p, mine in zip(followed, kept, strict=True)]),
-        deviation=np.full(sum(counts), max(seen, settings.flow_noise)),
+        deviation=np.full(sum(counts), max(seen, settings.flow_noise_px)),
     )
 
 

@@ -114,7 +114,7 @@ def calibrate_keys(
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
-        camera = solve(camera, problem, settings.iterations).camera
+        camera = solve(camera, problem, settings.max_iterations).camera
     return Keys(np.array(list(found)), camera, clicks, refused, wrong)
 
 
@@ -201,17 +201,17 @@ def _clicks(
                 kind=CLICK,
                 source=np.full(len(points), -1),
                 ends=own,
-                shares=np.where(own >= 0, settings.survey_error, 0.0),
+                shares=np.where(own >= 0, settings.survey_error_m, 0.0),
             ),
-            np.full(len(points), settings.click_noise),
+            np.full(len(points), settings.click_noise_px),
             settings.field_weight,
-            settings.loss,
+            settings.loss_scale,
         )
     ]
     numbers = camera.camera[0].numbers
     for marking in drawn:
         pixels = np.array(marking.xy).reshape(-1, 2)
-        samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing)
+        samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
         place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
         nearest_on_markings(
             numbers,
@@ -234,11 +234,11 @@ def _clicks(
                     kind=CLICK,
                     source=np.full(int(known.sum()), -1),
                     ends=np.tile([template[name] for name in names], (int(known.sum()), 1)),
-                    shares=settings.survey_error * shares,
+                    shares=settings.survey_error_m * shares,
                 ),
                 normal[known],
-                np.full(int(known.sum()), settings.key_frame.drawn_noise),
-                settings.loss,
+                np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
+                settings.loss_scale,
             )
         )
     return together(parts)

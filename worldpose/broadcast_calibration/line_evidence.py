@@ -84,7 +84,7 @@ def find_lines(
         people: boxes (detections, 4) [px] that occlude lines; None = no people.
         settings: search width, noise, number of samples.
     """
-    first = _look(camera, samples, picture, people, settings, settings.line_reach)
+    first = _look(camera, samples, picture, people, settings, settings.line_search_px)
     if len(first) < _FEW:
         return PointEvidence.none(), camera
     corrected = _corrected(camera, first)
@@ -142,7 +142,7 @@ def _look(
         variances,
     )
     found = np.isfinite(exact)
-    deviation = np.sqrt(variances[found] + settings.line_noise**2)
+    deviation = np.sqrt(variances[found] + settings.line_noise_px**2)
     return PointEvidence.across_lines(
         ObservedPoints(
             frame=np.zeros(int(found.sum()), dtype=np.int64),
@@ -151,11 +151,11 @@ def _look(
             kind=MARKING,
             source=lines.marking[index][found],
             ends=lines.ends[index][found],
-            shares=settings.survey_error * lines.shares[index][found],
+            shares=settings.survey_error_m * lines.shares[index][found],
         ),
         normals[found],
         deviation,
-        settings.loss,
+        settings.loss_scale,
     )
 
 

@@ -207,7 +207,7 @@ def player_evidence(
         ),
         np.maximum(deviation, 0.5),
         settings.player_weight / noise.frames,
-        settings.loss,
+        settings.loss_scale,
     )
     return evidence, noise
 

@@ -27,21 +27,21 @@ class Prior:
         center: (3,) [m], world.
         center_information: (3, 3) [1/m^2].
         principal_point: (2,) [px].
-        principal_spread: (2,) [px].
-        log_focal: (frames,); with `focal_spread`.
-        focal_spread: standard deviation of the logarithm.
+        principal_std: (2,) [px].
+        log_focal: (frames,); with `log_focal_std`.
+        log_focal_std: standard deviation of the logarithm.
         distortion: (frames, 3).
-        distortion_spread: (frames, 3).
+        distortion_std: (frames, 3).
     """
 
     center: Floats
     center_information: Floats
     principal_point: Floats
-    principal_spread: Floats
+    principal_std: Floats
     log_focal: Floats
-    focal_spread: float
+    log_focal_std: float
     distortion: Floats
-    distortion_spread: Floats
+    distortion_std: Floats
 
 
 def build_prior(
@@ -58,16 +58,16 @@ def build_prior(
     middle = 0.5 * (image_size - 1.0)
     zoom = focal / (REFERENCE * width)
     growth = np.stack([zoom**1.6, zoom, zoom], axis=-1)
-    spread = np.array([settings.k1_spread, settings.k2_spread, settings.k3_spread])
+    spread = np.array([settings.k1_std, settings.k2_std, settings.k3_std])
     return Prior(
-        center=np.array(settings.center),
-        center_information=np.diag(1.0 / np.square(settings.center_spread)),
+        center=np.array(settings.center_m),
+        center_information=np.diag(1.0 / np.square(settings.center_std_m)),
         principal_point=middle + width * np.array(settings.principal_point),
-        principal_spread=width * np.array(settings.principal_point_spread),
+        principal_std=width * np.array(settings.principal_point_std),
         log_focal=np.full(len(focal), np.log(settings.focal * width)),
-        focal_spread=settings.focal_spread,
+        log_focal_std=settings.log_focal_std,
         distortion=growth * np.array([settings.k1, settings.k2, 0.0]),
-        distortion_spread=growth * spread,
+        distortion_std=growth * spread,
     )
 
 

@@ -159,10 +159,10 @@ def report_calibration(
     status[keys.frames] = FRAME_STATUS.index("key_frame")
     earlier, later = median_residuals(fit.before, points), median_residuals(camera, points)
     reasons = []
-    share = float(np.mean(expected > settings.weak_error))
+    share = float(np.mean(expected > settings.weak_error_px))
     if share > 0.05:
         reasons.append(
-            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error:g} px"
+            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error_px:g} px"
         )
     bridged = int((status == FRAME_STATUS.index("bridged")).sum())
     if bridged:

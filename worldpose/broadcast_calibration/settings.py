@@ -23,25 +23,25 @@ class BroadcastPrior(Record):
 
     principal_point: tuple[_Offset, _Offset] = (0.0, -0.018)
     """From the image center, in image widths [1]; 2022: 0, and -35 px of 1920."""
-    principal_point_spread: tuple[Positive, Positive] = (0.01, 0.012)
+    principal_point_std: tuple[Positive, Positive] = (0.01, 0.012)
     """In widths [1]; 2022: 19 and 23 px of 1920."""
     focal: float = Field(default=2.1, ge=1e-6, le=1000)
     """In image widths [1]; 2022: 1.25 to 3.7."""
-    focal_spread: float = Field(default=0.4, ge=1e-6, le=100)
+    log_focal_std: float = Field(default=0.4, ge=1e-6, le=100)
     """Of the focal length's logarithm [1]."""
     k1: float = Field(default=0.4, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length to the power 1.6."""
-    k1_spread: float = Field(default=0.25, ge=1e-6, le=100)
+    k1_std: float = Field(default=0.25, ge=1e-6, le=100)
     """As `k1`, with the same growth [1]; 2022: 0.08. Wide enough for a lens without distortion."""
     k2: float = Field(default=1.5, ge=-100, le=100)
     """At a focal length of 2.19 widths [1]; it grows with the focal length."""
-    k2_spread: float = Field(default=0.8, ge=1e-6, le=100)
+    k2_std: float = Field(default=0.8, ge=1e-6, le=100)
     """As `k2`, with the same growth [1]; 2022: 0.5 to 0.8."""
-    k3_spread: float = Field(default=0.5, ge=1e-6, le=100)
-    """As `k2_spread`, about zero [1]: the released cameras have none (trap 3)."""
-    center: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
+    k3_std: float = Field(default=0.5, ge=1e-6, le=100)
+    """As `k2_std`, about zero [1]: the released cameras have none (trap 3)."""
+    center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
     """World [m]: on the main stand, at the halfway line."""
-    center_spread: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)
+    center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)
     """[m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in large stadiums."""
 
 
@@ -50,21 +50,21 @@ class BroadcastCalibrationSettings(Record):
 
     prior: BroadcastPrior = BroadcastPrior()
     """Gaussian prior of the camera."""
-    click_noise: float = Field(default=1.0, ge=1e-6, le=100)
+    click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]."""
-    survey_error: float = Field(default=0.006, ge=0, le=1)
+    survey_error_m: float = Field(default=0.006, ge=0, le=1)
     """Of the template's markings from the painted ones, each axis, standard deviation [m]."""
     field_weight: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the loss of markings (M3; the paper's 1)."""
     player_weight: float = Field(default=0.5, ge=0, le=100)
     """Factor on the loss of players' keypoints (M4; the paper's 0.5): with residuals in standard
     deviations, two keypoints of a person are worth one; a detector's errors are correlated."""
-    loss: float = Field(default=3.0, ge=1e-6, le=1000)
+    loss_scale: float = Field(default=3.0, ge=1e-6, le=1000)
     """Scale of the Geman-McClure losses [standard deviations]; the paper gives none."""
-    line_noise: float = Field(default=0.3, ge=1e-6, le=100)
+    line_noise_px: float = Field(default=0.3, ge=1e-6, le=100)
     """Minimum standard deviation of a painted line's sample across it [px]: survey error and paint
     edges, which the image noise does not include."""
-    line_shift: float = Field(default=0.05, ge=0, le=10)
+    line_shift_px: float = Field(default=0.05, ge=0, le=10)
     """Common shift of all painted lines in the image, each axis, standard deviation [px], from
     sharpening or a lens beyond k1 to k3: it enters the covariance, since no residual shows it."""
     player_shift: float = Field(default=0.05, ge=0, le=10)
@@ -73,18 +73,18 @@ class BroadcastCalibrationSettings(Record):
     0.05 is 3 mm in the world."""
     line_samples: int = Field(default=240, ge=20, le=100_000)
     """Approximate maximum number of line samples per frame [1]."""
-    line_reach: float = Field(default=12.0, ge=1e-6, le=10000)
+    line_search_px: float = Field(default=12.0, ge=1e-6, le=10000)
     """Maximum distance of lines from their projection in the search [px]."""
     flow_points: int = Field(default=400, ge=30, le=100_000)
     """Approximate number of points followed from frame to frame [1]."""
-    flow_noise: float = Field(default=0.1, ge=1e-6, le=10)
+    flow_noise_px: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum standard deviation of a followed point's motion [px]; a larger value measured in the
     clip replaces it."""
     flow_outlier: float = Field(default=3.5, ge=1e-6, le=1000)
     """Maximum modified z-score of a followed point (M6; threshold of Iglewicz and Hoaglin)."""
     flow_weight: float = Field(default=1.0, ge=0, le=100)
     """Factor on the loss of followed points (M6); 0 = without."""
-    flow_drift: float = Field(default=0.15, ge=1e-6, le=100)
+    flow_drift_px: float = Field(default=0.15, ge=1e-6, le=100)
     """Drift of tracking after one frame, growing with the square root of the frames [px]; the drift
     measured between two or more key frames replaces it."""
     smooth: bool = True
@@ -92,9 +92,9 @@ class BroadcastCalibrationSettings(Record):
     feed_offset: Literal["report", "correct"] = "report"
     """Handling of the feed's clock offset from the static cameras: report it, or shift people in
     time by it if it is determined."""
-    rounds: int = Field(default=2, ge=1, le=1000)
+    passes: int = Field(default=2, ge=1, le=1000)
     """Iterations of player matching and line search [1]."""
-    iterations: int = Field(default=30, ge=1, le=10000)
+    max_iterations: int = Field(default=30, ge=1, le=10000)
     """Maximum solver iterations in each of these passes [1]."""
     solver: Literal["levenberg_marquardt", "adam"] = "levenberg_marquardt"
     """Solver of the last fit; Adam is the paper's (M5)."""
@@ -103,7 +103,7 @@ class BroadcastCalibrationSettings(Record):
     cut_share: float = Field(default=0.25, gt=0, lt=1)
     """Minimum share of followed points consistent with a rotating and zooming camera between two
     frames of one shot [1]."""
-    weak_error: float = Field(default=3.0, ge=1e-6, le=1000)
+    weak_error_px: float = Field(default=3.0, ge=1e-6, le=1000)
     """A clip is weak if more than a twentieth of its frames have a larger expected image error of
     places on the pitch [px]."""
 
@@ -116,16 +116,16 @@ class BroadcastCalibrationSettings(Record):
         corner = (0.574 / 2.19) ** 2
         camera = CameraPrior(
             focal=prior.focal,
-            focal_spread=prior.focal_spread,
-            principal_point_spread=0.02,
+            log_focal_std=prior.log_focal_std,
+            principal_point_std=0.02,
             k1=prior.k1 * corner,
-            k1_spread=1.5 * prior.k1_spread * corner,
-            k2_spread=2.0 * prior.k2 * corner**2,
-            height=prior.center[2],
-            height_spread=0.35,
-            distance=-prior.center[1],
-            distance_spread=0.25,
+            k1_std=1.5 * prior.k1_std * corner,
+            k2_std=2.0 * prior.k2 * corner**2,
+            height_m=prior.center_m[2],
+            log_height_std=0.35,
+            distance_m=-prior.center_m[1],
+            log_distance_std=0.25,
         )
         return StaticCalibrationSettings(
-            prior=camera, click_noise=self.click_noise, survey_error=self.survey_error
+            prior=camera, click_noise_px=self.click_noise_px, survey_error_m=self.survey_error_m
         )

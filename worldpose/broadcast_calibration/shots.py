@@ -32,21 +32,21 @@ _UNLIKE: Final = 30.0
 class ProgrammeSettings(Record):
     """Criteria for shots of a programme as clip proposals."""
 
-    rate: float = Field(default=25.0, ge=1e-6, le=10000)
-    """Approximate sampling rate of frames [1/s]; it limits the accuracy of cuts."""
+    rate_hz: float = Field(default=25.0, ge=1e-6, le=10000)
+    """Approximate sampling rate of frames [Hz]; it limits the accuracy of cuts."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
     """As in calibration: minimum share of homography inliers within a shot [1]."""
-    transition: float = Field(default=0.1, ge=1e-6, le=10)
+    min_transition_s: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
     replay."""
-    shortest: float = Field(default=4.0, ge=1e-6, le=1000)
+    min_duration_s: float = Field(default=4.0, ge=1e-6, le=1000)
     """Minimum duration of a clip [s]."""
-    grass: float = Field(default=0.5, gt=0, lt=1)
+    min_grass_share: float = Field(default=0.5, gt=0, lt=1)
     """Minimum median share of grass in frames of a main camera [1]."""
-    tallest: float = Field(default=0.35, ge=1e-6, le=100)
+    max_person_height: float = Field(default=0.35, ge=1e-6, le=100)
     """Maximum median height of the tallest region on the grass, in image heights [1]: people are a
     tenth in a main camera, half and more in other cameras."""
-    pan: float = Field(default=0.25, ge=0, le=100)
+    min_pan: float = Field(default=0.25, ge=0, le=100)
     """Minimum pan of a clip, in image widths [1]: 7 degrees at a usual focal length."""
 
 
@@ -122,7 +122,7 @@ def find_shots(
         fps: frames per second.
         settings: limits.
     """
-    stride = max(1, round(fps / settings.rate))
+    stride = max(1, round(fps / settings.rate_hz))
     looked = max(1, round(_LOOK * fps / stride))
     course: _Course | None = None
     before: Image | None = None
@@ -215,16 +215,20 @@ def _shot(
     grass, tallest = float(np.median(course.grass)), float(np.median(course.tallest))
     pan, seconds = course.right - course.left, count / fps
     # Neighbouring samples are a stride apart, in a shot and across a cut.
-    wipe = settings.transition * fps + stride
+    wipe = settings.min_transition_s * fps + stride
     sides = (
         before is not None and course.first - before > wipe,
         after is not None and after - course.last > wipe,
     )
     unfit = (
-        *((f"shorter than {settings.shortest:g} s",) if seconds < settings.shortest else ()),
-        *(("too little grass",) if grass < settings.grass else ()),
-        *(("people too large",) if tallest > settings.tallest else ()),
-        *(("hardly a pan",) if pan < settings.pan else ()),
+        *(
+            (f"shorter than {settings.min_duration_s:g} s",)
+            if seconds < settings.min_duration_s
+            else ()
+        ),
+        *(("too little grass",) if grass < settings.min_grass_share else ()),
+        *(("people too large",) if tallest > settings.max_person_height else ()),
+        *(("hardly a pan",) if pan < settings.min_pan else ()),
         *(("between two wipes, as replays are",) if all(sides) else ()),
     )
     return Shot(course.first, count, seconds, grass, tallest, pan, tuple(course.pictures), unfit)

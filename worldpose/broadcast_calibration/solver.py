@@ -212,14 +212,14 @@ def _add_prior(camera: MovingCamera, prior: Prior, system: NormalEquations) -> f
     corner[:3, :3] += prior.center_information
     right_corner[:3] += prior.center_information @ off
     cost = 0.5 * float(off @ prior.center_information @ off)
-    moved = (camera.principal_point - prior.principal_point) / prior.principal_spread
-    corner[[3, 4], [3, 4]] += 1.0 / prior.principal_spread**2
-    right_corner[3:CLIP_SIZE] += moved / prior.principal_spread
+    moved = (camera.principal_point - prior.principal_point) / prior.principal_std
+    corner[[3, 4], [3, 4]] += 1.0 / prior.principal_std**2
+    right_corner[3:CLIP_SIZE] += moved / prior.principal_std
     cost += 0.5 * float(moved @ moved)
     lens = np.concatenate([np.log(camera.focal)[:, None], camera.distortion], axis=1)
     middle = np.concatenate([prior.log_focal[:, None], prior.distortion], axis=1)
-    width = np.full((len(lens), 1), prior.focal_spread)
-    spread = np.concatenate([width, prior.distortion_spread], axis=1)
+    width = np.full((len(lens), 1), prior.log_focal_std)
+    spread = np.concatenate([width, prior.distortion_std], axis=1)
     gone = (lens - middle) / spread
     blocks[0][:, range(3, FRAME_SIZE), range(3, FRAME_SIZE)] += 1.0 / spread**2
     right[:, 3:] += gone / spread

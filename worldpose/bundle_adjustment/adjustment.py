@@ -117,10 +117,14 @@ def adjust_cameras(
     Note:
         B1-B3, trap 1; paper section "Bundle Adjustment".
     """
-    proposed = propose_frames(clip, settings.frames, settings.frame_gap, settings.min_views)
+    proposed = propose_frames(
+        clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views
+    )
     used = np.flatnonzero(np.isin(clip.frame, settings.chosen_frames))
     used = used if settings.chosen_frames else proposed
-    judged = propose_frames(clip, settings.frames, settings.frame_gap, settings.min_views, used)
+    judged = propose_frames(
+        clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views, used
+    )
     judged = judged if len(judged) else used
     clip = learn_confidence(clip, np.union1d(used, judged))
     adjuster = _Adjuster(clip, settings, used, judged)
@@ -253,7 +257,7 @@ class _Adjuster:
             # The next solution starts here and needs two or three steps.
             self.offset, self.observations = rough.offset, observed._replace(points=rough.points)
             self.noise = estimate_noise(
-                rough.cameras, rough.points, self.observations, settings.robust_scale
+                rough.cameras, rough.points, self.observations, settings.loss_scale
             )
         # A stated covariance never shrinks; the prior of given cameras may. Update only once: after
         # more updates, one camera that shows other people would free all the others.
@@ -351,7 +355,7 @@ class _Adjuster:
             )[0]
         information, _ = camera_knowledge(self.clip, self.settings)
         factor = self.variance_factor[:, None, None]
-        response = survey_response(self.clip, self.settings.survey_error)
+        response = survey_response(self.clip, self.settings.survey_error_m)
         return add_shared_errors(
             adjusted.camera_covariance,
             information / factor,
@@ -374,7 +378,7 @@ class _Adjuster:
 
     def held_out_errors(self, fixed: Flags | None) -> HeldOutErrors:
         """Return held-out errors by cameras adjusted without each group; None = initial cameras."""
-        robust = self.settings.robust_scale
+        robust = self.settings.loss_scale
         groups = self._groups(len(self.judged))
         if fixed is None or self.settings.evidence == "markings":
             cameras = self.clip.cameras if fixed is None else self.adjust(fixed).cameras

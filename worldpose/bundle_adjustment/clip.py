@@ -209,8 +209,8 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
     exact = {
         "learn_noise": False,
         "offsets": "none",
-        "pixel_noise": settings.pixel_noise / np.sqrt(max_precision),
-        "joint_noise": settings.joint_noise / np.sqrt(max_precision),
+        "pixel_noise_px": settings.pixel_noise_px / np.sqrt(max_precision),
+        "joint_noise_m": settings.joint_noise_m / np.sqrt(max_precision),
     }
     return replace(
         clip, confidence=precision / max_precision, triangulation=settings.model_copy(update=exact)
@@ -244,7 +244,7 @@ def project_joints(
     with np.errstate(invalid="ignore", divide="ignore"):
         size = cameras.focal.mean(axis=-1)[:, None] / depth.T
         size = size.reshape(shape).swapaxes(0, 1)
-        variance = settings.pixel_noise**2 + (settings.joint_noise * size) ** 2
+        variance = settings.pixel_noise_px**2 + (settings.joint_noise_m * size) ** 2
         noise = np.sqrt(variance / confidence)
     noise[~np.isfinite(noise)] = np.inf
     return predicted.reshape((*shape, 2)).swapaxes(0, 1), noise

@@ -22,7 +22,7 @@ _UNINFORMATIVE: Final = 100.0 * np.array(
 )
 """Standard deviations of an uninformative prior [rad, m, 1, px, 1]; they only keep the system
 regular. A hundredth of them would already constrain the lens."""
-MARKINGS_SOLVER: Final = SolverSettings(iterations=500, cost_change=1e-6)
+MARKINGS_SOLVER: Final = SolverSettings(max_iterations=500, min_cost_change=1e-6)
 """For ill-conditioned directions as long and flat as those of a lens determined by six clicks."""
 
 
@@ -69,7 +69,7 @@ def players_problem(
     information, free = camera_knowledge(clip, settings)
     information = information / np.reshape(variance_factor, (-1, 1, 1))
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
-    scale = settings.robust_scale / np.sqrt(noise.correlation)
+    scale = settings.loss_scale / np.sqrt(noise.correlation)
     return Problem(
         cameras=clip.cameras,
         free=free & ~fixed[:, None],
@@ -131,7 +131,7 @@ def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSetting
         point_of=np.arange(len(world)),
         camera_of=np.repeat(np.arange(len(has)), [len(i) for i in clicked]),
         image=np.concatenate(image),
-        weight=np.full(len(world), settings.click_noise**-2.0),
+        weight=np.full(len(world), settings.click_noise_px**-2.0),
         scale=np.full(len(world), np.inf),
         names=clip.names,
     )
@@ -170,7 +170,7 @@ def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> Floats:
     distance = np.where(np.isfinite(distance), distance, usual)
     given = settings.given
     spread = np.zeros((count, _SIZE))
-    spread[:, :3] = given.rotation
+    spread[:, :3] = given.rotation_rad
     spread[:, 3:6] = given.center * distance[:, None]
     spread[:, 6] = given.focal
     on_lines = np.zeros(count, dtype=np.bool_) if clip.on_lines is None else clip.on_lines

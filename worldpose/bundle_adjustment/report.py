@@ -38,9 +38,11 @@ def adjustment_arrays(
     """
     clip = adjusted.clip
     outliers = keypoint_outliers(
-        clip, adjusted.cameras, adjusted.noise, settings.wrong_keypoint, settings.review
+        clip, adjusted.cameras, adjusted.noise, settings.wrong_keypoint, settings.max_review_items
     )
-    clicks = review_clicks(clip.clicks, adjusted.cameras, adjusted.covariance, settings.click_noise)
+    clicks = review_clicks(
+        clip.clicks, adjusted.cameras, adjusted.covariance, settings.click_noise_px
+    )
     weak = [
         weak_direction(adjusted.cameras[c], adjusted.covariance[c]) for c in range(len(clip.clicks))
     ]

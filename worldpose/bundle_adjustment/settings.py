@@ -18,7 +18,7 @@ class GivenCameraPrior(Record):
     together. Lens coefficients and principal point are fixed.
     """
 
-    rotation: float = Field(default=0.0005, ge=1e-12, le=0.1)
+    rotation_rad: float = Field(default=0.0005, ge=1e-12, le=0.1)
     """About each axis [rad]: a pixel at a focal length of 2000 px."""
     center: float = Field(default=0.0025, ge=1e-6, le=1)
     """Along each axis, relative to the distance between camera and people [1]: 1 cm in a room,
@@ -37,19 +37,19 @@ class BundleAdjustmentSettings(Record):
     evidence: Literal["markings_and_players", "markings"] = "markings_and_players"
     """Observations in the adjustment. `markings` alone, with every parameter of the lens free and
     no prior, is the paper's warning (trap 1); it exists for measurements."""
-    candidates: int = Field(default=3000, ge=1, le=1_000_000)
+    max_candidates: int = Field(default=3000, ge=1, le=1_000_000)
     """Maximum candidate frames of all clips [1], evenly spread: a minute at 50 frames per second,
     and 0.3 GB of detections from 16 cameras."""
-    frames: int = Field(default=40, ge=1, le=10000)
-    """Maximum frames in the adjustment [1]; more add seconds and little information."""
-    frame_gap: float = Field(default=0.1, ge=0, le=10)
+    max_frames: int = Field(default=40, ge=1, le=10000)
+    """Maximum frames in the adjustment [frame]; more add seconds and little information."""
+    min_frame_gap_s: float = Field(default=0.1, ge=0, le=10)
     """Minimum time between two of them [s]: detector errors last about 0.3 s."""
     chosen_frames: tuple[Frame, ...] = ()
-    """Match frames that a user chose instead; a clip ignores those outside it."""
+    """Match frames that a user chose instead [frame]; a clip ignores those outside it."""
     min_views: int = Field(default=3, ge=2, le=1000)
     """Minimum inlier cameras of a joint in the adjustment [1]: two views hardly contradict each
     other."""
-    robust_scale: float = Field(default=3.0, ge=1e-6, le=1000)
+    loss_scale: float = Field(default=3.0, ge=1e-6, le=1000)
     """Standard deviations of an observation beyond which it counts less (Cauchy's loss) [1]:
     inliers lose a few per cent of efficiency."""
     folds: int = Field(default=4, ge=2, le=1000)
@@ -65,18 +65,18 @@ class BundleAdjustmentSettings(Record):
     min_significance: float = Field(default=3.0, ge=0, le=1000)
     """Standard errors by which the held-out loss must fall for given cameras, and for rigs of up to
     four cameras, to change at all [1]."""
-    survey_error: float = Field(default=SURVEY_ERROR, ge=0, le=1)
+    survey_error_m: float = Field(default=SURVEY_ERROR, ge=0, le=1)
     """Error of the surveyed ends of painted lines, standard deviation along each axis [m]; all
     cameras share it."""
-    click_noise: float = Field(default=1.0, ge=1e-6, le=100)
+    click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view."""
     wrong_click: float = Field(default=4.2, ge=1e-6, le=1000)
     """Mahalanobis distance from which a click is proposed for removal [1]: 0.015 % of correct ones
     (chi-square, two degrees of freedom)."""
     wrong_keypoint: float = Field(default=4.2, ge=1e-6, le=1000)
     """Mahalanobis distance from which a keypoint is on the review list [1]."""
-    review: int = Field(default=1000, ge=0, le=100_000)
+    max_review_items: int = Field(default=1000, ge=0, le=100_000)
     """Maximum length of the review list of keypoints and people [1]; the worst come first."""
-    solver: SolverSettings = SolverSettings(cost_change=1e-5)
+    solver: SolverSettings = SolverSettings(min_cost_change=1e-5)
     """Stopping rule of the solver: with a robust loss the last steps are small and many, and two
     more digits of the cost move the cameras' ground by less than 0.1 mm."""

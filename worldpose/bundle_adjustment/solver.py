@@ -35,9 +35,9 @@ all cameras [1]."""
 class SolverSettings(Record):
     """Stopping rule and initial damping of the solver."""
 
-    iterations: int = Field(default=50, ge=1, le=10000)
+    max_iterations: int = Field(default=50, ge=1, le=10000)
     """Maximum steps [1]; a dozen are usual."""
-    cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
+    min_cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
     """Relative gain below which a step is the last [1]: two orders below the gain that moves a
     joint by a tenth of a millimetre."""
     damping: float = Field(default=1e-4, ge=1e-12, le=1e6)
@@ -88,7 +88,7 @@ class Solution:
         cost: robust sum of squares with priors.
         start_cost: the same at the start.
         iterations: number of steps tried.
-        converged: whether the last step gained less than `cost_change`.
+        converged: whether the last step gained less than `min_cost_change`.
         camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
             free; zero for fixed parameters, empty if not requested.
     """
@@ -142,9 +142,9 @@ def solve(
         damping=settings.damping,
         decrease=5.0,
         min_damping=1e-9,
-        iterations=settings.iterations,
+        iterations=settings.max_iterations,
         # A gain below rounding error means convergence, too.
-        converged=lambda before, after: abs(before - after) <= settings.cost_change * before,
+        converged=lambda before, after: abs(before - after) <= settings.min_cost_change * before,
     )
     found = minimize(start, system.step, schedule)
     last = found.state

@@ -148,7 +148,7 @@ def relative_covariance(
 
 _SPACING: Final = 0.25
 """Spacing of samples along painted lines [m]."""
-_LINE_WIDTH: Final = LineRefinementSettings().line_width
+_LINE_WIDTH: Final = LineRefinementSettings().line_width_m
 _APART: Final = 8.0
 """Minimum distance of two independent samples in an image [px]: the width of a bar across a
 line."""
@@ -158,7 +158,7 @@ _NOISE: Final = 0.1
 """Standard deviation of a sample across its line [px]. With it, and the true errors of a survey,
 the response predicts the displacement of people by all cameras to 0.6 of 6 mm on simulated matches;
 0.3 predicts two thirds of it, 0.03 the same."""
-_SHIFT: Final = LineRefinementSettings().line_shift
+_SHIFT: Final = LineRefinementSettings().line_shift_px
 """Standard deviation of the shift of a whole line in one image [px]; no other camera shares it."""
 
 

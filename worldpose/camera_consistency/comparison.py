@@ -27,10 +27,10 @@ class ConsistencySettings(Record):
     leave_out: bool = True
     """Exclude faulty cameras; else the run continues with them and warns."""
     sample_frames: int = Field(default=48, ge=4, le=10000)
-    """Frames at which cameras are compared [1]."""
-    stretch_frames: int = Field(default=500, ge=2, le=100_000)
+    """Frames at which cameras are compared [frame]."""
+    max_chunk_frames: int = Field(default=500, ge=2, le=100_000)
     """Longest chunk of frames in which clocks are compared [frame]."""
-    pixel_noise: float = Field(default=1.5, ge=1e-6, le=1000)
+    pixel_noise_px: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation of a keypoint, independent of people's size [px]."""
 
 
@@ -328,7 +328,7 @@ class Comparison:
         view = self.view(c, hypothesis)
         at = self.times(hypothesis)
         matched = detections = expected = found = 0
-        gate = TrackingSettings().gate
+        gate = TrackingSettings().gate_m
         for n, joints in enumerate(people):
             if at[n] < 0:
                 continue

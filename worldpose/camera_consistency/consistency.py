@@ -62,13 +62,13 @@ def check_consistency(
             todo="Give arrays of the same clip and cameras.",
         )
     count = int(cameras.batch_shape[0])
-    part = _select_busiest_frames(confidence, settings.stretch_frames)
+    part = _select_busiest_frames(confidence, settings.max_chunk_frames)
     points = np.array(keypoints[part], dtype=np.float64)
     points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
     if count < 2 or not len(points):
         return Consistency((), (), tuple(range(count)), np.zeros((count, count)))
     given, tilt = np.ones(count, dtype=np.bool_), np.full(count, GIVEN_TILT)
-    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise)
+    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise_px)
     if covariance is not None:
         known = [bool(np.isfinite(each).all()) for each in covariance]
         given = np.logical_not(known)

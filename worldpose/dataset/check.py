@@ -108,7 +108,7 @@ def skeleton_findings(
     upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
     thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
     for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
-        if settings.bones[0] <= thigh / size <= settings.bones[1]:
+        if settings.bones_m[0] <= thigh / size <= settings.bones_m[1]:
             yield Finding(
                 fault=unit,
                 kind="convention",
@@ -135,7 +135,7 @@ def skeleton_findings(
         left["the world's x, y, z"] = _left(in_world, plane[posed], focal[posed])
     best = min(left, key=lambda name: left[name])
     shipped, least = left[_AS_SHIPPED], left[best]
-    if shipped - least > settings.least_gain_px and least < settings.explained * shipped:
+    if shipped - least > settings.min_gain_px and least < settings.max_share_left * shipped:
         yield Finding(
             fault="skeleton_axes",
             kind="convention",

@@ -242,14 +242,14 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
     Returns:
         None if they have no points in common.
     """
-    sample = _sample(source, view, settings.sample)
+    sample = _sample(source, view, settings.max_sample)
     if sample is None:
         return None
     errors = _errors(source.points, view.rows, sample, SOUND)
     shipped = _median(errors)
     best, least = SOUND, shipped
     for fault in _candidates(moving=len(view.rows.rotation) > 1):
-        if shipped < settings.least_gain_px:
+        if shipped < settings.min_gain_px:
             break
         points = source.points if fault.points is None else fault.points(source)
         if points is None:
@@ -261,9 +261,9 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
             best, least = fault, error
     # This order also works for infinity.
     height = _height(view)
-    explains = shipped - least > settings.least_gain_px and least < settings.explained * shipped
-    explains = explains and least <= settings.left * height
-    if not explains and np.isfinite(shipped) and shipped > settings.least_gain_px:
+    explains = shipped - least > settings.min_gain_px and least < settings.max_share_left * shipped
+    explains = explains and least <= settings.max_error_left * height
+    if not explains and np.isfinite(shipped) and shipped > settings.min_gain_px:
         found = find_frame_offset(source, view, settings)
         if found is not None:
             explains, best = True, found[0]
@@ -287,7 +287,7 @@ def agreement_findings(found: Iterable[Agreement], settings: CheckSettings) -> I
     for one in found:
         if one.fault is not SOUND:
             named.setdefault((one.source, one.fault.name, one.fault.says), []).append(one)
-        elif one.median_px > settings.tolerated * one.height_px:
+        elif one.median_px > settings.max_error * one.height_px:
             named.setdefault((one.source, "reprojection", _UNEXPLAINED), []).append(one)
     for (source, name, says), group in named.items():
         yield Finding(
@@ -410,9 +410,9 @@ def find_frame_offset(
         error = _error(points, view, seen, frame, person, fault)
         if error < least - 1e-9:
             best, least = fault, error
-    if best is None or shipped - least <= settings.least_gain_px:
+    if best is None or shipped - least <= settings.min_gain_px:
         return None
-    return (best, least / shipped) if least < settings.explained * shipped else None
+    return (best, least / shipped) if least < settings.max_share_left * shipped else None
 
 
 def _error(

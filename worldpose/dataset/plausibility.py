@@ -39,7 +39,7 @@ def plausible_share(source: PointSource, settings: CheckSettings) -> float:
         return 0.0
     height, middle = (nose[..., 2] - feet)[here], nose[here]
     good = (height > 0.3) & (height < 2.3) & (np.abs(feet[here]) < 1.5)
-    good &= (np.abs(middle[:, :2]) <= np.array(settings.bounds)).all(-1)
+    good &= (np.abs(middle[:, :2]) <= np.array(settings.bounds_m)).all(-1)
     return float(good.mean())
 
 
@@ -50,7 +50,7 @@ def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | N
     the first.
     """
     before = plausible_share(source, settings)
-    if before >= settings.plausible_share:
+    if before >= settings.min_plausible_share:
         return None, before, before
     best, most, nearest = None, before, np.inf
     for fault in point_faults():
@@ -62,7 +62,7 @@ def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | N
         height = abs(foot_height(moved))
         if share > most + 0.01 or (share >= most - 0.01 and height < nearest - 0.02):
             best, most, nearest = fault, share, height
-    return (best, before, most) if most >= settings.plausible_share else (None, before, before)
+    return (best, before, most) if most >= settings.min_plausible_share else (None, before, before)
 
 
 def foot_height(source: PointSource) -> float:
@@ -74,14 +74,14 @@ def foot_height(source: PointSource) -> float:
 def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
     """Yield feet above or below the pitch, and for poses whether their pivot explains it."""
     height = foot_height(source)
-    if np.isnan(height) or settings.ground_low <= height <= settings.ground_high:
+    if np.isnan(height) or settings.min_ground_m <= height <= settings.max_ground_m:
         return
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
     fault, left = "feet_off_the_ground", height
     if source.pivot is not None:
         moved = source.moved(source.points + source.pivot[:, :, None])
         left = foot_height(moved)
-        if settings.ground_low <= left <= settings.ground_high and abs(left) < 0.5 * abs(height):
+        if settings.min_ground_m <= left <= settings.max_ground_m and abs(left) < 0.5 * abs(height):
             fault = "root_about_origin"
             says += "; on the ground if global_orient turned about the model's origin"
     yield Finding(
@@ -107,7 +107,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         )
         seen = np.flatnonzero(np.isfinite(bone).any((0, 2)))
         lengths = np.array([np.nanmedian(bone[:, person]) for person in seen])
-        low, high = settings.bones
+        low, high = settings.bones_m
         if (wrong := (lengths < low) | (lengths > high)).any():
             yield Finding(
                 fault="limb_length",
@@ -119,12 +119,15 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
     middle = _hips(source)
     speed = np.linalg.norm(np.diff(middle, axis=0), axis=-1) * fps
     speed = speed[np.isfinite(speed)]
-    if len(speed) and (share := float((speed > settings.top_speed).mean())) > settings.fast_share:
+    if (
+        len(speed)
+        and (share := float((speed > settings.max_speed_m_s).mean())) > settings.max_fast_share
+    ):
         yield Finding(
             fault="speed",
             kind="plausibility",
             where=(source.name,),
-            says=f"people move faster than {settings.top_speed:g} m/s",
+            says=f"people move faster than {settings.max_speed_m_s:g} m/s",
             figures={"share_of_steps": share, "fastest_m_per_s": float(speed.max())},
         )
 
@@ -133,8 +136,8 @@ def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fin
     """Yield people off the pitch."""
     middle = _hips(source)
     here = np.isfinite(middle).all(-1)
-    away = np.abs(middle[here][:, :2]) > np.array(settings.bounds)
-    if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.plausible_share:
+    away = np.abs(middle[here][:, :2]) > np.array(settings.bounds_m)
+    if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.min_plausible_share:
         yield Finding(
             fault="off_the_pitch",
             kind="plausibility",
@@ -153,7 +156,7 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
         return
     where = (f"cameras/{view.name}",)
     residual = float(np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max())
-    if residual > settings.orthonormal:
+    if residual > settings.max_rotation_error:
         yield Finding(
             fault="rotation_not_orthonormal",
             kind="damage",
@@ -170,7 +173,7 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
             says="R mirrors: its determinant is -1",
         )
     drift = float(np.linalg.norm(centers(view.rows) - camera_center(view.rows), axis=-1).max())
-    if drift > settings.center_drift:
+    if drift > settings.max_center_drift_m:
         yield Finding(
             fault="moving_center",
             kind="plausibility",
@@ -285,7 +288,7 @@ def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> 
     stadium with the pitch in the centre of its image. For a moving camera nothing is known without
     people in frames with a pose.
     """
-    if visible_share(source, source.points, rows) >= settings.least_seen:
+    if visible_share(source, source.points, rows) >= settings.min_visible_share:
         return False
     if len(rows.rotation) > 1:
         posed = np.all(np.isfinite(rows.rotation), axis=(-1, -2))[: len(source.points)]
@@ -295,7 +298,7 @@ def is_blind(source: PointSource, rows: CameraRows, settings: CheckSettings) -> 
     if not STAND[0] < center[2] < STAND[1] or not forward[2] < 0.0 or not down[2] < 0.0:
         return True
     middle = center - forward * center[2] / forward[2]
-    return bool((np.abs(middle[:2]) > np.array(settings.bounds)).any())
+    return bool((np.abs(middle[:2]) > np.array(settings.bounds_m)).any())
 
 
 def visibility_findings(
@@ -304,7 +307,7 @@ def visibility_findings(
     """Yield findings on cameras that show too few people, and the fault that explains each.
 
     One writer makes one mistake: among the faults whose repair lets cameras show at least ten times
-    `least_seen` of the people, the fault that explains most cameras comes first.
+    `min_visible_share` of the people, the fault that explains most cameras comes first.
     """
     if not views:
         return
@@ -316,7 +319,7 @@ def visibility_findings(
             for column, view in enumerate(views):
                 rows = view.rows if fault.camera is None else fault.camera(view.rows)
                 share[row, column] = visible_share(source, points, rows)
-    share[share < 10.0 * settings.least_seen] = 0.0
+    share[share < 10.0 * settings.min_visible_share] = 0.0
     left = np.ones(len(views), dtype=np.bool_)
     while left.any():
         worth = (share > 0.0)[:, left].sum(1) + share[:, left].mean(1)
@@ -366,7 +369,10 @@ def turning_findings(source: PointSource, view: View, settings: CheckSettings) -
         return
     left = {late: _left(source, view, late) for late in range(-LATEST, LATEST + 1)}
     best = min(left, key=lambda late: (left[late], abs(late)))
-    if left[0] - left[best] > settings.least_gain_px and left[best] < settings.explained * left[0]:
+    if (
+        left[0] - left[best] > settings.min_gain_px
+        and left[best] < settings.max_share_left * left[0]
+    ):
         (fault,) = (f for f in frame_faults(moving=False) if f.later_points == best)
         yield Finding(
             fault=fault.name,

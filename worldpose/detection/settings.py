@@ -62,7 +62,7 @@ class DetectionSettings(Record):
     low_score_threshold: float = Field(default=0.1, gt=0, lt=1)
     """A box from this score on is a person where a track predicts one (ByteTrack's second pass)."""
     track_buffer_frames: int = Field(default=25, ge=1, le=10000)
-    """Frames after which an unseen track ends."""
+    """Time after which an unseen track ends [frame]."""
     max_gap_frames: int = Field(default=8, ge=0, le=1000)
     """Gaps of a track up to this length are filled with linearly interpolated boxes [frame]. Frames
     are buffered for as long, which costs memory. A third of a second is a step of a sprint."""

@@ -209,12 +209,12 @@ def _points(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a grid (n, 3) on the surface, and the same grid at player height [m]."""
     along, across = (
-        np.linspace(-0.5 * side, 0.5 * side, int(np.ceil(side / settings.spacing)) + 1)
+        np.linspace(-0.5 * side, 0.5 * side, int(np.ceil(side / settings.spacing_m)) + 1)
         for side in (pitch.length, pitch.width)
     )
     x, y = (values.ravel() for values in np.meshgrid(along, across, indexing="ij"))
     surface = np.stack([x, y, pitch.height(x, y)], axis=-1)
-    return surface, surface + np.array([0.0, 0.0, settings.player_height])
+    return surface, surface + np.array([0.0, 0.0, settings.player_height_m])
 
 
 def _figures(samples: Sequence[CameraSamples]) -> CameraErrors:

@@ -189,11 +189,11 @@ def _wrong(where: object, expected: str, found: str) -> InputError:
 class ReferenceSettings(Record):
     """Search range and gate of the alignment."""
 
-    max_offset: float = Field(default=2.0, gt=0)
+    max_offset_s: float = Field(default=2.0, gt=0)
     """Maximum clock offset of the search, either way [s]."""
-    step: float = Field(default=0.2, gt=0)
+    step_s: float = Field(default=0.2, gt=0)
     """Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
-    match_gate: float = Field(default=1.0, gt=0)
+    match_gate_m: float = Field(default=1.0, gt=0)
     """Maximum mean joint distance of a match after alignment [m], as in the evaluation."""
 
 
@@ -234,8 +234,8 @@ def align_reference(
     """
     settings = settings or ReferenceSettings()
     times = prediction.frames / fps
-    count = int(np.ceil(settings.max_offset / settings.step))
-    grid = np.arange(-count, count + 1) * settings.step
+    count = int(np.ceil(settings.max_offset_s / settings.step_s))
+    grid = np.arange(-count, count + 1) * settings.step_s
     tried = [
         (_match_cost(prediction.joints, sample_joints(joints, rate, times + o), settings), o)
         for o in grid
@@ -245,7 +245,7 @@ def align_reference(
     if match is None:
         raise DegenerateError(
             "the reference matches the prediction nowhere within "
-            f"{settings.max_offset:g} s of difference between their clocks"
+            f"{settings.max_offset_s:g} s of difference between their clocks"
         )
 
     def error(shift: float) -> float:
@@ -254,7 +254,7 @@ def align_reference(
     # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
         error,
-        bounds=(offset - settings.step, offset + settings.step),
+        bounds=(offset - settings.step_s, offset + settings.step_s),
         method="bounded",
         options={"xatol": 1e-4},
     )
@@ -291,21 +291,21 @@ def _match_cost(
     people: Floats, reference: Floats, settings: ReferenceSettings
 ) -> tuple[float, NDArray[np.int64] | None]:
     """Return the sum of joint distances, clipped at the gate, and the match after registration."""
-    motion = register_world(reference, people, settings.match_gate)
+    motion = register_world(reference, people, settings.match_gate_m)
     if motion is None:
         return np.inf, None
     moved = motion.apply(reference.reshape(len(reference), -1, 3)).reshape(reference.shape)
     distances = joint_distances(people, moved)
-    match = match_people(distances, settings.match_gate)
+    match = match_people(distances, settings.match_gate_m)
     there = int(np.isfinite(reference[..., 0]).any(-1).sum())
     if not (match >= 0).any():
         return np.inf, None
     chosen = np.take_along_axis(distances, np.maximum(match, 0)[..., None], axis=2)[..., 0]
-    total = np.where(match >= 0, chosen, 0.0).sum() + settings.match_gate * (
+    total = np.where(match >= 0, chosen, 0.0).sum() + settings.match_gate_m * (
         there - (match >= 0).sum()
     )
     # Missing people cost the gate, so that a short overlap that fits by chance does not win.
-    missing = settings.match_gate * (len(reference) * reference.shape[1] - there)
+    missing = settings.match_gate_m * (len(reference) * reference.shape[1] - there)
     return float(total + missing), match
 
 

@@ -424,9 +424,9 @@ def match_tracks(
         for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
     )
     if (match >= 0).sum() < settings.min_matched_share * possible:
-        motion = register_world(people, true, settings.match_gate)
+        motion = register_world(people, true, settings.match_gate_m)
         if motion is not None:
             moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
             distances = joint_distances(moved, true)
-            match = match_people(distances, settings.match_gate)
+            match = match_people(distances, settings.match_gate_m)
     return merge_tracks(match, distances)

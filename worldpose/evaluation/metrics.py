@@ -309,7 +309,7 @@ def evaluate_joints(
     settings = settings or EvaluationSettings()
     people = select_frames(prediction.joints, prediction.frames, reference.frames)
     distances = joint_distances(people, reference.joints)
-    match = match_people(distances, settings.match_gate)
+    match = match_people(distances, settings.match_gate_m)
     counts = _counting_joints(reference, settings)
     present = np.asarray(counts.any(axis=-1))
     exists = np.asarray(np.isfinite(people[..., 0]).any(axis=-1))
@@ -321,7 +321,7 @@ def evaluate_joints(
 
     true = np.where(counts[..., None], reference.joints, np.nan)
     tally = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
-    identity = identity_scores(distances, present, exists & ~idle, settings.match_gate)
+    identity = identity_scores(distances, present, exists & ~idle, settings.match_gate_m)
     around = None if boxes is None else select_frames(boxes, prediction.frames, reference.frames)
     tracks = match_tracks(people, reference.joints, distances, match, camera, around, settings)
     figures, persons = _track_figures(
@@ -445,7 +445,7 @@ def _track_figures(
         figures[f"per_person_g_mpjpe{suffix}_mm"] = _mean(errors.per_person, 1000.0)
         figures[f"pa_mpjpe{suffix}_mm"] = _mean(errors.per_frame, 1000.0)
         for name, values in (("meter", errors.shared), ("person", errors.per_person)):
-            drift = drift_per_meter(values, lengths, settings.min_trajectory)
+            drift = drift_per_meter(values, lengths, settings.min_trajectory_m)
             figures[f"per_{name}_drift{suffix}_cm_per_m"] = None if drift is None else 100.0 * drift
     whole, local = challenge_errors(predicted, true)
     figures["challenge_global_m"], figures["challenge_local_m"] = _mean(whole), _mean(local)

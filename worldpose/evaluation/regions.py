@@ -52,7 +52,7 @@ def region_counts(
         )
     joints = select_frames(prediction.joints, prediction.frames, reference.frames)
     stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
-    match = match_people(joint_distances(joints, reference.joints), settings.match_gate)
+    match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
     error = take_matched(joints, match) - reference.joints
     flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
     covariance = flat.reshape(*flat.shape[:3], 3, 3)

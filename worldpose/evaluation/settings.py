@@ -10,7 +10,7 @@ from data_contracts.records import Record
 class EvaluationSettings(Record):
     """Thresholds for matches, correct limbs and visible joints."""
 
-    match_gate: float = Field(default=1.0, ge=1e-6, le=100)
+    match_gate_m: float = Field(default=1.0, ge=1e-6, le=100)
     """Maximum mean joint distance of a match [m]: more than the error of a poor reconstruction,
     less than the distance between two players without contact."""
     pcp_alpha: float = Field(default=0.5, ge=1e-6, le=100)
@@ -28,7 +28,7 @@ class EvaluationSettings(Record):
     min_aligned_joints: int = Field(default=7, ge=3, le=1000)
     """Minimum joints, of 14, of a person in a frame for PA-MPJPE [1]: alignment to a few joints
     removes most of their error, and half a body hides the error of the other half."""
-    min_trajectory: float = Field(default=1.0, ge=1e-6, le=100)
+    min_trajectory_m: float = Field(default=1.0, ge=1e-6, le=100)
     """Minimum true path length of people for the drift [m]: the drift per metre of a standing
     goalkeeper is arbitrary."""
     min_matched_share: float = Field(default=0.5, ge=0, le=1)
@@ -39,9 +39,9 @@ class EvaluationSettings(Record):
 class CameraErrorSettings(Record):
     """Grid of test points for camera errors."""
 
-    spacing: float = Field(default=2.5, ge=1e-6, le=1000)
+    spacing_m: float = Field(default=2.5, ge=1e-6, le=1000)
     """Spacing of the grid over the pitch [m]: some 1200 points, of which a tight broadcast frame
     shows about a hundred."""
-    player_height: float = Field(default=1.0, ge=1e-6, le=100)
+    player_height_m: float = Field(default=1.0, ge=1e-6, le=100)
     """Height above the surface of the points for the reprojection error [m]: a player's middle,
     since cameras that are accurate on the grass can be wrong above it."""

@@ -22,6 +22,6 @@ class FilteringSettings(Record):
     two strangers running the same way, and less than for a body with a left-right swap."""
     min_keypoints: int = Field(default=5, ge=1, le=1000)
     """A box with fewer keypoints on a body is not judged as a whole [1]."""
-    held_out_frames: int = Field(default=64, ge=1, le=10000)
-    """Maximum frames, evenly spread, for the prediction of held-out cameras [1]: with 20 people in
-    16 cameras a quarter of a million keypoints."""
+    max_held_out_frames: int = Field(default=64, ge=1, le=10000)
+    """Maximum frames, evenly spread, for the prediction of held-out cameras [frame]: with 20
+    people in 16 cameras a quarter of a million keypoints."""

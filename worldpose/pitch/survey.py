@@ -147,20 +147,20 @@ class SurveySettings(Record):
     """Whether x, y and height of the survey are a left-handed frame, such as x north and y east."""
     fit_scale: bool = False
     """Divide by the survey's scale, as of a map projection, instead of only reporting it."""
-    accuracy: float = Field(default=0.03, ge=1e-6, le=10)
+    accuracy_m: float = Field(default=0.03, ge=1e-6, le=10)
     """Standard deviation of painted markings from the Laws of the Game [m]: a quarter of a line."""
-    largest_offset: float = Field(default=1.0, ge=1e-6, le=100)
+    max_offset_m: float = Field(default=1.0, ge=1e-6, le=100)
     """Offset beyond which a point's name is wrong [m]: no painter errs by that much."""
-    largest_scale: float = Field(default=0.08, ge=1e-6, le=10)
+    max_scale_error: float = Field(default=0.08, ge=1e-6, le=10)
     """Deviation of the scale from 1 beyond which lengths have another unit [1]: yards differ by 9
     %; a survey of the corners alone passes for pitches of 97 to 113 m by 63 to 73 m."""
-    length_spread: float = Field(default=5.0, ge=1e-6, le=1000)
+    length_std_m: float = Field(default=5.0, ge=1e-6, le=1000)
     """Standard deviation of pitch lengths around 105 m [m]: prior of a length not surveyed."""
-    width_spread: float = Field(default=4.0, ge=1e-6, le=1000)
-    """Standard deviation of pitch widths around 68 m [m]: as `length_spread`."""
-    crown_spread: float = Field(default=0.1, ge=1e-6, le=10)
-    """Standard deviation of crowns around 0.2 m [m]: as `length_spread`."""
-    slope_spread: float = Field(default=0.01, ge=1e-6, le=1)
+    width_std_m: float = Field(default=4.0, ge=1e-6, le=1000)
+    """Standard deviation of pitch widths around 68 m [m]: as `length_std_m`."""
+    crown_std_m: float = Field(default=0.1, ge=1e-6, le=10)
+    """Standard deviation of crowns around 0.2 m [m]: as `length_std_m`."""
+    slope_std: float = Field(default=0.01, ge=1e-6, le=1)
     """Standard deviation of the pitch's slope across it [1]: 1 %, the most on sport grounds."""
 
 
@@ -267,12 +267,12 @@ def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: Surve
     far = [
         f"{survey.names[n]} ({offset[n]:.2f} m)"
         for n in np.argsort(-offset)
-        if offset[n] > settings.largest_offset
+        if offset[n] > settings.max_offset_m
     ]
     if far:
         raise InputError(
             survey.where,
-            expected=f"every point within {settings.largest_offset:g} m of the place of its name",
+            expected=f"every point within {settings.max_offset_m:g} m of the place of its name",
             found=f"farther off: {', '.join(far[:6])}",
             todo="Exchange or correct these names, or remove the points from the file.",
         )
@@ -415,20 +415,20 @@ def _fit_plan(
     size = np.array(_STANDARD_SIZE)
     turn = _best_rotation(centred, law[:, :2] + change * size)
     shift = (law[:, :2] + change * size).mean(axis=0)
-    spreads = np.array([settings.length_spread, settings.width_spread])
+    spreads = np.array([settings.length_std_m, settings.width_std_m])
     scale = 1.0
     for iteration in range(_MAX_ITERATIONS):
         turned = centred @ turn.T
         residual = scale * turned + shift - law[:, :2] - change * size
         # Wide at first: the start may be metres off if the pitch is not 105 x 68 m.
-        loss = max(3.0 * settings.accuracy, 3.0 * 0.7**iteration)
+        loss = max(3.0 * settings.accuracy_m, 3.0 * 0.7**iteration)
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=-1) / loss**2)
         jacobian = np.zeros((len(places), 2, 6))
         jacobian[..., 0] = scale * turned @ np.array([[0.0, 1.0], [-1.0, 0.0]])
         jacobian[:, [0, 1], [1, 2]] = 1.0
         jacobian[:, [0, 1], [3, 4]] = -change
         jacobian[..., 5] = turned if stretch else 0.0
-        root = np.sqrt(weight)[:, None] / settings.accuracy
+        root = np.sqrt(weight)[:, None] / settings.accuracy_m
         rows = np.concatenate([(jacobian * root[..., None]).reshape(-1, 6), np.zeros((2, 6))])
         rows[[-2, -1], [3, 4]] = 1.0 / spreads
         right = np.concatenate([(residual * root).ravel(), (size - _STANDARD_SIZE) / spreads])
@@ -460,12 +460,12 @@ def _fit_heights(
         crown = PitchSpec().crown
         return _Heights(above + crown * ridge, heights, crown, np.zeros(2), False)
     base = float(heights[taken].mean())
-    rows = np.column_stack([np.ones(len(ridge)), plan.places, ridge])[taken] / settings.accuracy
+    rows = np.column_stack([np.ones(len(ridge)), plan.places, ridge])[taken] / settings.accuracy_m
     prior = np.zeros((3, 4))
     prior[[0, 1, 2], [1, 2, 3]] = 1.0 / np.array(
-        [settings.slope_spread, settings.slope_spread, settings.crown_spread]
+        [settings.slope_std, settings.slope_std, settings.crown_std_m]
     )
-    right = (heights - base - above)[taken] / settings.accuracy
+    right = (heights - base - above)[taken] / settings.accuracy_m
     right = np.concatenate([right, prior @ (0.0, 0.0, 0.0, PitchSpec().crown)])
     rows = np.concatenate([rows, prior])
     level, *slope, crown = np.linalg.lstsq(rows, right, rcond=None)[0].tolist()
@@ -478,7 +478,7 @@ def _fit_heights(
         offset=np.where(taken, world - surface, np.nan),
         crown=crown,
         slope=np.array(slope),
-        measured=bool(spread < 0.5 * settings.crown_spread),
+        measured=bool(spread < 0.5 * settings.crown_std_m),
     )
 
 
@@ -508,7 +508,7 @@ def _estimate_scale(survey: Survey, places: NDArray[np.float64], settings: Surve
     if abs(gross - 1.0) < 0.3:  # within the fit's convergence range: prescribed markings decide
         turn = _fit_plan(survey, places, settings, stretch=True).turn
         scale = 1.0 / float(np.sqrt(np.linalg.det(turn)))
-    if abs(scale - 1.0) <= settings.largest_scale:
+    if abs(scale - 1.0) <= settings.max_scale_error:
         return scale
     units = {"feet": 1 / 0.3048, "yards": 1 / 0.9144, "centimetres": 100.0, "millimetres": 1000.0}
     near = [name for name, unit in units.items() if abs(scale / unit - 1.0) < 0.06]

@@ -81,7 +81,7 @@ def click(
     chosen = _choose_points(
         there, pixels[:, 0], places, camera.image_size[0], settings, clustered, rng
     )
-    noisy = _clip_to_image(camera, pixels + settings.noise * rng.standard_normal(pixels.shape))
+    noisy = _clip_to_image(camera, pixels + settings.noise_px * rng.standard_normal(pixels.shape))
     clicked = {names[index]: noisy[index] for index in chosen}
     wrong: dict[str, str] = {}
     if mistaken and len(chosen):
@@ -169,7 +169,7 @@ def _make_mistake(
     taken = list(clicked)
     victim = taken[rng.integers(len(taken))]
     others = [name for name in _confusable_names(victim) if name in names and name not in clicked]
-    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(*settings.wrong_distance)
+    angle, far = 2.0 * np.pi * rng.random(), rng.uniform(*settings.wrong_distance_px)
     if rng.random() < 0.5 and others:
         named = others[rng.integers(len(others))]
         return {named if name == victim else name: xy for name, xy in clicked.items()}, {
@@ -207,7 +207,9 @@ def _draw_markings(
         # Clicks are at about even steps, wherever a sample is near.
         steps = np.linspace(0.0, len(seen) - 1.0, settings.drawn_points).round().astype(int)
         points = seen[np.unique(steps)]
-        points = _clip_to_image(camera, points + settings.noise * rng.standard_normal(points.shape))
+        points = _clip_to_image(
+            camera, points + settings.noise_px * rng.standard_normal(points.shape)
+        )
         drawn.append(DrawnMarking(name=name, xy=tuple(_round_click(xy) for xy in points)))
     return tuple(drawn)
 
@@ -311,15 +313,15 @@ def add_calibration_errors(
     given = {}
     for index, (name, camera) in enumerate(cameras.items()):
         factor = errors.bad_factor if index in bad else 1.0
-        turn = factor * errors.rotation * rng.standard_normal(3)
-        shift = factor * errors.center * rng.standard_normal(3)
+        turn = factor * errors.rotation_rad * rng.standard_normal(3)
+        shift = factor * errors.center_m * rng.standard_normal(3)
         scale = 1.0 + factor * errors.focal * rng.standard_normal()
         given[name] = _move_camera(camera, turn, shift, scale) if _has_errors(errors) else camera
     return given
 
 
 def _has_errors(errors: CalibrationErrors) -> bool:
-    return max(errors.rotation, errors.center, errors.focal) > 0.0
+    return max(errors.rotation_rad, errors.center_m, errors.focal) > 0.0
 
 
 def _move_camera(

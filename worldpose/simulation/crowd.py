@@ -92,8 +92,8 @@ def take_corner(
         rng: draws everything.
     """
     time = _sample_times(duration)
-    count, center = crowd.people, np.array(crowd.area_center)
-    half = 0.5 * np.array(crowd.area_size)
+    count, center = crowd.people, np.array(crowd.area_center_m)
+    half = 0.5 * np.array(crowd.area_size_m)
     out = 1.0 if center[0] >= 0.0 else -1.0
     goal = np.array([center[0] + out * half[0], 0.0])
     corner = np.array([goal[0], rng.choice([-1.0, 1.0]) * 34.0])
@@ -111,7 +111,7 @@ def take_corner(
     around *= np.where(rng.random((len(balls), len(attackers), 1)) < 0.5, 0.4, 2.5)
 
     def wish(sample: int, position: Floats, velocity: Floats) -> tuple[Floats, Floats, Floats]:
-        target, top = position.copy(), np.full(count, crowd.speed[1])
+        target, top = position.copy(), np.full(count, crowd.speed_m_s[1])
         coming = np.flatnonzero((time[sample] > balls - 1.2) & (time[sample] < balls + 0.5))
         target[attackers] = homes + feints[sample]
         top[attackers] = 2.0
@@ -119,7 +119,7 @@ def take_corner(
         if len(coming):
             ball = int(coming[-1])
             target[attackers] = drops[ball] + around[ball]
-            top[attackers] = crowd.speed[1]
+            top[attackers] = crowd.speed_m_s[1]
             look = drops[ball] if time[sample] > balls[ball] - 0.6 else corner
         his = attackers[: len(markers)]
         toward = _unit(goal - position[his])
@@ -152,14 +152,14 @@ def run_through(
         rng: draws everything.
     """
     time = _sample_times(duration)
-    count, center = crowd.people, np.array(crowd.area_center)
-    reach = 0.5 * float(min(crowd.area_size))
+    count, center = crowd.people, np.array(crowd.area_center_m)
+    reach = 0.5 * float(min(crowd.area_size_m))
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1) + rng.uniform(-0.3, 0.3, count)
     partners = np.arange(1, 2 * (count // 4), 2)  # each runs next to the previous person
     angle[partners] = angle[partners - 1] + 0.06
-    speed = rng.uniform(0.5 * sum(crowd.speed), crowd.speed[1], count)
+    speed = rng.uniform(0.5 * sum(crowd.speed_m_s), crowd.speed_m_s[1], count)
     # Pairs that fight for the path are slower.
-    speed[partners - 1] = rng.uniform(crowd.speed[0], 0.5 * sum(crowd.speed), len(partners))
+    speed[partners - 1] = rng.uniform(crowd.speed_m_s[0], 0.5 * sum(crowd.speed_m_s), len(partners))
     miss = 0.35 * rng.standard_normal((count, 2))
     state = angle.copy()
 
@@ -171,7 +171,7 @@ def run_through(
         ahead[partners] = position[partners - 1] + BESIDE * aside[partners - 1]
         ahead[partners] += velocity[partners - 1] / KEEN  # the follower aims ahead to keep up
         top = speed.copy()
-        top[partners] = crowd.speed[1] + 1.0
+        top[partners] = crowd.speed_m_s[1] + 1.0
         return ahead, top, center
 
     start = center + reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -333,7 +333,7 @@ def gather(
     count = settings.people if driven is None else len(driven)
     person_seeds = seed.spawn(count)
     generators = [np.random.default_rng(each) for each in person_seeds]
-    bodies = [draw_body(settings.height, rng) for rng in generators]
+    bodies = [draw_body(settings.height_m, rng) for rng in generators]
     paths: list[GroundPath] = []
     action = None
     if driven is not None:
@@ -352,7 +352,7 @@ def gather(
             paths.append(wander(settings, scenario.duration, paths, rng))
     times = paths[0].time if paths else np.array([0.0, scenario.duration])
     if action is None:
-        action = np.broadcast_to(np.array(settings.area_center), (len(times), 2))
+        action = np.broadcast_to(np.array(settings.area_center_m), (len(times), 2))
         if paths:
             action = np.mean([path.position for path in paths], axis=0)
     if clip is not None and paths:

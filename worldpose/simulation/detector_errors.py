@@ -214,7 +214,7 @@ def perceived_bias(
     """
     front, left = facing(joints)
     up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
-    offsets = noise.shared_bias * systematic.joint_bias + noise.own_bias * own
+    offsets = noise.shared_bias_m * systematic.joint_bias + noise.own_bias_m * own
     turned: Floats = offsets @ np.stack([front, left, up], axis=-2)
     return turned
 
@@ -257,13 +257,13 @@ def _detect_one(
     pixels, size = projections.keypoints[:, person], projections.size[:, person]
     hider = projections.hider[:, person]
     hidden, frames = hider >= 0, len(pixels)
-    small = size < noise.small
+    small = size < noise.small_px
     spread = size[:, None] * DIFFICULTY
 
     error = _draw_errors(pixels, spread, noise, fps, rng)
-    error *= (1.0 + noise.hidden_spread * hidden)[..., None]
+    error *= (1.0 + noise.hidden_std * hidden)[..., None]
     far = np.linalg.norm(error, axis=-1) / size[:, None]
-    doubt = 1.0 + noise.confidence_spread * rng.standard_normal((frames, 17))
+    doubt = 1.0 + noise.confidence_std * rng.standard_normal((frames, 17))
     confidence = np.exp(-noise.confidence_drop * far) * doubt
     confidence = np.clip(confidence * (1.0 - noise.hidden_doubt * hidden), 0.01, 1.0)
     twice = 2.0 * projections.azimuth[:, person]
@@ -274,11 +274,11 @@ def _detect_one(
     thrown = rng.random((frames, 17)) < noise.displaced
     angle = 2.0 * np.pi * rng.random((frames, 17))
     reach = rng.uniform(DISPLACED[0], DISPLACED[1], (frames, 17))
-    sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor)
+    sigma = np.hypot(np.hypot(noise.white, noise.slow) * spread, noise.floor_px)
     throw = (reach * sigma)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     keypoints = pixels + error + np.where(thrown[..., None], throw, 0.0)
 
-    stolen = bursts(noise.stolen, noise.stolen_time, (frames, 17), fps, rng) & hidden
+    stolen = bursts(noise.stolen, noise.stolen_time_s, (frames, 17), fps, rng) & hidden
     frame, joint = np.nonzero(stolen)
     theirs = projections.keypoints[frame, hider[frame, joint], joint]
     there = np.isfinite(theirs[:, 0])
@@ -286,14 +286,14 @@ def _detect_one(
 
     luck = rng.random((frames, 17))
     lost = luck < np.where(hidden, noise.hidden_joint_missed, noise.joint_missed)
-    missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time, small, fps, rng)
+    missed = _draw_bursts_by_size(noise.person_missed, noise.person_missed_time_s, small, fps, rng)
     overlapped = hidden.mean(axis=-1) >= MOSTLY_HIDDEN
     overlapped &= rng.random(frames) < noise.hidden_person_missed
     merges = overlapped & (rng.random(frames) < noise.merged)
     lost |= (missed | overlapped)[:, None]
     outside = np.isnan(pixels[..., 0])
-    lost |= outside | ((~outside).sum(axis=-1) < noise.fewest_joints)[:, None]
-    swapped = _draw_bursts_by_size(noise.swapped, noise.swapped_time, small, fps, rng)
+    lost |= outside | ((~outside).sum(axis=-1) < noise.min_joints)[:, None]
+    swapped = _draw_bursts_by_size(noise.swapped, noise.swapped_time_s, small, fps, rng)
     for array in (keypoints, lost, confidence, thrown):
         array[swapped] = array[swapped][:, MIRRORED]
     keypoints[lost], confidence[lost] = np.nan, np.nan
@@ -307,14 +307,14 @@ def _draw_errors(
 ) -> Floats:
     """Return errors of zero mean (frames, 17, 2) [px]: white, slow and by motion."""
     white = rng.standard_normal(pixels.shape)
-    slow = drift(pixels.shape, noise.slow_time, fps, rng)
+    slow = drift(pixels.shape, noise.slow_time_s, fps, rng)
     along = rng.standard_normal((*spread.shape, 1))
-    error: Floats = np.hypot(noise.white * spread, noise.floor)[..., None] * white
+    error: Floats = np.hypot(noise.white * spread, noise.floor_px)[..., None] * white
     error += (noise.slow * spread)[..., None] * slow
-    if len(pixels) > 1 and noise.blur > 0.0:
+    if len(pixels) > 1 and noise.blur_s > 0.0:
         motion = np.gradient(pixels, axis=0) * fps
         # At the image border the motion is unknown; blur is negligible there.
-        error += noise.blur * np.where(np.isfinite(motion), motion, 0.0) * along
+        error += noise.blur_s * np.where(np.isfinite(motion), motion, 0.0) * along
     return error
 
 
@@ -420,16 +420,16 @@ def draw_false_positives(
     noise, crowd = scenario.noise, scenario.crowd
     share = noise.false_people / MAX_FALSE_POSITIVES
     shape = (frames, MAX_FALSE_POSITIVES)
-    on = bursts(share, noise.false_people_time, shape, scenario.fps, rng)
-    body = draw_body(crowd.height, rng)
+    on = bursts(share, noise.false_people_time_s, shape, scenario.fps, rng)
+    body = draw_body(crowd.height_m, rng)
     # Any moment of a walk serves as a posture; every appearance draws another.
-    path = wander(CrowdSettings(height=crowd.height), POSTURES, (), rng)
+    path = wander(CrowdSettings(height_m=crowd.height_m), POSTURES, (), rng)
     appeared = on & ~np.concatenate([np.zeros_like(on[:1]), on[:-1]])
     times = rng.uniform(0.0, POSTURES, appeared.shape)
     joints = walk(body, path, times.ravel(), lambda x, y: 0.0 * x, rng)
     joints = joints.reshape(*appeared.shape, 17, 3)
     joints[..., :2] -= joints[..., 11:13, :2].mean(axis=2, keepdims=True)
-    place = np.array(crowd.area_center) + np.array(crowd.area_size) * rng.uniform(
+    place = np.array(crowd.area_center_m) + np.array(crowd.area_size_m) * rng.uniform(
         -1.0, 1.0, (*appeared.shape, 2)
     )
     joints[..., :2] += place[:, :, None]

@@ -329,11 +329,11 @@ def draw_actions(
         rng: draws them.
     """
     minutes = (time[-1] - time[0]) / 60.0
-    count = rng.poisson(minutes * (rates.jumps + rates.falls))
+    count = rng.poisson(minutes * (rates.jumps_per_min + rates.falls_per_min))
     begins, draws = np.sort(rng.uniform(time[0], time[-1], count)), rng.random((count, 3))
     actions: list[Action] = []
     for begin, (kind, size, side) in zip(begins, draws, strict=True):
-        jumps = kind * (rates.jumps + rates.falls) < rates.jumps
+        jumps = kind * (rates.jumps_per_min + rates.falls_per_min) < rates.jumps_per_min
         motion: Motion = jump(0.28 + 0.17 * size) if jumps else fall()
         pace = float(np.interp(begin, time, speed))
         suits = pace < MAX_JUMP_SPEED if jumps else 1.0 < pace < 5.0

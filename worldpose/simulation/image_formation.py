@@ -293,15 +293,15 @@ def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
             fallen = np.asarray(y + height * np.float32(way[1]), dtype=np.float32)
             direct *= np.float32(1.0) - venue.in_shadow(fallen)
         light = light + direct
-    return np.asarray(np.float32(venue.settings.exposure) * light, dtype=np.float32)
+    return np.asarray(np.float32(venue.settings.brightness) * light, dtype=np.float32)
 
 
 def _haze_before(venue: Venue, outline: Singles) -> Singles:
     """Return the haze before a thing, as `draw_triangles` takes it."""
     share = 0.0
-    if venue.settings.fog > 0.0:
-        share = 1.0 - np.exp(-venue.settings.fog * float(np.nanmean(outline[:, 2])))
-    return np.array([share, *(255.0 * venue.settings.exposure * FOG_COLOR)], dtype=np.float32)
+    if venue.settings.fog_per_m > 0.0:
+        share = 1.0 - np.exp(-venue.settings.fog_per_m * float(np.nanmean(outline[:, 2])))
+    return np.array([share, *(255.0 * venue.settings.brightness * FOG_COLOR)], dtype=np.float32)
 
 
 def cluster_boxes(spans: Sequence[Box | None]) -> list[tuple[Box, list[int]]]:
@@ -332,9 +332,9 @@ def _overlap(a: Box, b: Box) -> bool:
 
 def blur_by_lens(light: Singles, settings: RenderingSettings) -> Singles:
     """Return an image blurred by the lens."""
-    if settings.blur == 0.0:
+    if settings.blur_px == 0.0:
         return light
-    return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur), dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur_px), dtype=np.float32)
 
 
 def to_bytes(light: Singles) -> Image:
@@ -357,12 +357,12 @@ def _refocus(settings: RenderingSettings, sharp: Image, blurred: Image, box: Box
     height, width = sharp.shape[:2]
     left, top = max(box[0] - _MARGIN, 0), max(box[1] - _MARGIN, 0)
     right, bottom = min(box[2] + _MARGIN, width), min(box[3] + _MARGIN, height)
-    if settings.blur == 0.0:
+    if settings.blur_px == 0.0:
         blurred[top:bottom, left:right] = sharp[top:bottom, left:right]
         return
     a, b = max(left - _MARGIN, 0), max(top - _MARGIN, 0)
     part = sharp[b : bottom + _MARGIN, a : right + _MARGIN]
-    soft = cv2.GaussianBlur(part, (0, 0), settings.blur)
+    soft = cv2.GaussianBlur(part, (0, 0), settings.blur_px)
     blurred[top:bottom, left:right] = soft[top - b : bottom - b, left - a : right - a]
 
 

@@ -92,7 +92,7 @@ def open_view(
     venue = build_venue(pitch, seed, settings or RenderingSettings())
     seen = paint_empty(venue, camera)
     venue.add_fog(seen.color, seen.distance)
-    light = np.asarray(255.0 * venue.settings.exposure * seen.color, dtype=np.float32)
+    light = np.asarray(255.0 * venue.settings.brightness * seen.color, dtype=np.float32)
     blurred = blur_by_lens(light, venue.settings)
     return View(
         venue,
@@ -236,7 +236,7 @@ class _FilmSet:
         """Yield the content of every frame of a camera with a clock offset [s]."""
         times = self.times + clock_offset
         poses = self.poses if clock_offset == 0.0 else self.scene.crowd.poses(times)
-        share = self.scenario.look.shutter * self.scenario.fps
+        share = self.scenario.look.exposure_s * self.scenario.fps
         surfaces = (self.cast.pose(poses[:, k]) for k in range(len(times)))
         for time, (opened, following) in zip(times, pairwise(surfaces), strict=False):
             closed = opened.toward(following, share) if share > 0.0 else opened
@@ -355,7 +355,7 @@ def simulate_match(
     scene = simulate_scene(scenario, seed, clip_id=CLIP_ID, driven=driven, clip=clip)
     given = scene.given if options.calibrated or scenario.calibration != CalibrationErrors() else {}
     images = _stills(scenario, scene, seed) if options.stills and not options.render else {}
-    width, height = scenario.rig.image_size
+    width, height = scenario.rig.image_size_px
     specs = [
         CameraSpec(
             id=name,

@@ -165,11 +165,11 @@ def wander(
     """
     samples = round((duration + 2.0 * MARGIN) / STEP) + 1
     time = np.linspace(-MARGIN, -MARGIN + (samples - 1) * STEP, samples)
-    low, high = crowd.speed
+    low, high = crowd.speed_m_s
     speed = low + (high - low) * (0.5 + 0.5 * _slow_wave(time, (4.0, 9.0), rng))
     speed = np.maximum(speed, 0.0)
     whim = 0.8 * _slow_wave(time, (3.0, 8.0), rng)
-    center, half = np.array(crowd.area_center), 0.5 * np.array(crowd.area_size)
+    center, half = np.array(crowd.area_center_m), 0.5 * np.array(crowd.area_size_m)
     place = np.array([other.position for other in others]).reshape(len(others), len(time), 2)
     motion = np.array([_velocity(other) for other in others]).reshape(place.shape)
 
@@ -188,7 +188,9 @@ def wander(
         wish = (
             whim[i]
             + _turn_back(here + LOOK_AHEAD * velocity - center, half, angle)
-            + _turn_aside(place[:, i] - here, motion[:, i] - velocity, angle, crowd.personal_space)
+            + _turn_aside(
+                place[:, i] - here, motion[:, i] - velocity, angle, crowd.personal_space_m
+            )
         )
         limit = min(TURN_RATE, LATERAL_ACCELERATION / max(speed[i], 0.1))
         limit *= min(1.0, speed[i] / TURNING_SPEED)

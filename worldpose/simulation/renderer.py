@@ -84,9 +84,9 @@ def _develop(
     color: Singles, camera: Camera, settings: RenderingSettings, seed: int
 ) -> NDArray[np.uint8]:
     """Return the light (height, width, 3) after lens and sensor."""
-    seen = np.asarray(255.0 * settings.exposure * color, dtype=np.float32)
-    if settings.blur > 0.0:
-        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), settings.blur), dtype=np.float32)
+    seen = np.asarray(255.0 * settings.brightness * color, dtype=np.float32)
+    if settings.blur_px > 0.0:
+        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), settings.blur_px), dtype=np.float32)
     which = zlib.crc32(camera.cam_from_world.translation.tobytes())
     rng = np.random.default_rng([seed, 0, which])
     if settings.noise > 0.0:
@@ -169,7 +169,7 @@ def render_panorama(cameras: Camera, venue: Venue, *, lit: bool = False) -> Pano
         if lit:
             color *= 1.0 - venue.shade * venue.in_shadow(seen.ground[..., 1])[..., None]
             venue.add_fog(color, seen.distance)
-            color *= venue.settings.exposure
+            color *= venue.settings.brightness
         whole[:, begin : begin + count] = np.clip(np.rint(255.0 * color), 0.0, 255.0)
     levels = [whole]
     while scale / 2 ** len(levels) > 0.5 * float(cameras.focal.min()):
@@ -218,8 +218,8 @@ def render_broadcast(
             [1.0] * (len(limbs) + len(goals)),
         )
         color *= np.float32(255.0)
-        if settings.blur > 0.0:
-            color = np.asarray(cv2.GaussianBlur(color, (0, 0), settings.blur), dtype=np.float32)
+        if settings.blur_px > 0.0:
+            color = np.asarray(cv2.GaussianBlur(color, (0, 0), settings.blur_px), dtype=np.float32)
         down, right = (int(n) for n in noise.integers(0, 256, 2))
         color += field[down : down + height, right : right + width, None]
         yield np.asarray(cv2.convertScaleAbs(np.maximum(color, 0.0)), dtype=np.uint8)
@@ -244,8 +244,8 @@ def film_broadcast(
     for frame, moment in enumerate(moments):
         sharp = _sample_panorama(panorama, cameras[frame], width, height)
         blurred = sharp.copy()
-        if venue.settings.blur > 0.0:
-            blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), venue.settings.blur))
+        if venue.settings.blur_px > 0.0:
+            blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), venue.settings.blur_px))
         yield expose(venue, cameras[frame], sharp, blurred, grain, moment, frame)
 
 

@@ -18,18 +18,18 @@ from worldpose.simulation.settings import (
 
 _QUARTER: Final = (
     # Of a camera in the quarter x > 0, y > 0: position, aim, focal length.
-    Seat(place=(13.0, 60.0, 22.0), aim=(19.2, 11.4), focal=2254.0),
-    Seat(place=(76.0, 14.0, 19.0), aim=(41.2, -16.0), focal=2228.0),
-    Seat(place=(38.0, 57.0, 16.0), aim=(33.5, 17.7), focal=2096.0),
-    Seat(place=(66.0, 48.0, 26.0), aim=(34.6, -3.4), focal=2387.0),
+    Seat(place_m=(13.0, 60.0, 22.0), aim_m=(19.2, 11.4), focal_px=2254.0),
+    Seat(place_m=(76.0, 14.0, 19.0), aim_m=(41.2, -16.0), focal_px=2228.0),
+    Seat(place_m=(38.0, 57.0, 16.0), aim_m=(33.5, 17.7), focal_px=2096.0),
+    Seat(place_m=(66.0, 48.0, 26.0), aim_m=(34.6, -3.4), focal_px=2387.0),
 )
 
 
 def _mirrored(seat: Seat, x: float, y: float) -> Seat:
     return Seat(
-        place=(x * seat.place[0], y * seat.place[1], seat.place[2]),
-        aim=(x * seat.aim[0], y * seat.aim[1]),
-        focal=seat.focal,
+        place_m=(x * seat.place_m[0], y * seat.place_m[1], seat.place_m[2]),
+        aim_m=(x * seat.aim_m[0], y * seat.aim_m[1]),
+        focal_px=seat.focal_px,
     )
 
 
@@ -39,19 +39,19 @@ STADIUM_SEATS: Final = (
         for seat in _QUARTER
         for x, y in ((1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0))
     ),
-    Seat(place=(0.0, 62.0, 25.0), aim=(0.0, 0.0), focal=2100.0),
-    Seat(place=(0.0, -62.0, 25.0), aim=(0.0, 0.0), focal=2100.0),
+    Seat(place_m=(0.0, 62.0, 25.0), aim_m=(0.0, 0.0), focal_px=2100.0),
+    Seat(place_m=(0.0, -62.0, 25.0), aim_m=(0.0, 0.0), focal_px=2100.0),
 )
 """18 seats in stands of 13 to 27 m behind the lines and 16 to 26 m up; the first 16 see every
 point of the pitch from four sides or more with people 40 to 150 px tall."""
 
 CORNER_SEATS: Final = (
-    Seat(place=(66.0, 48.0, 26.0), aim=(48.0, 30.0), focal=3300.0),
-    Seat(place=(38.0, 57.0, 16.0), aim=(46.6, 32.3), focal=4000.0),
-    Seat(place=(-76.0, 14.0, 19.0), aim=(-49.2, 29.5), focal=3400.0),
-    Seat(place=(-38.0, -57.0, 16.0), aim=(-34.0, -27.0), focal=3800.0),
-    Seat(place=(13.0, 60.0, 22.0), aim=(39.8, 28.7), focal=4100.0),
-    Seat(place=(66.0, -48.0, 26.0), aim=(43.0, -27.0), focal=3300.0),
+    Seat(place_m=(66.0, 48.0, 26.0), aim_m=(48.0, 30.0), focal_px=3300.0),
+    Seat(place_m=(38.0, 57.0, 16.0), aim_m=(46.6, 32.3), focal_px=4000.0),
+    Seat(place_m=(-76.0, 14.0, 19.0), aim_m=(-49.2, 29.5), focal_px=3400.0),
+    Seat(place_m=(-38.0, -57.0, 16.0), aim_m=(-34.0, -27.0), focal_px=3800.0),
+    Seat(place_m=(13.0, 60.0, 22.0), aim_m=(39.8, 28.7), focal_px=4100.0),
+    Seat(place_m=(66.0, -48.0, 26.0), aim_m=(43.0, -27.0), focal_px=3300.0),
 )
 """Six of these stands, with lenses so long that an image shows one or two corners of markings."""
 
@@ -60,12 +60,12 @@ _TINY: Final = Scenario(
     about="5 people walk and run for 4 s before 6 static cameras and the broadcast camera: "
     "seconds to reconstruct.",
     duration=4.0,
-    rig=RigSettings(person_height=95.0),
+    rig=RigSettings(person_height_px=95.0),
     broadcast=BroadcastSettings(),
 )
 _STADIUM: Final = RigSettings(cameras=16, seats=STADIUM_SEATS)
 _TEAMS: Final = CrowdSettings(
-    people=25, movement="football", officials=3, area_center=(0.0, 0.0), area_size=(105.0, 68.0)
+    people=25, movement="football", officials=3, area_center_m=(0.0, 0.0), area_size_m=(105.0, 68.0)
 )
 _MATCH: Final = Scenario(
     name="match",
@@ -81,23 +81,23 @@ _MATCH: Final = Scenario(
 )
 _BOX: Final = CrowdSettings(
     people=6,
-    area_center=(-44.0, 2.0),
-    area_size=(8.0, 9.0),
-    speed=(-0.8, 4.5),
-    personal_space=0.9,
+    area_center_m=(-44.0, 2.0),
+    area_size_m=(8.0, 9.0),
+    speed_m_s=(-0.8, 4.5),
+    personal_space_m=0.9,
 )
 _TRIAL: Final = ObservationNoise(
     white=0.026,
     slow=0.028,
-    blur=0.004,
-    shared_bias=0.032,
-    own_bias=0.009,
+    blur_s=0.004,
+    shared_bias_m=0.032,
+    own_bias_m=0.009,
     view_bias=0.013,
     hidden_joint_missed=0.35,
     stolen=0.2,
     swapped=0.03,
 )
-_SPRAWL: Final = RigSettings(cameras=10, person_height=105.0, height=(10.0, 28.0))
+_SPRAWL: Final = RigSettings(cameras=10, person_height_px=105.0, height_m=(10.0, 28.0))
 
 
 def _variant(name: str, about: str, base: Scenario, **changes: object) -> Scenario:
@@ -126,7 +126,7 @@ SCENARIOS: Final = {
             broadcast=BroadcastSettings(),
             noise=_TRIAL,
             # A line is 7 px wide here: a click on its edge instead of its middle is 3.5 px off.
-            clicks=ClickSettings(clustered=1.0, clustered_points=(5, 5), noise=3.0),
+            clicks=ClickSettings(clustered=1.0, clustered_points=(5, 5), noise_px=3.0),
         ),
         Scenario(
             name="crossing",
@@ -137,11 +137,11 @@ SCENARIOS: Final = {
             crowd=CrowdSettings(
                 people=12,
                 movement="crossing",
-                area_center=(40.0, -9.0),
-                area_size=(9.0, 9.0),
-                speed=(2.0, 6.0),
+                area_center_m=(40.0, -9.0),
+                area_size_m=(9.0, 9.0),
+                speed_m_s=(2.0, 6.0),
             ),
-            rig=RigSettings(cameras=10, person_height=95.0, height=(7.0, 14.0)),
+            rig=RigSettings(cameras=10, person_height_px=95.0, height_m=(7.0, 14.0)),
             broadcast=BroadcastSettings(),
         ),
         Scenario(
@@ -152,9 +152,9 @@ SCENARIOS: Final = {
             crowd=CrowdSettings(
                 people=18,
                 movement="corner",
-                area_center=(45.0, 0.0),
-                area_size=(11.0, 15.0),
-                speed=(0.0, 5.0),
+                area_center_m=(45.0, 0.0),
+                area_size_m=(11.0, 15.0),
+                speed_m_s=(0.0, 5.0),
             ),
             rig=_STADIUM,
             broadcast=BroadcastSettings(),
@@ -166,20 +166,20 @@ SCENARIOS: Final = {
             "The match with 8 % of keypoints far off, clocks half a frame apart, lost frames, "
             "an uncertain calibration and one camera ten times worse.",
             _MATCH,
-            rig=_STADIUM.model_copy(update={"clock_spread": 0.5}),
+            rig=_STADIUM.model_copy(update={"clock_std_frames": 0.5}),
             noise=_TRIAL.model_copy(
-                update={"displaced": 0.08, "dropped_frames": 0.01, "false_people": 0.4}
+                update={"displaced": 0.08, "dropped_share": 0.01, "false_people": 0.4}
             ),
             calibration=CalibrationErrors(
-                rotation=0.0003, center=0.1, focal=0.001, bad_cameras=1, bad_factor=10.0
+                rotation_rad=0.0003, center_m=0.1, focal=0.001, bad_cameras=1, bad_factor=10.0
             ),
         ),
         Scenario(
             name="sparse-corner",
             about="Static calibration alone: 6 cameras that see one or two corners of markings.",
             duration=1.0,
-            crowd=CrowdSettings(people=4, area_center=(44.0, 24.0), area_size=(14.0, 14.0)),
-            rig=RigSettings(cameras=6, seats=CORNER_SEATS, seat_spread=0.3),
+            crowd=CrowdSettings(people=4, area_center_m=(44.0, 24.0), area_size_m=(14.0, 14.0)),
+            rig=RigSettings(cameras=6, seats=CORNER_SEATS, seat_std_m=0.3),
             # A wrong point among one or two cannot be detected.
             clicks=ClickSettings(wrong=0.0),
         ),
@@ -187,15 +187,15 @@ SCENARIOS: Final = {
             name="fog",
             about="To be rendered: 12 people, small, in fog under floodlights, in patterned kits.",
             duration=4.0,
-            crowd=CrowdSettings(people=12, area_center=(38.0, -6.0), area_size=(26.0, 24.0)),
-            rig=RigSettings(person_height=55.0),
+            crowd=CrowdSettings(people=12, area_center_m=(38.0, -6.0), area_size_m=(26.0, 24.0)),
+            rig=RigSettings(person_height_px=55.0),
             broadcast=BroadcastSettings(),
             look=RenderingSettings(
                 light="floodlights",
-                fog=0.012,
-                exposure=0.85,
+                fog_per_m=0.012,
+                brightness=0.85,
                 patterns=("halves", "sash", "chequers"),
-                blur=1.0,
+                blur_px=1.0,
                 noise=4.0,
             ),
         ),
@@ -205,7 +205,7 @@ SCENARIOS: Final = {
             "20 s of the match, the broadcast camera panning to and fro.",
             _MATCH,
             duration=20.0,
-            broadcast=BroadcastSettings(sweep=22.0, focal=(3300.0, 4200.0)),
+            broadcast=BroadcastSettings(sweep_m=22.0, focal_px=(3300.0, 4200.0)),
             key_frames=4,
         ),
         _variant(
@@ -213,7 +213,7 @@ SCENARIOS: Final = {
             "20 s of the match, the broadcast camera zooming from its widest to its closest.",
             _MATCH,
             duration=20.0,
-            broadcast=BroadcastSettings(focal=(2500.0, 7000.0), zoom_period=(14.0, 20.0)),
+            broadcast=BroadcastSettings(focal_px=(2500.0, 7000.0), zoom_period_s=(14.0, 20.0)),
             key_frames=4,
         ),
     )

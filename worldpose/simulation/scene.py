@@ -37,7 +37,7 @@ from worldpose.simulation.random_processes import bursts, drift
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 
 STANDARD_PERSON: Final = 1.8
-"""Body height for `RigSettings.person_height` [m]."""
+"""Body height for `RigSettings.person_height_px` [m]."""
 
 GOLDEN: Final = (np.sqrt(5.0) - 1.0) / 2.0
 """Steps of this share of a turn spread any number of cameras, and an additional one moves none."""
@@ -66,13 +66,13 @@ def place_camera(
     """
     if index < len(rig.seats):
         seat = rig.seats[index]
-        center = np.array(seat.place) + rig.seat_spread * rng.uniform(-1.0, 1.0, 3)
-        aim = np.array([*seat.aim, 0.0])
-        aim[:2] += rig.seat_spread * rng.uniform(-1.0, 1.0, 2)
-        focal = seat.focal * rng.uniform(0.99, 1.01)
+        center = np.array(seat.place_m) + rig.seat_std_m * rng.uniform(-1.0, 1.0, 3)
+        aim = np.array([*seat.aim_m, 0.0])
+        aim[:2] += rig.seat_std_m * rng.uniform(-1.0, 1.0, 2)
+        focal = seat.focal_px * rng.uniform(0.99, 1.01)
     else:
         center, aim, focal = _place_in_ring(rig, index, target, pitch, rng)
-    width, tall = rig.image_size
+    width, tall = rig.image_size_px
     middle = np.array([width - 1.0, tall - 1.0]) / 2.0
     return Camera(
         focal=np.array([focal, focal]),
@@ -95,12 +95,12 @@ def _place_in_ring(
     way = np.array([np.cos(azimuth), np.sin(azimuth)])
     border = 0.5 * np.array([pitch.length, pitch.width])
     to_border = float(np.min((border - np.sign(way) * target[:2]) / np.abs(way)))
-    distance = to_border + rng.uniform(*rig.distance)
-    center = target + np.array([*(distance * way), rng.uniform(*rig.height)])
+    distance = to_border + rng.uniform(*rig.distance_m)
+    center = target + np.array([*(distance * way), rng.uniform(*rig.height_m)])
     aim = target + np.array([*rng.uniform(-1.5, 1.5, 2), 0.5 * STANDARD_PERSON])
     # An upright person far below the camera is foreshortened by the cosine of the tilt.
     far = float(np.linalg.norm(aim - center))
-    return center, aim, rig.person_height * far / (STANDARD_PERSON * distance / far)
+    return center, aim, rig.person_height_px * far / (STANDARD_PERSON * distance / far)
 
 
 def look_at(center: NDArray[np.float64], aim: NDArray[np.float64], roll: float) -> Rigid:
@@ -144,22 +144,22 @@ def move_broadcast_camera(
     """
     center = np.array(
         [
-            rng.uniform(-settings.aside, settings.aside),
-            -rng.uniform(*settings.setback),
-            rng.uniform(*settings.height),
+            rng.uniform(-settings.aside_m, settings.aside_m),
+            -rng.uniform(*settings.setback_m),
+            rng.uniform(*settings.height_m),
         ]
     )
     hand = np.arange(times[0] - WARM_UP, times[-1] + 2.0 * CALM, CALM)
     aim = np.stack([np.interp(hand, action_times, axis) for axis in action.T], axis=-1)
-    aim[:, 0] += settings.sway * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
-    aim[:, 0] += settings.sweep * np.sin(2.0 * np.pi * (hand / 8.0 + rng.random()))
+    aim[:, 0] += settings.sway_m * _smooth(drift(hand.shape, 2.5, 1.0 / CALM, rng), 0.6)
+    aim[:, 0] += settings.sweep_m * np.sin(2.0 * np.pi * (hand / 8.0 + rng.random()))
     # The image centre stays within the pitch, nearer to the camera than the action's far side.
     aim = np.clip(0.9 * aim, [-40.0, -22.0], [40.0, 26.0])
-    aim = _smooth(_smooth(aim, 0.5 * settings.lag), 0.5 * settings.lag)
+    aim = _smooth(_smooth(aim, 0.5 * settings.lag_s), 0.5 * settings.lag_s)
     aim = np.stack([np.interp(times, hand, axis) for axis in aim.T], axis=-1)
 
-    low, high = settings.focal
-    period = rng.uniform(*settings.zoom_period)
+    low, high = settings.focal_px
+    period = rng.uniform(*settings.zoom_period_s)
     wave = np.sin(2.0 * np.pi * (times / period + rng.random()))
     focal = low * (high / low) ** (0.5 + 0.5 * wave)
     roll = np.radians(0.15) * rng.standard_normal()
@@ -295,7 +295,7 @@ class _World:
     def bodies(self, times: NDArray[np.float64]) -> Bodies:
         joints, noise = self.crowd.joints(times), self.scenario.noise
         bias = None
-        if noise.shared_bias > 0.0 or noise.own_bias > 0.0:
+        if noise.shared_bias_m > 0.0 or noise.own_bias_m > 0.0:
             bias = perceived_bias(joints, self.systematic, noise, self.own_bias)
         return Bodies(joints, self.crowd.heights, bias)
 
@@ -333,7 +333,7 @@ def simulate_scene(
     world = _World(scenario, crowd, pitch, systematic, own_bias.reshape(persons, 17, 3))
     times = np.arange(round(scenario.duration * scenario.fps)) / scenario.fps
     bodies = world.bodies(times)
-    x, y = scenario.crowd.area_center
+    x, y = scenario.crowd.area_center_m
     target = np.array([x, y, float(pitch.height(x, y))])
 
     cameras: dict[str, Camera] = {}
@@ -346,7 +346,7 @@ def simulate_scene(
         name = f"cam{index:02d}"
         place, clock, *errors, hand = camera_seed.spawn(7)
         camera = place_camera(scenario.rig, index, target, scenario.pitch, _rng(place))
-        clock_offset = scenario.rig.clock_spread * float(_rng(clock).standard_normal())
+        clock_offset = scenario.rig.clock_std_frames * float(_rng(clock).standard_normal())
         seen_bodies = (
             bodies if clock_offset == 0.0 else world.bodies(times + clock_offset / scenario.fps)
         )
@@ -366,7 +366,7 @@ def simulate_scene(
     broadcast = None
     if scenario.broadcast is not None:
         place, *errors = broadcast_seed.spawn(5)
-        size = scenario.rig.image_size
+        size = scenario.rig.image_size_px
         broadcast = move_broadcast_camera(
             scenario.broadcast, times, crowd.action, crowd.action_times, size, _rng(place)
         )
@@ -408,7 +408,7 @@ def _report_detections(
         np.concatenate([real.displaced, false.displaced], axis=1),
         np.concatenate([real.merged_into, merged], axis=1),
     )
-    dropped = bursts(noise.dropped_frames, noise.dropped_time, (frames,), scenario.fps, _rng(loss))
+    dropped = bursts(noise.dropped_share, noise.dropped_time_s, (frames,), scenario.fps, _rng(loss))
     size = np.concatenate([projections.size, projected.size], axis=1)
     return report(together, size, dropped, _rng(order))
 

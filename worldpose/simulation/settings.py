@@ -37,18 +37,18 @@ class RenderingSettings(Record):
     stand_shadow: float = Field(default=0.45, ge=0, le=1)
     """Share of the light that a stand blocks on a part of the pitch [1], if the sun shines; 0 = no
     such shadow."""
-    fog: float = Field(default=0.0, ge=0, le=100)
+    fog_per_m: float = Field(default=0.0, ge=0, le=100)
     """Extinction [1/m]; at 0.01 a third of the contrast is left at 100 m."""
-    exposure: float = Field(default=1.0, gt=0, le=100)
+    brightness: float = Field(default=1.0, gt=0, le=100)
     """Brightness of the whole image [1]."""
     patterns: tuple[Pattern, ...] = PATTERNS
     """Shirt patterns to draw from."""
     bystanders: int = Field(default=0, ge=0, le=100)
     """People who stand 2.5 to 3.3 m behind the lines and do not play [1]: ball boys, stewards,
     photographers. The ground truth does not include them."""
-    shutter: float = Field(default=0.004, ge=0, le=1)
+    exposure_s: float = Field(default=0.004, ge=0, le=1)
     """Exposure time of every frame [s]: 1/250 s, usual for sport by day."""
-    blur: float = Field(default=0.7, ge=0, le=100)
+    blur_px: float = Field(default=0.7, ge=0, le=100)
     """Standard deviation of the lens's and the codec's blur [px]; a sharp broadcast lens."""
     noise: float = Field(default=2.0, ge=0, le=1000)
     """Standard deviation of the sensor's noise [levels of 255], after a broadcast codec."""
@@ -57,9 +57,9 @@ class RenderingSettings(Record):
 class ObservationNoise(Record):
     """Errors of a 2D pose detector on people who are small in the image.
 
-    A joint's error is a bias (`shared_bias`, `own_bias`, `view_bias`), a part that drifts (`slow`)
-    and one that is independent per frame (`white`, `floor`, `blur`). White noise alone would
-    average out over ten views and fifty frames per second.
+    A joint's error is a bias (`shared_bias_m`, `own_bias_m`, `view_bias`), a part that drifts
+    (`slow`) and one that is independent per frame (`white`, `floor_px`, `blur_s`). White noise
+    alone would average out over ten views and fifty frames per second.
 
     Spreads are standard deviations per image axis. Those relative to a person's height in the image
     are for a joint of average difficulty; each joint's own is in proportion to its COCO sigma (eyes
@@ -72,39 +72,39 @@ class ObservationNoise(Record):
     slow: float = Field(default=0.015, ge=0, le=10)
     """Error that drifts [person height]: a pose, a shirt or a background misleads for a while, so
     that averaging over frames does not remove it."""
-    slow_time: float = Field(default=0.3, gt=0, le=100)
+    slow_time_s: float = Field(default=0.3, gt=0, le=100)
     """Time constant of the drift's correlation [s]: a fraction of a stride."""
-    floor: float = Field(default=0.5, ge=0, le=100)
+    floor_px: float = Field(default=0.5, ge=0, le=100)
     """Added to `white` in squares [px]: the limit of a heatmap's grid."""
-    blur: float = Field(default=0.002, ge=0, le=1)
+    blur_s: float = Field(default=0.002, ge=0, le=1)
     """Error along a joint's motion in the image, as the time in which the joint moves that far [s]:
     a share of the exposure, 4 to 10 ms under floodlight."""
-    shared_bias: float = Field(default=0.008, ge=0, le=1)
+    shared_bias_m: float = Field(default=0.008, ge=0, le=1)
     """Offset of the detector's joint from the true one along each axis of the body [m]: one vector
     per joint (mirrored on the other side), the same for all people and cameras, because it is the
     joint definition of the training labels. No number of views removes it."""
-    own_bias: float = Field(default=0.004, ge=0, le=1)
+    own_bias_m: float = Field(default=0.004, ge=0, le=1)
     """The same, drawn for every person [m]: clothes and build."""
     view_bias: float = Field(default=0.005, ge=0, le=1)
     """Bias that varies with the viewing direction of a body, with two periods per turn (front and
     back are alike, sides differ) [person height]; the same for all people and cameras."""
-    fewest_joints: int = Field(default=5, ge=0, le=1000)
+    min_joints: int = Field(default=5, ge=0, le=1000)
     """A person with fewer joints in the image is not found [1]: detectors need a body, not a hand
     at the border."""
     joint_missed: float = Field(default=0.02, ge=0, le=1)
     """Share of visible joints not reported [1]: detectors omit those of low confidence."""
     person_missed: float = Field(default=0.03, ge=0, lt=1)
     """Share of frames in which a visible person is not found at all [1]."""
-    person_missed_time: float = Field(default=0.2, gt=0, le=100)
+    person_missed_time_s: float = Field(default=0.2, gt=0, le=100)
     """Mean length of such a gap [s]: misses come in bursts, because the image hardly changes."""
-    hidden_spread: float = Field(default=1.0, ge=0, le=100)
+    hidden_std: float = Field(default=1.0, ge=0, le=100)
     """Additional error of a joint hidden behind a person, in units of its usual one [1]: the
     detector guesses from the rest of the body; 1 doubles the error."""
     hidden_joint_missed: float = Field(default=0.4, ge=0, le=1)
     """Share of hidden joints not reported [1]."""
     stolen: float = Field(default=0.1, ge=0, lt=1)
     """Share of hidden joints reported at the same joint of the occluding person [1]."""
-    stolen_time: float = Field(default=0.15, gt=0, le=100)
+    stolen_time_s: float = Field(default=0.15, gt=0, le=100)
     """Mean length of such an interval [s]."""
     hidden_person_missed: float = Field(default=0.9, ge=0, le=1)
     """Share of frames in which a mostly hidden person is not found [1]: two boxes with that much
@@ -114,20 +114,20 @@ class ObservationNoise(Record):
     [1]."""
     swapped: float = Field(default=0.02, ge=0, lt=1)
     """Share of person-frames with a left-right swap [1]: a back that looks like a front."""
-    swapped_time: float = Field(default=0.15, gt=0, le=100)
+    swapped_time_s: float = Field(default=0.15, gt=0, le=100)
     """Mean length of such a swap [s]."""
-    small: float = Field(default=60.0, ge=0, le=10000)
+    small_px: float = Field(default=60.0, ge=0, le=10000)
     """People smaller than this in the image have twice the rate of misses and swaps [px]."""
     displaced: float = Field(default=0.0, ge=0, lt=1)
     """Share of joints with gross errors of 4 to 10 standard deviations, at full confidence [1]; the
     ground truth flags them."""
-    dropped_frames: float = Field(default=0.0, ge=0, lt=1)
+    dropped_share: float = Field(default=0.0, ge=0, lt=1)
     """Share of frames that a camera lost [1]."""
-    dropped_time: float = Field(default=0.06, gt=0, le=10)
+    dropped_time_s: float = Field(default=0.06, gt=0, le=10)
     """Mean length of such a gap [s]."""
     false_people: float = Field(default=0.1, ge=0, lt=1)
     """False positives, mean number per frame and camera [1]: shadows, boards."""
-    false_people_time: float = Field(default=0.3, gt=0, le=100)
+    false_people_time_s: float = Field(default=0.3, gt=0, le=100)
     """Mean duration of one [s]."""
     false_doubt: float = Field(default=0.4, ge=0, lt=1)
     """Reduction of their confidence, as a share of it [1]."""
@@ -136,14 +136,14 @@ class ObservationNoise(Record):
     2 %; confidence reflects random errors, not systematic ones."""
     hidden_doubt: float = Field(default=0.5, ge=0, lt=1)
     """Reduction of a hidden joint's confidence, as a share of it [1]."""
-    confidence_spread: float = Field(default=0.05, ge=0, le=10)
+    confidence_std: float = Field(default=0.05, ge=0, le=10)
     """Error of the confidence itself, relative [1]: confidence reflects the error without revealing
     it."""
 
     @classmethod
     def none(cls) -> Self:
         """Return a detector that reports every joint in the image exactly, with confidence 1."""
-        rates = [name for name in cls.model_fields if not name.endswith("_time")]
+        rates = [name for name in cls.model_fields if not name.endswith("_time_s")]
         return cls(**dict.fromkeys(rates, 0.0))
 
 
@@ -166,9 +166,9 @@ class ActionRates(Record):
     """Share of tackled players who fall [1]; the others hurdle the leg."""
     shots: float = Field(default=0.12, ge=0, le=1)
     """Share of balls within 28 m of a goal that are shot at it [1]."""
-    jumps: float = Field(default=3.0, ge=0, le=1000)
+    jumps_per_min: float = Field(default=3.0, ge=0, le=1000)
     """Per wandering person [1/min]: as in a penalty area."""
-    falls: float = Field(default=0.4, ge=0, le=100)
+    falls_per_min: float = Field(default=0.4, ge=0, le=100)
     """Per wandering person [1/min]."""
     standing_about: float = Field(default=0.7, ge=0, le=1)
     """Share of the time of standing, rests under 1.6 s left out, in which people shift their
@@ -177,7 +177,9 @@ class ActionRates(Record):
     @classmethod
     def none(cls) -> ActionRates:
         """Return rates without actions: people only move and stand."""
-        return cls(headers=0, tackles=0, shots=0, jumps=0, falls=0, standing_about=0)
+        return cls(
+            headers=0, tackles=0, shots=0, jumps_per_min=0, falls_per_min=0, standing_about=0
+        )
 
 
 class CrowdSettings(Record):
@@ -191,16 +193,16 @@ class CrowdSettings(Record):
     wander, area and speed for all but teams."""
     officials: int = Field(default=0, ge=0, le=100)
     """Number of people who are a referee and assistants [1], the last ones; only in football."""
-    area_center: tuple[Coordinate, Coordinate] = (-41.0, 12.0)
+    area_center_m: tuple[Coordinate, Coordinate] = (-41.0, 12.0)
     """Middle of the area [m]: off both axes, so that a wrong sign or a flat pitch shows, and at a
     corner of a penalty area, so that cameras have markings to be calibrated from."""
-    area_size: tuple[Positive, Positive] = (20.0, 14.0)
+    area_size_m: tuple[Positive, Positive] = (20.0, 14.0)
     """Length along x and y [m]; people turn back towards the middle at its border."""
-    speed: Range = (1.0, 4.0)
+    speed_m_s: Range = (1.0, 4.0)
     """Slowest and fastest [m/s]: a stroll and a steady run; while below zero, they stand."""
-    personal_space: float = Field(default=1.5, ge=0, le=1000)
+    personal_space_m: float = Field(default=1.5, ge=0, le=1000)
     """Distance below which people avoid others [m]."""
-    height: Range = (1.70, 1.95)
+    height_m: Range = (1.70, 1.95)
     """Shortest and tallest body height [m]: professional players."""
     actions: ActionRates = ActionRates()
     """Actions of the people."""
@@ -209,11 +211,11 @@ class CrowdSettings(Record):
 class Seat(Record):
     """Position and aim of a static camera of a stadium."""
 
-    place: tuple[Coordinate, Coordinate, Coordinate]
+    place_m: tuple[Coordinate, Coordinate, Coordinate]
     """Its center, world [m]."""
-    aim: tuple[Coordinate, Coordinate]
+    aim_m: tuple[Coordinate, Coordinate]
     """Point of the pitch in the middle of its image [m]."""
-    focal: float = Field(gt=0, le=1e5)
+    focal_px: float = Field(gt=0, le=1e5)
     """Focal length [px]."""
 
 
@@ -224,18 +226,18 @@ class RigSettings(Record):
     """Number [1]."""
     seats: tuple[Seat, ...] = ()
     """Seats, used in order; none = a ring. Cameras beyond the seats stand in the ring."""
-    seat_spread: float = Field(default=0.5, ge=0, le=100)
+    seat_std_m: float = Field(default=0.5, ge=0, le=100)
     """Variation of seats and aims between seeds, along each axis [m]."""
-    image_size: tuple[ImageLength, ImageLength] = (1920, 1080)
+    image_size_px: tuple[ImageLength, ImageLength] = (1920, 1080)
     """Width and height [px] (C8)."""
-    distance: Range = (6.0, 30.0)
+    distance_m: Range = (6.0, 30.0)
     """Of the ring from the pitch border [m]: stands of a stadium."""
-    height: Range = (10.0, 20.0)
+    height_m: Range = (10.0, 20.0)
     """Of the ring above the pitch [m]: roofs and upper tiers."""
-    person_height: float = Field(default=115.0, gt=0, le=100000)
+    person_height_px: float = Field(default=115.0, gt=0, le=100000)
     """Height of a person of 1.8 m in the area's middle in the ring's images [px]; sets the focal
     length."""
-    clock_spread: float = Field(default=0.0, ge=0, le=100)
+    clock_std_frames: float = Field(default=0.0, ge=0, le=100)
     """Standard deviation of a camera's clock offset from match.yaml [frame]; unknown to the
     factory."""
 
@@ -246,23 +248,23 @@ class BroadcastSettings(Record):
     Ranges are those of 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose).
     """
 
-    setback: Range = (67.0, 88.0)
+    setback_m: Range = (67.0, 88.0)
     """From the long axis of the pitch [m], at negative y."""
-    height: Range = (12.0, 19.0)
+    height_m: Range = (12.0, 19.0)
     """Above the pitch [m]."""
-    aside: float = Field(default=0.3, ge=0, le=100)
+    aside_m: float = Field(default=0.3, ge=0, le=100)
     """Maximum distance off the halfway line [m]."""
-    focal: Range = (2900.0, 6200.0)
+    focal_px: Range = (2900.0, 6200.0)
     """Widest and closest zoom within a clip [px]; all clips together span 2400 to 7100."""
-    zoom_period: Range = (10.0, 24.0)
+    zoom_period_s: Range = (10.0, 24.0)
     """Time from wide to close and back [s]; the focal length then changes by at most about 20 px
     per frame."""
-    lag: float = Field(default=0.5, gt=0, le=100)
+    lag_s: float = Field(default=0.5, gt=0, le=100)
     """Time constant with which the operator follows the action [s]: a reaction, and a damped
     head."""
-    sway: float = Field(default=4.0, ge=0, le=1000)
+    sway_m: float = Field(default=4.0, ge=0, le=1000)
     """Drift of the aim off the action along x [m]: operators lead and trail play."""
-    sweep: float = Field(default=0.0, ge=0, le=100)
+    sweep_m: float = Field(default=0.0, ge=0, le=100)
     """Amplitude along x of a steady pan back and forth around the action [m]."""
 
 
@@ -273,9 +275,9 @@ class CalibrationErrors(Record):
     leaves about a third of a milliradian and a tenth of a metre.
     """
 
-    rotation: float = Field(default=0.0, ge=0, le=100)
+    rotation_rad: float = Field(default=0.0, ge=0, le=100)
     """About each axis of the camera [rad]."""
-    center: float = Field(default=0.0, ge=0, le=100)
+    center_m: float = Field(default=0.0, ge=0, le=100)
     """Along each axis of the world [m]; the rotation then keeps the image centre on the same point
     60 m away, as a fit to markings does."""
     focal: float = Field(default=0.0, ge=0, le=100)
@@ -291,7 +293,7 @@ class ClickSettings(Record):
 
     points: tuple[Count, Count] = (8, 12)
     """Minimum and maximum in one camera [1], limited by the number of visible points."""
-    noise: float = Field(default=1.0, ge=0, le=100)
+    noise_px: float = Field(default=1.0, ge=0, le=100)
     """Error of a click, standard deviation along each image axis [px]: a click on the middle of a
     painted corner at full resolution."""
     clustered: float = Field(default=0.0, ge=0, le=1)
@@ -304,7 +306,7 @@ class ClickSettings(Record):
     wrong: float = Field(default=0.2, ge=0, le=1)
     """Share of cameras with one wrong click [1]: every second of them a point with another's name,
     the other a slip."""
-    wrong_distance: Range = (20.0, 60.0)
+    wrong_distance_px: Range = (20.0, 60.0)
     """Distance of a slip [px]."""
     enough: int = Field(default=8, ge=0, le=1000)
     """If fewer points are visible, lines and arcs are drawn, too [1]."""

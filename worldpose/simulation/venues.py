@@ -227,8 +227,8 @@ class Venue:
 
     def add_fog(self, color: Singles, distance: Singles) -> None:
         """Add fog to colours (..., 3) at distances (...) [m]; in place."""
-        if self.settings.fog > 0.0:
-            clear = np.exp(np.float32(-self.settings.fog) * distance)[..., None]
+        if self.settings.fog_per_m > 0.0:
+            clear = np.exp(np.float32(-self.settings.fog_per_m) * distance)[..., None]
             color *= clear
             color += (np.float32(1.0) - clear) * FOG_COLOR.astype(np.float32)
 

@@ -77,7 +77,7 @@ class Problem:
         depth = self.evidence.points_world @ row[15:18] + row[20]
         meter = np.where(depth > _MIN_DEPTH, row[0] / np.maximum(depth, _MIN_DEPTH), 0.0)
         return replace(
-            self, click_noise=np.hypot(settings.click_noise, settings.survey_error * meter)
+            self, click_noise=np.hypot(settings.click_noise_px, settings.survey_error_m * meter)
         )
 
 
@@ -120,20 +120,21 @@ def build_problem(
     free = np.ones(len(PARAMETERS), dtype=np.bool_)
     free[9 + radial :] = False
     middle = (0.5 * (width - 1), 0.5 * (height - 1))
-    prior = [np.log(known.focal * width), known.focal_spread]
-    prior += [*middle, known.principal_point_spread * width, 0.5 * np.hypot(width, height)]
-    prior += [known.k1_spread, known.k2_spread, known.k3_spread]
-    prior += [np.log(known.height), known.height_spread]
-    prior += [np.log(known.distance), known.distance_spread, known.roll_spread, _MIN_HEIGHT]
-    prior += [*known.lens_spread, known.k1]
+    prior = [np.log(known.focal * width), known.log_focal_std]
+    prior += [*middle, known.principal_point_std * width, 0.5 * np.hypot(width, height)]
+    prior += [known.k1_std, known.k2_std, known.k3_std]
+    prior += [np.log(known.height_m), known.log_height_std]
+    prior += [np.log(known.distance_m), known.log_distance_std, known.roll_std_rad, _MIN_HEIGHT]
+    prior += [*known.lens_std, known.k1]
     return Problem(
         evidence=evidence,
         image_size=image_size,
         prior=np.array(prior),
         free=free,
-        click_noise=np.full(len(evidence.points), settings.click_noise),
-        drawn_noise=settings.drawn_noise * np.sqrt(count_neighbors(evidence, settings.drawn_reach)),
-        drawn_loss=settings.drawn_loss,
+        click_noise=np.full(len(evidence.points), settings.click_noise_px),
+        drawn_noise=settings.drawn_noise_px
+        * np.sqrt(count_neighbors(evidence, settings.drawn_correlation_px)),
+        drawn_loss=settings.drawn_loss_scale,
         where=where,
     )
 

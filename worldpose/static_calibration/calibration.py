@@ -118,7 +118,7 @@ def calibrate(
         C1-C5; paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
-    evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing, where)
+    evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
     problem = build_problem(evidence, image_size, stated, where=where)
     found = fit_inliers_at_best_noise(problem, find_start(problem, stated), stated)
@@ -129,7 +129,7 @@ def calibrate(
     if picture is not None and stated.lines:
         fit, lines = refine_and_judge(found, pitch, picture)
         found, estimate = replace(found, fit=fit), lines.estimate
-    report = build_report(estimate, found, lines, pitch, stated.click_noise)
+    report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)
 
 
@@ -457,7 +457,7 @@ def check_determined(found: Explanation, pitch: PitchTemplate) -> None:
         return
     evidence = found.problem.evidence
     clicked = (*evidence.points, *evidence.markings)
-    more = propose_clicks(found.estimate, pitch, clicked, found.settings.click_noise)
+    more = propose_clicks(found.estimate, pitch, clicked, found.settings.click_noise_px)
     if not more:
         places = np.concatenate([evidence.points_world, evidence.samples_world])
         more = points_off_line(pitch, places)

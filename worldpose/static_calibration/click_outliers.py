@@ -136,7 +136,7 @@ class Explanation:
 
     def noise_factor(self, stated: StaticCalibrationSettings) -> float:
         """Return the assumed noise over the stated noise [1]."""
-        return self.settings.click_noise / stated.click_noise
+        return self.settings.click_noise_px / stated.click_noise_px
 
 
 def compute_residuals(problem: Problem, row: NDArray[np.float64]) -> Rows:
@@ -252,7 +252,9 @@ def scale_noise(
     problem: Problem, factor: float, settings: StaticCalibrationSettings
 ) -> tuple[Problem, StaticCalibrationSettings]:
     """Return problem and settings with the noise of clicks and drawn pixels times a factor."""
-    noisy = {name: factor * getattr(settings, name) for name in ("click_noise", "drawn_noise")}
+    noisy = {
+        name: factor * getattr(settings, name) for name in ("click_noise_px", "drawn_noise_px")
+    }
     return (
         replace(
             problem,
@@ -408,7 +410,7 @@ def _select_markings(
     off = np.abs(compute_residuals(problem, row).drawn)
     on = evidence.drawn_marking
     middle = np.array([np.median(off[on == index]) for index in range(len(evidence.markings))])
-    right = np.asarray(middle < settings.wrong_marking * settings.drawn_noise)
+    right = np.asarray(middle < settings.wrong_marking * settings.drawn_noise_px)
     numbers = np.where(evidence.straight, _LINE_NUMBERS, _ARC_NUMBERS)
     all_numbers = _POINT_NUMBERS * len(inliers) + int(numbers.sum())
     left = _POINT_NUMBERS * int(inliers.sum()) + int(numbers[right].sum())

@@ -257,7 +257,7 @@ def cameras_from_homographies(
         leave_out: also leave out each straight marking in turn: one name may be wrong.
     """
     evidence, width = problem.evidence, problem.image_size[0]
-    spread = np.exp(_FOCAL_REACH * prior.focal_spread)
+    spread = np.exp(_FOCAL_REACH * prior.log_focal_std)
     focal_range = (prior.focal * width / spread, prior.focal * width * spread)
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
     seen = np.median(pixels, axis=0)
@@ -283,9 +283,9 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float6
     """
     evidence = problem.evidence
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
-    height = prior.height * np.exp(np.array(_FACTORS) * prior.height_spread)
-    distance = prior.distance * np.exp(np.array(_FACTORS) * prior.distance_spread)
-    focal = problem.image_size[0] * prior.focal * np.exp(np.array(_FOCALS) * prior.focal_spread)
+    height = prior.height_m * np.exp(np.array(_FACTORS) * prior.log_height_std)
+    distance = prior.distance_m * np.exp(np.array(_FACTORS) * prior.log_distance_std)
+    focal = problem.image_size[0] * prior.focal * np.exp(np.array(_FOCALS) * prior.log_focal_std)
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     grid = np.array(list(product(azimuth, distance, height, focal, range(len(_aims(problem))))))
     centers = np.stack(

@@ -137,17 +137,17 @@ def refine_by_search(
     everywhere = sample_markings(pitch, _WORLD_SPACING)
     begin = begin or start
     seen = search.look(begin.camera, everywhere)
-    index = thin_samples(seen, everywhere, settings.spacing, settings.samples)
+    index = thin_samples(seen, everywhere, settings.spacing_px, settings.samples)
     index = index[search.clear(begin.camera, everywhere[index], seen[index])]
-    if len(index) < settings.least_found or not search.free.any():
+    if len(index) < settings.min_found or not search.free.any():
         return _keep_start(start, "no painted line is in the picture")
     found = search.run(begin, everywhere[index])
     if found is None:
         return _keep_start(start, "too few painted lines were found")
     inliers = found.adjusted.weights > _INLIER
-    inliers &= _have_inliers(found, inliers, settings.least_share)
+    inliers &= _have_inliers(found, inliers, settings.min_inlier_share)
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
-    if count < max(settings.least_found, settings.least_share * visible):
+    if count < max(settings.min_found, settings.min_inlier_share * visible):
         return _keep_start(start, f"only {count} of {visible} samples of lines were found")
     correlation, excess = _residual_noise(found, inliers)
     independent = (1.0 - correlation) / (1.0 + correlation)
@@ -350,6 +350,6 @@ def _refine(
         pitch,
         picture,
         settings.line_refinement,
-        survey_error=settings.survey_error,
+        survey_error=settings.survey_error_m,
         begin=begin,
     )

@@ -267,13 +267,13 @@ class LineSearch:
     def look(self, camera: Camera, samples: LineSamples) -> ProjectedLines:
         """Return the samples projected into a camera's image."""
         s = self.settings
-        return project_lines(camera, samples, s.line_width, self.survey_error, s.line_shift)
+        return project_lines(camera, samples, s.line_width_m, self.survey_error, s.line_shift_px)
 
     def clear(
         self, camera: Camera, samples: LineSamples, seen: ProjectedLines
     ) -> NDArray[np.bool_]:
         """Return a mask of the samples (n,) with grass on both sides in the image."""
-        room, half = 0.5 * seen.widths + CLEARANCE, 0.5 * self.settings.line_width
+        room, half = 0.5 * seen.widths + CLEARANCE, 0.5 * self.settings.line_width_m
         return clear(camera, self.whites, half, seen.places, room, samples.marking)
 
     def run(self, begin: CameraEstimate, samples: LineSamples) -> LineFit | None:
@@ -284,7 +284,7 @@ class LineSearch:
         for left in reversed(range(_MAX_PASSES)):
             chosen = few
             seen = self.look(camera, few)
-            if seen.visible.sum() < 0.5 * self.settings.least_found:
+            if seen.visible.sum() < 0.5 * self.settings.min_found:
                 return None
             reach = self._reach(seen, covariance)
             fine = left == 0 or bool((reach <= _FINE)[seen.visible].mean() >= _MOSTLY)
@@ -296,7 +296,7 @@ class LineSearch:
             if not seen.visible.any():
                 return None
             measured = self._measure(seen, reach, fine)
-            least = self.settings.least_found * len(chosen.marking) / len(samples.marking)
+            least = self.settings.min_found * len(chosen.marking) / len(samples.marking)
             if np.isfinite(measured.offsets).sum() < max(least, 1.0):
                 return None
             found = self.converge(camera, chosen, seen, measured, fine)
@@ -311,7 +311,7 @@ class LineSearch:
         measured = MeasuredBars(
             np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
         )
-        scales = (2.0 * self.settings.loss, *(self.settings.loss,) * 2)
+        scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)
         adjusted = self._adjust(found.camera, found.seen, measured, scales)
         camera = stepped(found.camera, self._full_step(adjusted.step))
         return replace(found, camera=camera, measured=measured, adjusted=adjusted)
@@ -351,11 +351,15 @@ class LineSearch:
     ) -> LineFit:
         """Return the converged fit to bars at fixed pixels."""
         bars = seen.places + measured.offsets[:, None] * seen.normals
-        final = (self.settings.loss,) * 3
+        final = (self.settings.loss_scale,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
         for _ in range(_MAX_FITS if fine else 1):
             adjusted = self._adjust(camera, seen, measured, scales)
-            scales = (2.0 * self.settings.loss, self.settings.loss, self.settings.loss)
+            scales = (
+                2.0 * self.settings.loss_scale,
+                self.settings.loss_scale,
+                self.settings.loss_scale,
+            )
             camera = stepped(camera, self._full_step(adjusted.step))
             moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
             seen = self.look(camera, samples)
@@ -375,7 +379,7 @@ class LineSearch:
         """Return the bars matched to the samples, to a subpixel (`fine`) or to a pixel."""
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
-        limit = max(s.reach, float(np.quantile(reach[seen.visible], _BEST)))
+        limit = max(s.search_px, float(np.quantile(reach[seen.visible], _BEST)))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
         looked = np.where(usable, reach, -1.0)

@@ -149,7 +149,7 @@ def build_report(
     """
     problem, fit, settings = found.problem, found.fit, found.settings
     decisions = found.assumptions
-    scale = fit.noise_scale * settings.click_noise / stated
+    scale = fit.noise_scale * settings.click_noise_px / stated
     evidence = problem.evidence
     rows = compute_residuals(problem, camera_row(estimate.camera))
     problems = image_problems(estimate.camera, evidence.points_world)
@@ -173,17 +173,17 @@ def build_report(
         )
         for index, name in enumerate(evidence.markings)
     ]
-    known = ground_error_map(estimate, pitch, settings.map_step)
+    known = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = []
-    if known.median > settings.weak_median:
+    if known.median > settings.weak_median_m:
         reasons.append(
             f"expected ground error {known.median:.2f} m (median over the seen pitch), "
-            f"over {settings.weak_median:g} m"
+            f"over {settings.weak_median_m:g} m"
         )
-    if known.p95 > settings.weak_p95:
+    if known.p95 > settings.weak_p95_m:
         reasons.append(
             f"expected ground error {known.p95:.2f} m on the worst twentieth of the seen pitch, "
-            f"over {settings.weak_p95:g} m"
+            f"over {settings.weak_p95_m:g} m"
         )
     if fit.misfit > _TRUSTED * fit.noise_scale**2:
         reasons.append(
@@ -222,7 +222,7 @@ def build_report(
         ground_error=known,
         weak=bool(reasons),
         reasons=tuple(reasons),
-        add_next=propose_clicks(estimate, pitch, clicked, settings.click_noise),
+        add_next=propose_clicks(estimate, pitch, clicked, settings.click_noise_px),
         lines=lines,
     )
 
@@ -257,13 +257,13 @@ def _true_name(
     row = camera_row(estimate.camera)
     worst = {}
     for name in pitch.marking_names:
-        samples = pitch.marking_points(name, settings.sample_spacing)
+        samples = pitch.marking_points(name, settings.sample_spacing_m)
         bounds = np.array([0, len(samples)])
         drawn_residuals(row, problem.half_diagonal, samples, bounds, pixels, every, off, by_step)
         worst[name] = float(np.abs(off).max())
     nearest = min(worst, key=lambda name: worst[name])
     drawn = f"{evidence.markings[index]} left out: its pixels lie"
-    if worst[nearest] > settings.wrong_marking * settings.drawn_noise:
+    if worst[nearest] > settings.wrong_marking * settings.drawn_noise_px:
         return f"{drawn} on no marking"
     return f"{drawn} on {nearest}, {worst[nearest]:.1f} px off at most"
 

@@ -15,25 +15,25 @@ SURVEY_ERROR: Final = 0.006
 class LineRefinementSettings(Record):
     """Sampling, search widths and acceptance thresholds of the refinement."""
 
-    line_width: float = Field(default=0.12, ge=1e-6, le=100)
+    line_width_m: float = Field(default=0.12, ge=1e-6, le=100)
     """Width of the paint [m]: the maximum of Law 1, which most pitches have."""
-    line_shift: float = Field(default=0.05, ge=0, le=10)
+    line_shift_px: float = Field(default=0.05, ge=0, le=10)
     """Standard deviation of errors that shift a whole marking in the image [px], such as sharpening
     or lens distortion beyond k1 and k2."""
     samples: int = Field(default=2000, ge=100, le=1_000_000)
     """Approximate maximum number of samples in the image [1]."""
-    spacing: float = Field(default=4.0, ge=1e-6, le=1000)
+    spacing_px: float = Field(default=4.0, ge=1e-6, le=1000)
     """Spacing of neighbouring samples in the image [px]."""
-    reach: float = Field(default=40.0, ge=1e-6, le=10000)
+    search_px: float = Field(default=40.0, ge=1e-6, le=10000)
     """Maximum search width of a sample [px], three standard deviations of its projection; others
     wait for a more accurate camera."""
     contrast: float = Field(default=6.0, ge=1e-6, le=1000)
     """Minimum brightness of paint above the grass on either side [levels of 255]."""
-    loss: float = Field(default=3.0, ge=1e-6, le=1000)
+    loss_scale: float = Field(default=3.0, ge=1e-6, le=1000)
     """Final scale of the robust loss [standard deviations]."""
-    least_found: int = Field(default=30, ge=1, le=10000)
+    min_found: int = Field(default=30, ge=1, le=10000)
     """Minimum number of detected samples [1]."""
-    least_share: float = Field(default=0.4, ge=0, le=1)
+    min_inlier_share: float = Field(default=0.4, ge=0, le=1)
     """Minimum share of inliers among the samples in the image, and of each marking [1]: people
     occlude some samples, and paint is worn. A wrong camera may match a third, on wrong markings."""
     contradiction: float = Field(default=1e-6, gt=0, lt=1)
@@ -53,33 +53,33 @@ class CameraPrior(Record):
     focal: float = Field(default=1.6, ge=1e-6, le=1000)
     """Focal length in image widths [1]: WorldPose's static cameras have 1.1, its broadcast cameras
     1.25 to 3.7."""
-    focal_spread: float = Field(default=0.6, ge=1e-6, le=100)
+    log_focal_std: float = Field(default=0.6, ge=1e-6, le=100)
     """Of the focal length's logarithm [1]: a factor of 1.8 either way."""
-    principal_point_spread: float = Field(default=0.004, ge=1e-6, le=1)
+    principal_point_std: float = Field(default=0.004, ge=1e-6, le=1)
     """About the image center, each axis, in widths [1]: 8 px of 1920, a lens and a sensor mounted
     with ordinary care."""
     k1: float = Field(default=0.0, ge=-10, le=10)
-    """As `k1_spread`, its middle [1]: an unknown lens may bend either way."""
-    k1_spread: float = Field(default=0.025, ge=1e-6, le=10)
+    """As `k1_std`, its middle [1]: an unknown lens may bend either way."""
+    k1_std: float = Field(default=0.025, ge=1e-6, le=10)
     """Displacement of the image corner by k1, relative to its distance from the center [1]: 2.5 %
     is a visibly bent touch line."""
-    k2_spread: float = Field(default=0.0015, ge=1e-6, le=1)
-    """As `k1_spread`, of k2 [1]: a pixel or two in the corner. A larger spread bends the image
+    k2_std: float = Field(default=0.0015, ge=1e-6, le=1)
+    """As `k1_std`, of k2 [1]: a pixel or two in the corner. A larger spread bends the image
     beyond the clicks: on drawn broadcast lines 0.005 predicts worse than 0.0015."""
-    k3_spread: float = Field(default=0.005, ge=1e-6, le=1)
-    """As `k1_spread`, of k3 if it is free [1]."""
-    lens_spread: tuple[_AddedSpread, _AddedSpread, _AddedSpread] = (0.1, 0.02, 0.01)
+    k3_std: float = Field(default=0.005, ge=1e-6, le=1)
+    """As `k1_std`, of k3 if it is free [1]."""
+    lens_std: tuple[_AddedSpread, _AddedSpread, _AddedSpread] = (0.1, 0.02, 0.01)
     """Of the coefficients k1, k2, k3 [1], added in squares to the spread from the corner's
     displacement: wide lenses bend their corners more (C5); zero adds nothing."""
-    height: float = Field(default=18.0, ge=1e-6, le=10000)
+    height_m: float = Field(default=18.0, ge=1e-6, le=10000)
     """Above the pitch [m]: stands and roofs are 8 to 40 m up."""
-    height_spread: float = Field(default=0.4, ge=1e-6, le=100)
+    log_height_std: float = Field(default=0.4, ge=1e-6, le=100)
     """Of the height's logarithm [1]."""
-    distance: float = Field(default=75.0, ge=1e-6, le=10000)
+    distance_m: float = Field(default=75.0, ge=1e-6, le=10000)
     """In plan from the centre spot [m]: the stands are 40 to 120 m away."""
-    distance_spread: float = Field(default=0.35, ge=1e-6, le=100)
+    log_distance_std: float = Field(default=0.35, ge=1e-6, le=100)
     """Of the distance's logarithm [1]."""
-    roll_spread: float = Field(default=0.03, ge=1e-6, le=10)
+    roll_std_rad: float = Field(default=0.03, ge=1e-6, le=10)
     """Of the image horizon [rad]: 1.7 degrees, a level tripod or bracket."""
 
 
@@ -88,23 +88,23 @@ class StaticCalibrationSettings(Record):
 
     prior: CameraPrior = CameraPrior()
     """Gaussian prior of the camera."""
-    click_noise: float = Field(default=1.0, ge=1e-6, le=100)
+    click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]: a careful click in a zoomed view
     (C7)."""
-    survey_error: float = Field(default=SURVEY_ERROR, ge=0, le=1)
+    survey_error_m: float = Field(default=SURVEY_ERROR, ge=0, le=1)
     """Standard deviation of the template's points from the painted ones, each axis [m], in clicks
     and in painted lines: a total station measures to millimetres, but paint varies by a twentieth
     of its width."""
-    drawn_noise: float = Field(default=1.5, ge=1e-6, le=1000)
+    drawn_noise_px: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation of a point drawn along a marking, across it [px]: hand annotations of
     SoccerNet have residuals of 1.2 px (median 0.8)."""
-    drawn_reach: float = Field(default=8.0, ge=0, le=1000)
+    drawn_correlation_px: float = Field(default=8.0, ge=0, le=1000)
     """Correlation length of drawing errors along a marking, either way [px]: pixels closer together
     than this share the weight of one."""
-    drawn_loss: float = Field(default=6.0, ge=1e-6, le=1000)
+    drawn_loss_scale: float = Field(default=6.0, ge=1e-6, le=1000)
     """Cauchy scale of drawn points, in their standard deviations [1]: nearly least squares for
     inliers, with bounded influence of a marking under a wrong name."""
-    sample_spacing: float = Field(default=0.5, ge=1e-6, le=100)
+    sample_spacing_m: float = Field(default=0.5, ge=1e-6, le=100)
     """Spacing of marking samples [m]: chords then deviate from the circle by 3 mm."""
     wrong_click: float = Field(default=4.2, ge=1e-6, le=1000)
     """Leave-one-out residual above which a click is an outlier, in standard deviations [1]: 0.015 %
@@ -124,12 +124,12 @@ class StaticCalibrationSettings(Record):
     """Minimum relative reduction of the held-out error to keep k3 [1]."""
     search_cameras: int = Field(default=24, ge=1, le=10000)
     """Number of best plausible cameras to refine [1]."""
-    weak_median: float = Field(default=0.15, ge=1e-6, le=100)
+    weak_median_m: float = Field(default=0.15, ge=1e-6, le=100)
     """Median expected ground error over the visible pitch above which a camera is weak [m]: a
     player's foot is then too inaccurate."""
-    weak_p95: float = Field(default=0.6, ge=1e-6, le=100)
-    """As `weak_median`, for the 95th percentile over the visible pitch [m]: half a stride."""
-    map_step: float = Field(default=2.0, ge=1e-6, le=1000)
+    weak_p95_m: float = Field(default=0.6, ge=1e-6, le=100)
+    """As `weak_median_m`, for the 95th percentile over the visible pitch [m]: half a stride."""
+    map_step_m: float = Field(default=2.0, ge=1e-6, le=1000)
     """Grid spacing of the expected ground error's map [m]."""
     lines: bool = True
     """Refine on the painted lines if there is an image (C4)."""

@@ -261,7 +261,7 @@ def diagnose_no_people(
             )
         return _explain_limit(cameras, camera_ids, agreeing, settings, ground, births)
     matched = [each for each in matched_pairs if len(each.angle)]
-    if matched and max(np.median(each.angle) for each in matched) < settings.min_angle:
+    if matched and max(np.median(each.angle) for each in matched) < settings.min_angle_rad:
         # Cameras at nearly one position share few people if they look in different directions.
         return _explain_limit(cameras, camera_ids, matched, settings, ground, births)
     found = _explain_clock_offset(cameras, camera_ids, rays, matched_pairs, fps, settings)
@@ -429,15 +429,15 @@ def _explain_limit(
         **({"size": size} if math.isfinite(size) else {}),
     }
     widest = max(float(np.median(each.angle)) for each in agreeing)
-    if widest < settings.min_angle:
+    if widest < settings.min_angle_rad:
         return NoPeople(
             cause="narrow_angle",
             message=f"{seen}, but the rays of one person meet at "
-            f"{math.degrees(angle):.2g} degrees and tracking.min_angle asks for "
-            f"{math.degrees(settings.min_angle):.2g} ({settings.min_angle:g} rad): the cameras are "
-            f"{apart:.2f} m apart and people {depth:.0f} m away, so an error of one centimetre "
-            f"across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. Add a camera that "
-            "sees them from another side.",
+            f"{math.degrees(angle):.2g} degrees and tracking.min_angle_rad asks for "
+            f"{math.degrees(settings.min_angle_rad):.2g} ({settings.min_angle_rad:g} rad): "
+            f"the cameras are {apart:.2f} m apart and people {depth:.0f} m away, so an error of "
+            f"one centimetre across the rays is {0.01 / max(angle, 1e-9):.1f} m along them. "
+            "Add a camera that sees them from another side.",
             evidence=evidence,
         )
     low, high = settings.size_range
@@ -455,20 +455,20 @@ def _explain_limit(
             f"are read as metres; {a} and {b} are {apart:.4g} apart.",
             evidence=evidence,
         )
-    low, high = settings.body_heights
+    low, high = settings.body_heights_m
     if ground and not low <= height <= high:
         return NoPeople(
             cause="wrong_height",
             message=f"{seen}, but the middle of their bodies is at z = {height:.2f} m "
-            f"(tracking.body_heights accepts {low:g} to {high:g}). On a pitch people stand at "
+            f"(tracking.body_heights_m accepts {low:g} to {high:g}). On a pitch people stand at "
             "z = 0 and z points up: look at the world frame of the cameras, or write pitch: none.",
             evidence=evidence,
         )
-    if distance > settings.epipolar_gate:
+    if distance > settings.epipolar_gate_m:
         return NoPeople(
             cause="rays_miss",
             message=f"{seen}, but the rays of one joint pass {distance:.2f} m apart and "
-            f"tracking.epipolar_gate accepts {settings.epipolar_gate:g}: the cameras are not "
+            f"tracking.epipolar_gate_m accepts {settings.epipolar_gate_m:g}: the cameras are not "
             "known well enough.",
             evidence=evidence,
         )
@@ -478,13 +478,13 @@ def _explain_limit(
             message=f"{seen}, and no limit of tracking alone refuses them (angle "
             f"{math.degrees(widest):.2g} degrees, {distance:.2f} m between rays, {size:.2g} times "
             "an adult's size), but no group of detections passes all of them. Loosen "
-            "tracking.min_angle, epipolar_gate or size_range.",
+            "tracking.min_angle_rad, epipolar_gate_m or size_range.",
             evidence=evidence,
         )
     return NoPeople(
         cause="too_short",
         message=f"{seen}, but none was seen for long enough: {births} tracks were started and "
-        f"dropped; tracking.min_track asks for {settings.min_track:g} s, and frames with fewer "
+        f"dropped; tracking.min_track_s asks for {settings.min_track_s:g} s, and frames with fewer "
         f"than {settings.birth_views} cameras count at most {settings.pair_evidence:g} where "
         f"the odds that two detections are one person are below {settings.pair_odds:g}.",
         evidence={**evidence, "tracks": float(births)},
@@ -529,7 +529,7 @@ def _explain_clock_offset(
 def _views_overlap(cameras: Camera, rays: Floats, ground: bool, settings: TrackingSettings) -> bool:
     """Return whether people seen by one camera may be in the image of another."""
     centers, size = cameras.center, cameras.image_size
-    middle = 0.5 * sum(settings.body_heights)
+    middle = 0.5 * sum(settings.body_heights_m)
     for a in range(len(centers)):
         seen = rays[:, a][np.isfinite(rays[:, a, :, :, 0]).any(axis=-1)]
         if not len(seen):

@@ -177,7 +177,7 @@ def associate(
         return []
     camera, detection = np.nonzero(usable)
     origins, rays = centers[camera], directions[camera, detection]
-    low, high = settings.body_heights
+    low, high = settings.body_heights_m
     extent = 0.5 * (high - low) if ground else math.inf
     distances = pair_distances(
         origins,
@@ -185,8 +185,8 @@ def associate(
         camera,
         footprints(origins, rays, (0.5 * (low + high), extent)),
         settings.min_joints,
-        math.sin(settings.min_angle),
-        settings.epipolar_gate,
+        math.sin(settings.min_angle_rad),
+        settings.epipolar_gate_m,
     )
     first, second = np.nonzero(distances < np.inf)
     order = np.argsort(distances[first, second], kind="stable")
@@ -212,7 +212,7 @@ def is_person(joints: Floats, ground: bool, settings: TrackingSettings) -> bool:
     known = np.isfinite(joints[:, 2])
     if not has_adult_size(joints, settings.size_range):
         return False
-    low, high = settings.body_heights
+    low, high = settings.body_heights_m
     return not ground or low <= float(joints[known, 2].mean()) <= high
 
 
@@ -228,10 +228,10 @@ def _grow_group(
     Two passes, the first at the wider gate: two views alone leave the position uncertain.
     """
     unknown = np.full((1, directions.shape[2], 3), np.nan)
-    sine = math.sin(settings.min_angle)
-    for gate in (settings.gate, settings.epipolar_gate):
+    sine = math.sin(settings.min_angle_rad)
+    for gate in (settings.gate_m, settings.epipolar_gate_m):
         joints = intersect_people(
-            centers, directions, weights, index[:, None], unknown, settings.gate, sine
+            centers, directions, weights, index[:, None], unknown, settings.gate_m, sine
         )
         gates = np.full((len(centers), 1), gate)
         distances = -ray_affinity(joints, centers, directions, weights, gates, settings.min_joints)[
@@ -241,6 +241,6 @@ def _grow_group(
         ray_distance = distances[np.arange(len(centers)), best]
         index = np.where(ray_distance <= gate, best, -1)
     joints = intersect_people(
-        centers, directions, weights, index[:, None], unknown, settings.gate, sine
+        centers, directions, weights, index[:, None], unknown, settings.gate_m, sine
     )
     return Sighting(index, np.where(index >= 0, ray_distance, np.nan), joints[0])

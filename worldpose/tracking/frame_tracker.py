@@ -57,7 +57,7 @@ class FrameTracker:
         self.visibility = CameraVisibility(cameras)
         self.centers, self.fps, self.settings = self.visibility.centers, fps, settings
         self.ground, self.people = ground, people
-        self.confirmed_after = math.ceil(settings.min_track * fps)
+        self.confirmed_after = math.ceil(settings.min_track_s * fps)
         self.active: list[Person] = []
         self.lost: list[Person] = []
         self.ended: list[Person] = []
@@ -161,10 +161,10 @@ class FrameTracker:
         poses = np.stack([person.pose for person in self.active])
         doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
         usual = np.maximum(
-            settings.gate_spreads * self.gates.usual[:, None],
+            settings.gate_factor * self.gates.usual[:, None],
             settings.gate_growth * np.array([person.misfit for person in self.active]),
         )
-        gates = np.hypot(np.clip(usual, settings.min_gate, settings.gate), doubt)
+        gates = np.hypot(np.clip(usual, settings.min_gate_m, settings.gate_m), doubt)
         affinity = ray_affinity(
             poses, self.centers, directions, weights, gates, settings.min_joints
         )
@@ -188,8 +188,8 @@ class FrameTracker:
             weights,
             index,
             poses,
-            settings.gate,
-            math.sin(settings.min_angle),
+            settings.gate_m,
+            math.sin(settings.min_angle_rad),
         )
         return index, distance, joints
 
@@ -239,7 +239,7 @@ class FrameTracker:
         taken, new = [person.pose for person in seen], list[Sighting]()
         for group in groups:
             beside = separations(group.joints[None], np.array(taken)) if taken else np.array(np.inf)
-            if not beside.min() < self.settings.merge_distance:
+            if not beside.min() < self.settings.merge_distance_m:
                 new.append(group)
                 taken.append(group.joints)
         found = self._recover_lost(frame, new) if self.settings.causal and self.lost else []
@@ -284,16 +284,16 @@ class FrameTracker:
         return fit_track_ends(person.number, frames, joints, self.fps, self.settings)
 
     def _merge(self, frame: int) -> None:
-        """End people whose track has coincided with another's for `merge_time`."""
+        """End people whose track has coincided with another's for `merge_time_s`."""
         seen = [person for person in self.active if person.last_fixed == frame]
         seen.sort(key=lambda person: (-person.fixed, person.number))
         apart = _pose_distances([person.pose for person in seen], seen)
         near: dict[tuple[int, int], int] = {}
-        for a, b in np.argwhere(np.triu(apart < self.settings.merge_distance, 1)):
+        for a, b in np.argwhere(np.triu(apart < self.settings.merge_distance_m, 1)):
             kept, other = seen[a], seen[b]
             pair = (min(kept.number, other.number), max(kept.number, other.number))
             near[pair] = self.near_since.get(pair, frame)
-            long_enough = (frame - near[pair]) / self.fps >= self.settings.merge_time
+            long_enough = (frame - near[pair]) / self.fps >= self.settings.merge_time_s
             if long_enough and kept in self.active and other in self.active:
                 if not self.settings.causal:
                     kept.absorb(other, near[pair])
@@ -306,13 +306,13 @@ class FrameTracker:
         """End or lose people unseen for too long; unconfirmed ones have a shorter limit."""
         settings = self.settings
         for person in list(self.active):
-            patience = settings.max_coast if self._is_confirmed(person) else settings.min_track
+            patience = settings.max_coast_s if self._is_confirmed(person) else settings.min_track_s
             if (frame - person.last_fixed) / self.fps > patience:
                 self.active.remove(person)
                 back = settings.causal and self._is_confirmed(person)
                 (self.lost if back else self.ended).append(person)
         for person in list(self.lost):
-            if (frame - person.last_fixed) / self.fps > settings.max_lost:
+            if (frame - person.last_fixed) / self.fps > settings.max_lost_s:
                 self.lost.remove(person)
                 self.ended.append(person)
 

@@ -90,7 +90,7 @@ def fit_track_ends(
     limbs, variance = limb_lengths(joints, fps)
     out = []
     for edge in (0, -1):
-        near = np.abs(frames - frames[edge]) <= settings.end_time * fps
+        near = np.abs(frames - frames[edge]) <= settings.end_time_s * fps
         time = (frames[near] - frames[edge]) / fps
         place, velocity = places[edge], np.full(2, np.nan)
         if np.count_nonzero(near) >= 3:
@@ -136,7 +136,7 @@ def join_costs(
     for i, old in enumerate(before):
         for j, new in enumerate(after):
             gap = (new.frame - old.frame) / fps
-            if 0.0 < gap <= settings.max_gap:
+            if 0.0 < gap <= settings.max_gap_s:
                 costs[i, j] = _join_cost(old, new, gap, area, settings)
     return costs
 
@@ -149,13 +149,13 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
     first = np.nan_to_num(old.velocity)
     both = bool(np.isfinite(new.velocity).all())
     change = new.velocity - first
-    memory = settings.velocity_memory
+    memory = settings.velocity_memory_s
     short = min(gap, memory)
     mean = 0.5 * (first + new.velocity) if both else first
     offset = offset - mean * memory * (1.0 - math.exp(-gap / memory))
     prior, likelihood = [], []
     for share, pace in settings.paces:
-        agility, speed = pace * settings.agility, pace * settings.mean_speed
+        agility, speed = pace * settings.velocity_change_std_m_s, pace * settings.rms_speed_m_s
         variance = PLACE_NOISE**2 + agility**2 * short**3 / (12.0 if both else 3.0)
         variance += 2.0 * speed**2 * memory * (gap - short)
         prior.append(math.log(share) + _log_normal_density(first, speed**2 + VELOCITY_NOISE**2))
@@ -165,11 +165,11 @@ def _join_cost(old: End, new: End, gap: float, area: float, settings: TrackingSe
             likelihood[-1] += _log_normal_density(change, spread)
     cost = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(likelihood)) - math.log(area)
     if both:
-        cost += _log_normal_density(change, VELOCITY_NOISE**2 + 2.0 * settings.mean_speed**2)
+        cost += _log_normal_density(change, VELOCITY_NOISE**2 + 2.0 * settings.rms_speed_m_s**2)
     difference = new.limbs - old.limbs
     known = np.isfinite(difference)
-    own = settings.limb_noise**2 + old.limb_variance[known] + new.limb_variance[known]
-    other = own + 2.0 * settings.limb_spread**2
+    own = settings.limb_noise_m**2 + old.limb_variance[known] + new.limb_variance[known]
+    other = own + 2.0 * settings.limb_std_m**2
     evidence = _log_limb_density(difference[known], other) - _log_limb_density(
         difference[known], own
     )

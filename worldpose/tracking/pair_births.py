@@ -92,8 +92,8 @@ def judge_pairs(
         camera,
         anywhere,
         settings.min_joints,
-        math.sin(settings.min_angle),
-        settings.epipolar_gate,
+        math.sin(settings.min_angle_rad),
+        settings.epipolar_gate_m,
     )
     first, second = np.nonzero(distances < np.inf)
     index = np.full((len(centers), len(first)), -1)
@@ -106,8 +106,8 @@ def judge_pairs(
         weights,
         index,
         np.full((len(first), directions.shape[2], 3), np.nan),
-        settings.gate,
-        math.sin(settings.min_angle),
+        settings.gate_m,
+        math.sin(settings.min_angle_rad),
     )
     keep = np.array([is_person(each, ground, settings) for each in joints], dtype=np.bool_)
     first, second, joints = first[keep], second[keep], joints[keep]

@@ -57,7 +57,7 @@ def join_people(
         chains: each person's tracks in time order.
     """
     settings = tracker.settings
-    sure = drop_shadows(tracks, settings.shadow_distance)
+    sure = drop_shadows(tracks, settings.shadow_distance_m)
     sure = drop_bystanders(sure, pitch_size, settings.pitch_margin_m)
     limited = limit_people(sure, tracker.people)
     joins, chains = join_tracks(limited, tracker)
@@ -68,7 +68,7 @@ def join_people(
     while True:
         # Removal of tracks changes the joins: repeat until all joined tracks may stay.
         joins, chains = join_tracks(left, tracker)
-        whole = _select_whole(chains, sure, pairs, settings.shadow_distance)
+        whole = _select_whole(chains, sure, pairs, settings.shadow_distance_m)
         kept = limit_people(whole, tracker.people)
         if len(kept) == len(left):
             return joins, chains

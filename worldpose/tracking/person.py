@@ -122,7 +122,7 @@ class Person:
         if settings.predict_motion:
             self.pose = self.pose + self.velocity / fps
             if self.last_fixed < frame - 1:
-                self.velocity = self.velocity * math.exp(-1.0 / (fps * settings.coast_time))
+                self.velocity = self.velocity * math.exp(-1.0 / (fps * settings.coast_time_s))
 
     def see(
         self,
@@ -134,14 +134,14 @@ class Person:
     ) -> None:
         """Update with the sighting in `frame`; undetermined joints follow the others."""
         self.sightings[frame] = sighting
-        gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time))
+        gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
         self.misfit += gain * (float(np.nanmean(sighting.ray_distance)) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
         pose, shift, known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
         if not known:
             return
         if elapsed > 0.0:
-            gain = 1.0 - math.exp(-elapsed / settings.velocity_time)
+            gain = 1.0 - math.exp(-elapsed / settings.velocity_time_s)
             self.velocity = self.velocity + gain * shift / elapsed
         self.pose = pose
         self.last_fixed = frame
@@ -153,10 +153,10 @@ class Person:
     def uncertainty(self, frame: int, fps: float, settings: TrackingSettings) -> float:
         """Return the standard deviation of the predicted position at `frame` [m]."""
         unseen = (frame - self.last_fixed) / fps
-        wander = settings.agility * math.sqrt(unseen**3 / 3.0)
+        wander = settings.velocity_change_std_m_s * math.sqrt(unseen**3 / 3.0)
         # The velocity estimate needs a few frames; before, a person may be running.
-        known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time))
-        return math.hypot(wander, (1.0 - known) * settings.mean_speed * unseen)
+        known = 1.0 - math.exp(-self.fixed / (fps * settings.velocity_time_s))
+        return math.hypot(wander, (1.0 - known) * settings.rms_speed_m_s * unseen)
 
     def absorb(self, other: Person, since: int) -> None:
         """Move the other's sightings from frame `since` on to this person."""

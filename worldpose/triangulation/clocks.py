@@ -58,7 +58,7 @@ class CameraClocks:
         late: (cameras,) [frame]: frame t shows the time t + late of the cameras' mean clock; NaN
             where `determined` is false.
         standard_error: (cameras,) [frame]; several frames without motion.
-        determined: (cameras,) bool, standard error below the settings' `clock_error`.
+        determined: (cameras,) bool, standard error below the settings' `max_clock_error_frames`.
     """
 
     late: Floats
@@ -121,13 +121,13 @@ def estimate_clocks(
         alike = ALIKE * _common_score(sums)
         error = np.sqrt(np.maximum((left**2).sum(axis=0), stated) + centered**2 @ alike**2)
         error = np.minimum(error, UNKNOWN)
-        known = error < settings.clock_error
+        known = error < settings.max_clock_error_frames
         late = np.where(known, late + step, 0.0)
         if known.any():
             late = np.where(known, late - late[known].mean(), 0.0)
         if np.abs(step[known] - step[known].mean() if known.any() else 0.0).max() < SETTLED:
             break
-    determined = error < settings.clock_error
+    determined = error < settings.max_clock_error_frames
     return CameraClocks(np.where(determined, late, np.nan), error, determined)
 
 
@@ -200,7 +200,7 @@ def _sum_equations(
         depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
         with np.errstate(divide="ignore"):
             size = rig.cameras[camera, 0] / depth
-        variance = settings.pixel_noise**2 + (size * settings.joint_noise) ** 2
+        variance = settings.pixel_noise_px**2 + (size * settings.joint_noise_m) ** 2
         weight = precision[here, camera][known] / variance
         squared = weight * (miss**2).sum(axis=-1)
         weight = weight / (1.0 + squared / settings.max_deviation**2) ** 2

@@ -83,7 +83,7 @@ def stated_errors(
     Args:
         cameras: batch (cameras,).
         joints: (frames, persons, joints, 3) [m], world; their mean is the person's position.
-        settings: `calibration_error` replaces a missing covariance.
+        settings: `calibration_error_m` replaces a missing covariance.
         camera_covariance: (cameras, 12, 12) of steps in the order of `PARAMETERS`, or None.
     """
     found = np.isfinite(joints[..., 0])
@@ -100,7 +100,7 @@ def stated_errors(
         size = np.sqrt(cameras.focal[camera].prod()) / np.where(before, depth, 1.0)
         scale[:, camera] = np.where(before, size, 0.0)
         if camera_covariance is None:
-            variance[:, camera] = (settings.calibration_error * scale[:, camera]) ** 2
+            variance[:, camera] = (settings.calibration_error_m * scale[:, camera]) ** 2
             continue
         seen = cameras[camera].project_with_jacobians(places[before])
         by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)

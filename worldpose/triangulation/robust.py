@@ -245,12 +245,12 @@ def _run_passes(
     lengths = limb_lengths(solution) if known is None else known.lengths
     if settings.repair_limb_lengths:
         repair_limb_lengths(observations, settings, solution, lengths)
-    bias = np.full(detections.confidence.shape[-1], settings.common_bias)
+    bias = np.full(detections.confidence.shape[-1], settings.common_bias_m)
     if known is not None:
         bias = known.common_bias
     elif settings.learn_noise and len(bias) == len(BY_JOINT):
         seen_noise = solution.covariance + offset_covariance
-        bias = BY_JOINT * learn_common_bias(solution.joints, seen_noise, settings.common_bias)
+        bias = BY_JOINT * learn_common_bias(solution.joints, seen_noise, settings.common_bias_m)
     model = DetectorModel(tuple(models), factor, lengths, bias)
     return _Passes(solution, exchanged, shift, offset_covariance, model, misplaced)
 

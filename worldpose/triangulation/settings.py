@@ -12,21 +12,21 @@ from data_contracts.records import Record
 class TriangulationSettings(Record):
     """Noise, inlier limit and minimum views of triangulation.
 
-    The expected error of a keypoint is sqrt(pixel_noise^2 + (pixels per metre at the joint x
-    joint_noise)^2) [px] per axis, times factors for its joint and its confidence. So one setting
+    The expected error of a keypoint is sqrt(pixel_noise_px^2 + (pixels per metre at the joint x
+    joint_noise_m)^2) [px] per axis, times factors for its joint and its confidence. So one setting
     serves people of 60 and of 600 pixels.
     """
 
-    pixel_noise: float = Field(default=1.5, ge=1e-6, le=1000)
+    pixel_noise_px: float = Field(default=1.5, ge=1e-6, le=1000)
     """Standard deviation per image axis that does not depend on distance [px]: the grid
     of a detector."""
-    joint_noise: float = Field(default=0.04, ge=0, le=10)
+    joint_noise_m: float = Field(default=0.04, ge=0, le=10)
     """Standard deviation per axis that scales with the person [m]: human labels of a hip spread by
     2 to 3 % of body height (COCO's keypoint sigmas)."""
     learn_noise: bool = True
     """Learn the factors from residuals between the clip's views; False uses the stated noise, with
     a variance proportional to the inverse confidence."""
-    common_bias: float = Field(default=0.024, ge=0, le=1)
+    common_bias_m: float = Field(default=0.024, ge=0, le=1)
     """Usual standard deviation per axis of the error that all views of a joint share [m]: a
     detector's labels mean another point than the joint's centre. No residual shows it; it is added
     to the covariance. With `learn_noise` every joint has a factor (`noise_model.BY_JOINT`), and the
@@ -37,7 +37,7 @@ class TriangulationSettings(Record):
     % of correct ones (chi-square, two degrees of freedom)."""
     min_views: int = Field(default=2, ge=2, le=1000)
     """Minimum inlier cameras [1]; a joint with fewer is missing."""
-    min_angle: float = Field(default=0.1, ge=1e-6, le=10)
+    min_angle_rad: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum of the widest angle between inlier rays [rad]: below it a pixel moves the joint ten
     times as far along the rays as across them."""
     undo_swaps: bool = True
@@ -49,13 +49,13 @@ class TriangulationSettings(Record):
     """How calibration errors are kept from a person's pose (T4): "none" treats the cameras as
     exact; "midhip" shifts every image of a person so that the mid-hips meet, as the paper does;
     "body" shifts it by the most probable offset of all joints together."""
-    calibration_error: float = Field(default=0.03, ge=1e-6, le=10)
+    calibration_error_m: float = Field(default=0.03, ge=1e-6, le=10)
     """Initial displacement of people by calibration errors [m], from which "body" learns if cameras
     have no covariance: the residual error of careful calibration from pitch markings in the middle
     of the pitch."""
-    max_gap: float = Field(default=0.5, ge=0, le=100)
+    max_gap_s: float = Field(default=0.5, ge=0, le=100)
     """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
-    clock_error: float = Field(default=0.05, ge=1e-6, le=10)
+    max_clock_error_frames: float = Field(default=0.05, ge=1e-6, le=10)
     """A camera's clock offset is determined if its standard error is below this [frame]."""
     correct_clocks: bool = False
     """Shift every camera's observations in time by the clock offset estimated from tracks."""
@@ -63,4 +63,4 @@ class TriangulationSettings(Record):
     @property
     def noise(self) -> tuple[float, float]:
         """The stated noise [px], [m]."""
-        return self.pixel_noise, self.joint_noise
+        return self.pixel_noise_px, self.joint_noise_m

@@ -64,7 +64,7 @@ def solve_joints(observations: Observations, settings: TriangulationSettings) ->
         settings.noise,
         settings.max_deviation**2,
         settings.min_views,
-        math.sin(settings.min_angle),
+        math.sin(settings.min_angle_rad),
         solution,
     )
     return solution

@@ -42,7 +42,7 @@ def test_a_clip_is_looked_at_for_no_longer_than_is_asked():
     broken = {p: (j.copy(), c) for p, (j, c) in joints.items()}
     # Between the two parts of a second each, at both ends, nothing is looked at.
     broken[0][0][60:940] += 100.0
-    settings = SETTINGS.model_copy(update={"shape_time": 2.0})
+    settings = SETTINGS.model_copy(update={"shape_time_s": 2.0})
     solver = Solver(SOLVER.chained, SOLVER.prior, settings, None)
     one = fit_shapes(solver, joints, {}, 50.0)
     two = fit_shapes(solver, broken, {}, 50.0)
@@ -81,7 +81,7 @@ def test_what_few_seconds_say_of_offsets_is_held_back_by_how_often_errors_repeat
         places[:, [15, 16], 2] += 0.04
     sizes, spreads = [], []
     for repeat in (1e6, 40.0, 0.02):
-        settings = SETTINGS.model_copy(update={"bias_time": repeat})
+        settings = SETTINGS.model_copy(update={"bias_time_s": repeat})
         shapes = fit_shapes(Solver(SOLVER.chained, SOLVER.prior, settings, None), joints, {}, 50.0)
         sizes.append(np.linalg.norm(shapes.offsets[15]))
         spreads.append(np.trace(shapes.offsets_covariance[15]))

@@ -33,7 +33,7 @@ def test_a_clip_with_lines_and_players_is_known_to_centimetres_and_pixels(name):
     painted, truth = PitchTemplate.from_spec(scenario.pitch), scene.broadcast
     joints = scene.truth.joints
     rng = np.random.default_rng(4)
-    keys = click_key_frames(truth, painted, joints, ClickSettings(noise=1.0), 4, rng).key_frames
+    keys = click_key_frames(truth, painted, joints, ClickSettings(noise_px=1.0), 4, rng).key_frames
     pictures = [
         np.ascontiguousarray(picture[..., 1])
         for picture in render_broadcast(truth, painted, joints, 4)

@@ -204,10 +204,10 @@ def test_scipy_finds_no_lower_cost():
             mine = points.frame == frame
             pixels[mine] = camera.camera[frame].project(points.world[mine])
         white = np.einsum("nij,nj->ni", points.whitening, pixels - points.image)[:, 0]
-        lens = (camera.distortion - prior.distortion) / prior.distortion_spread
-        zoom = (np.log(camera.focal) - prior.log_focal) / prior.focal_spread
+        lens = (camera.distortion - prior.distortion) / prior.distortion_std
+        zoom = (np.log(camera.focal) - prior.log_focal) / prior.log_focal_std
         place = np.sqrt(np.diag(prior.center_information)) * (camera.center - prior.center)
-        middle = (camera.principal_point - prior.principal_point) / prior.principal_spread
+        middle = (camera.principal_point - prior.principal_point) / prior.principal_std
         return np.concatenate([white, lens.ravel(), zoom, place, middle])
 
     peer = least_squares(residuals, np.zeros(40), x_scale="jac", xtol=1e-12, ftol=1e-12)

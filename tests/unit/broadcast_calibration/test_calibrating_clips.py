@@ -25,7 +25,7 @@ from worldpose.simulation.settings import RenderingSettings
 
 FRAMES, FPS = 16, 25.0
 LOOK = RenderingSettings(light="floodlights", stand_shadow=0.0)
-SETTINGS = BroadcastCalibrationSettings(flow_points=250, rounds=1)
+SETTINGS = BroadcastCalibrationSettings(flow_points=250, passes=1)
 
 
 def grey(picture):

@@ -64,7 +64,9 @@ def scene():
 
 KNOWN = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 3e-3, 2.0, 2.0, 0.01, 0.003, 0.0])
 """Standard deviations of the calibrated cameras' steps."""
-STATED = TriangulationSettings(pixel_noise=1.0, joint_noise=0.0, learn_noise=False, offsets="none")
+STATED = TriangulationSettings(
+    pixel_noise_px=1.0, joint_noise_m=0.0, learn_noise=False, offsets="none"
+)
 
 
 def people(frames, persons, rng):

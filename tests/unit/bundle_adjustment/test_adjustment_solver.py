@@ -114,7 +114,7 @@ def test_covariance_of_the_cameras_is_what_repetition_shows(scene):
 
 def test_it_stops_when_told_and_says_so(scene):
     problem, *_ = scene(noise=1.0)
-    adjust = solve(disturbed(problem), SolverSettings(iterations=1))
+    adjust = solve(disturbed(problem), SolverSettings(max_iterations=1))
     assert adjust.iterations == 1
     assert not adjust.converged
 

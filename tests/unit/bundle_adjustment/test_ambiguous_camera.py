@@ -10,7 +10,7 @@ from worldpose.static_calibration import project_with_jacobian, stepped
 from worldpose.triangulation import triangulate_joints
 
 AMBIGUOUS = 0
-QUICK = BundleAdjustmentSettings(frames=8, folds=2)
+QUICK = BundleAdjustmentSettings(max_frames=8, folds=2)
 
 
 def ground_error(camera, true, places):

@@ -16,7 +16,7 @@ from worldpose.bundle_adjustment import (
 from worldpose.static_calibration import stepped
 from worldpose.triangulation import triangulate_joints
 
-QUICK = BundleAdjustmentSettings(frames=8, folds=2, solver=SolverSettings(cost_change=1e-6))
+QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 
 
 def errors(cameras, true):

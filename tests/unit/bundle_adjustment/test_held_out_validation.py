@@ -66,7 +66,7 @@ def test_what_a_far_keypoint_costs_grows_with_the_logarithm_of_its_square(clip, 
     assert held.loss[0].max() < 1e-4
 
 
-QUICK = BundleAdjustmentSettings(frames=8, folds=2)
+QUICK = BundleAdjustmentSettings(max_frames=8, folds=2)
 WRONG = 2
 
 

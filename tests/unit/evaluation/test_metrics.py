@@ -56,7 +56,7 @@ def test_case_b_a_prediction_beyond_the_gate_is_missed_and_false():
     assert scores.mpjpe_mm is None
     assert (scores.coverage, scores.joint_coverage, scores.pcp3d) == (0.0, 0.0, 0.0)
     assert (scores.false_persons_per_frame, scores.persons, scores.frames) == (1.0, 1, 1)
-    assert score(tracks([[person(1.2)]]), tracks([[person(0.0)]]), match_gate=1.3).coverage == 1.0
+    assert score(tracks([[person(1.2)]]), tracks([[person(0.0)]]), match_gate_m=1.3).coverage == 1.0
 
 
 def test_case_c_a_missing_joint_lowers_joint_coverage_not_the_error():

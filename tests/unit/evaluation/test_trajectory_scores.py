@@ -83,9 +83,9 @@ def test_case_j_drift_is_the_mean_of_each_person_s_own():
     scores = score(prediction, truth)
     assert scores.per_meter_drift_rigid_cm_per_m == pytest.approx(0.75, abs=MM)
     assert scores.per_person_drift_rigid_cm_per_m == pytest.approx(0.0, abs=MM)
-    far = score(prediction, truth, min_trajectory=15.0)
+    far = score(prediction, truth, min_trajectory_m=15.0)
     assert far.per_meter_drift_rigid_cm_per_m == pytest.approx(0.5, abs=MM)
-    assert score(prediction, truth, min_trajectory=30.0).per_meter_drift_cm_per_m is None
+    assert score(prediction, truth, min_trajectory_m=30.0).per_meter_drift_cm_per_m is None
 
 
 def test_case_k_one_frame_late_is_one_step_off():

@@ -150,9 +150,9 @@ def test_parts_without_content_are_left_out():
 
 @pytest.mark.parametrize("shown", [True, False])
 def test_only_settings_that_were_asked_for_are_listed(shown):
-    overrides = {"tracking": {"gate": 0.5}} if shown else {}
+    overrides = {"tracking": {"gate_m": 0.5}} if shown else {}
     text = report_page("A run", run(overrides=overrides), seconds={})
-    assert (["tracking", "gate", "0.5"] in Page(text).rows) == shown
+    assert (["tracking", "gate_m", "0.5"] in Page(text).rows) == shown
 
 
 def test_static_cameras_are_listed_with_what_is_wrong_with_them():

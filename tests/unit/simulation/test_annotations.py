@@ -59,14 +59,14 @@ def test_clicks_are_as_many_and_as_exact_as_stated(camera):
 
 def test_nobody_clicks_what_is_out_of_the_picture(camera):
     for seed in range(10):
-        xy = np.array([point.xy for point in clicked(camera, seed, noise=0.0).markings.points])
+        xy = np.array([point.xy for point in clicked(camera, seed, noise_px=0.0).markings.points])
         assert (xy >= BORDER - 0.01).all()
         assert (xy <= np.array([1919.0, 1079.0]) - BORDER + 0.01).all()
 
 
 def test_all_clicks_of_a_clustered_camera_lie_in_a_third_of_the_picture(camera):
     for seed in range(20):
-        clicks = clicked(camera, seed, clustered=True, noise=0.0)
+        clicks = clicked(camera, seed, clustered=True, noise_px=0.0)
         x = [point.xy[0] for point in clicks.markings.points]
         assert 5 <= len(x) <= 7
         assert np.ptp(x) <= 0.34 * 1920.0 + 0.01
@@ -76,7 +76,7 @@ def test_all_clicks_of_a_clustered_camera_lie_in_a_third_of_the_picture(camera):
 def test_a_mistake_is_one_click_named_for_another_or_far_off_and_the_truth_says_which(camera):
     kinds = set()
     for seed in range(30):
-        clicks = clicked(camera, seed, mistaken=True, noise=0.0)
+        clicks = clicked(camera, seed, mistaken=True, noise_px=0.0)
         far = np.linalg.norm(offsets(camera, clicks), axis=-1)
         # Clicks are written to a hundredth of a pixel.
         assert (far > 0.02).sum() == 1
@@ -105,7 +105,7 @@ def test_points_behind_somebody_are_not_clicked(camera):
 
 
 def test_lines_are_drawn_where_points_are_few(camera):
-    clicks = clicked(camera, 2, enough=100, noise=0.0)
+    clicks = clicked(camera, 2, enough=100, noise_px=0.0)
     names = {marking.name for marking in clicks.markings.drawn}
     assert {"penalty_area_left_front", "goal_line_left", "center_circle"} <= names
     assert "goal_line_right" not in names
@@ -181,7 +181,7 @@ def test_no_errors_give_the_true_cameras(cameras):
 
 
 def test_rotations_err_as_stated_about_an_unmoved_center(cameras):
-    given = misjudged(cameras, rotation=0.001)
+    given = misjudged(cameras, rotation_rad=0.001)
     # 18 angles, chi with 3 degrees of freedom: mean 1.6 of the spread per axis, give or take 10 %.
     assert angles(cameras, given).mean() == pytest.approx(0.0016, rel=0.35)
     for name, camera in given.items():
@@ -190,7 +190,7 @@ def test_rotations_err_as_stated_about_an_unmoved_center(cameras):
 
 
 def test_a_wrong_center_keeps_the_middle_of_the_picture(cameras):
-    given = misjudged(cameras, center=0.5)
+    given = misjudged(cameras, center_m=0.5)
     shifts = [np.linalg.norm(given[n].center - camera.center) for n, camera in cameras.items()]
     assert np.mean(shifts) == pytest.approx(0.8, rel=0.35)  # 1.6 spreads again
     for name, camera in cameras.items():
@@ -209,8 +209,8 @@ def test_focal_lengths_err_relatively(cameras):
 
 
 def test_bad_cameras_are_as_many_and_as_bad_as_stated(cameras):
-    usual = angles(cameras, misjudged(cameras, rotation=0.0001))
-    some = angles(cameras, misjudged(cameras, rotation=0.0001, bad_cameras=3, bad_factor=100.0))
+    usual = angles(cameras, misjudged(cameras, rotation_rad=0.0001))
+    some = angles(cameras, misjudged(cameras, rotation_rad=0.0001, bad_cameras=3, bad_factor=100.0))
     ratio = some / usual
     assert np.sort(ratio)[-3:] == pytest.approx(100.0, rel=0.01)
     assert np.sort(ratio)[:-3] == pytest.approx(1.0, rel=0.01)

@@ -106,9 +106,9 @@ def test_every_lens_is_one_to_one_in_the_whole_picture(camera):
 
 
 def test_a_sweep_pans_and_a_zoom_range_is_used():
-    pan = np.arctan2(*axes(filmed(sweep=22.0))[:, :2].T)
+    pan = np.arctan2(*axes(filmed(sweep_m=22.0))[:, :2].T)
     assert np.ptp(np.degrees(pan)) > 15.0
-    focal = filmed(focal=(2500.0, 7000.0), zoom_period=(14.0, 20.0)).focal[:, 0]
+    focal = filmed(focal_px=(2500.0, 7000.0), zoom_period_s=(14.0, 20.0)).focal[:, 0]
     # 30 s hold a whole period.
     assert focal.min() == pytest.approx(2500.0, rel=0.01)
     assert focal.max() == pytest.approx(7000.0, rel=0.01)

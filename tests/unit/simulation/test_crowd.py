@@ -75,13 +75,13 @@ def test_markers_stay_with_their_attackers_on_the_goals_side(corner):
 
 def test_the_last_person_keeps_the_goal(corner):
     place = corner[-1].position[WITHIN]
-    goal = np.array([CORNER.area_center[0] + 0.5 * CORNER.area_size[0], 0.0])
+    goal = np.array([CORNER.area_center_m[0] + 0.5 * CORNER.area_size_m[0], 0.0])
     assert np.linalg.norm(place - goal, axis=-1).max() < 4.0
 
 
 def test_runners_cross_the_middle_at_a_run(crossing):
     place = np.array([path.position for path in crossing])[:, WITHIN]
-    far = np.linalg.norm(place - CROSSING.area_center, axis=-1)
+    far = np.linalg.norm(place - CROSSING.area_center_m, axis=-1)
     assert np.median(far.min(axis=1)) < 0.7
     assert far.min(axis=1).max() < 3.0
     assert np.array([path.speed[WITHIN].max() for path in crossing]).min() > 2.5

@@ -143,7 +143,7 @@ def test_slow_noise_stays_over_frames_and_white_noise_does_not(camera):
 
 def test_hidden_joints_err_more(camera):
     projections, keypoints, _ = detected(
-        camera, one_setting(white=0.02, hidden_spread=1.0), standing(0.0, 40.0), standing(0.0, 20.0)
+        camera, one_setting(white=0.02, hidden_std=1.0), standing(0.0, 40.0), standing(0.0, 20.0)
     )
     spread = (keypoints - projections.keypoints).std(axis=(0, 3))
     np.testing.assert_allclose(spread[0], 2 * 0.02 * 90.0 * DIFFICULTY, rtol=0.06)
@@ -193,7 +193,7 @@ def test_confidence_falls_with_the_error_and_for_hidden_joints(camera):
 
 
 def test_confidence_is_above_0_and_at_most_1(camera):
-    noise = one_setting(white=0.3, confidence_drop=8.0, confidence_spread=0.5, hidden_doubt=0.9)
+    noise = one_setting(white=0.3, confidence_drop=8.0, confidence_std=0.5, hidden_doubt=0.9)
     _, _, confidence = detected(camera, noise, standing(0.0, 40.0), standing(0.0, 20.0))
     assert confidence.min() > 0.0
     assert confidence.max() <= 1.0
@@ -206,7 +206,7 @@ def test_a_few_joints_at_the_border_are_no_person(camera):
     inside = int(projections.seen.sum())
     assert 5 < inside < 17
     for fewest, found in ((inside, inside), (inside + 1, 0)):
-        some = detect(projections, one_setting(fewest_joints=fewest), EVEN, FPS, rngs(1))
+        some = detect(projections, one_setting(min_joints=fewest), EVEN, FPS, rngs(1))
         assert np.isfinite(some.keypoints[..., 0]).sum() == found
 
 
@@ -263,10 +263,12 @@ def test_a_detector_errs_alike_left_and_right():
 def test_the_shared_bias_turns_with_the_body_and_is_in_metres():
     joints = bodies(standing(0.0, 20.0)).joints
     systematic = SystematicErrors(np.tile([1.0, 0.0, 2.0], (17, 1)), np.zeros((17, 2, 2)))
-    offset = perceived_bias(joints, systematic, one_setting(shared_bias=0.03), np.zeros((1, 17, 3)))
+    offset = perceived_bias(
+        joints, systematic, one_setting(shared_bias_m=0.03), np.zeros((1, 17, 3))
+    )
     # Forward is towards the camera, along negative y.
     np.testing.assert_allclose(offset, np.broadcast_to([0.0, -0.03, 0.06], offset.shape))
-    own = perceived_bias(joints, systematic, one_setting(own_bias=0.01), np.ones((1, 17, 3)))
+    own = perceived_bias(joints, systematic, one_setting(own_bias_m=0.01), np.ones((1, 17, 3)))
     np.testing.assert_allclose(own, np.broadcast_to([0.01, -0.01, 0.01], own.shape))
 
 
@@ -453,7 +455,7 @@ def drawn(noise, frames=20_000, seed=0):
 
 
 def test_as_many_as_the_settings_say_and_as_long():
-    joints = drawn(ObservationNoise(false_people=0.4, false_people_time=0.3))
+    joints = drawn(ObservationNoise(false_people=0.4, false_people_time_s=0.3))
     there = np.isfinite(joints[..., 0, 0])
     # Some 1000 stretches: standard error 3 %, of the count and of the length.
     assert there.sum(axis=1).mean() == pytest.approx(0.4, rel=0.15)

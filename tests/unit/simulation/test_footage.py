@@ -153,7 +153,7 @@ def test_missing_people_are_left_out(view, cast):
 
 
 def test_fog_draws_everything_towards_its_grey(cast):
-    foggy = open_view(camera(), PITCH, 3, PLAIN.model_copy(update={"fog": 0.05}))
+    foggy = open_view(camera(), PITCH, 3, PLAIN.model_copy(update={"fog_per_m": 0.05}))
     frame = render_frame(foggy, cast, cast.pose(people(PLACES)))
     # At 50 m 8 % of the contrast is left.
     spread = frame.image[frame.person_ids >= 0].astype(float).std(axis=0)
@@ -179,7 +179,7 @@ SMALL = SCENARIOS["tiny"].model_copy(
     update={
         # A third of the usual size: a ninth of the time.
         "rig": SCENARIOS["tiny"].rig.model_copy(
-            update={"cameras": 1, "image_size": (640, 360), "person_height": 40.0}
+            update={"cameras": 1, "image_size_px": (640, 360), "person_height_px": 40.0}
         ),
         "broadcast": None,
     }

@@ -69,7 +69,7 @@ def test_cameras_are_given_exactly_when_asked_for(tmp_path, scene):
 
 
 def test_stills_are_of_the_first_frame_and_the_same_seed_gives_the_same_bytes(tmp_path):
-    rig = TINY.rig.model_copy(update={"image_size": (320, 180), "person_height": 16.0})
+    rig = TINY.rig.model_copy(update={"image_size_px": (320, 180), "person_height_px": 16.0})
     small = TINY.model_copy(update={"rig": rig})
     for name, seed in (("a", 1), ("b", 1), ("other", 2)):
         simulate_match(small, seed, tmp_path / name, MatchOptions(duration=0.4, cameras=2))

@@ -42,8 +42,8 @@ def test_speed_is_what_the_positions_say_and_within_its_range(paths):
         moved = np.linalg.norm(np.diff(path.position, axis=0), axis=-1) / STEP
         # Each step goes exactly speed x time.
         np.testing.assert_allclose(moved, path.speed[:-1], rtol=1e-9)
-        assert path.speed.min() >= CROWD.speed[0]
-        assert path.speed.max() <= CROWD.speed[1]
+        assert path.speed.min() >= CROWD.speed_m_s[0]
+        assert path.speed.max() <= CROWD.speed_m_s[1]
 
 
 def test_speeds_differ_and_use_the_range(paths):
@@ -67,7 +67,7 @@ def test_headings_never_jump(paths):
 
 def test_people_stay_about_their_area(paths):
     for path in paths:
-        away = np.abs(path.position - CROWD.area_center) - 0.5 * np.array(CROWD.area_size)
+        away = np.abs(path.position - CROWD.area_center_m) - 0.5 * np.array(CROWD.area_size_m)
         # A runner at 4 m/s needs 4 m to come about.
         assert away.max() < 5.0
 

@@ -55,16 +55,16 @@ def test_no_frames_are_no_frames():
 def test_none_switches_every_rate_off():
     rates = ObservationNoise.none().model_dump()
     assert {name for name, value in rates.items() if value != 0} == {
-        "slow_time",
-        "person_missed_time",
-        "stolen_time",
-        "dropped_time",
-        "swapped_time",
-        "false_people_time",
+        "slow_time_s",
+        "person_missed_time_s",
+        "stolen_time_s",
+        "dropped_time_s",
+        "swapped_time_s",
+        "false_people_time_s",
     }
 
 
-@pytest.mark.parametrize("setting", ["white", "swapped", "slow_time", "false_people"])
+@pytest.mark.parametrize("setting", ["white", "swapped", "slow_time_s", "false_people"])
 def test_negative_settings_are_refused(setting):
     with pytest.raises(ValidationError):
         ObservationNoise(**{setting: -0.1})

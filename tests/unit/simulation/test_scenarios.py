@@ -141,7 +141,7 @@ def test_the_moving_camera_is_written_as_it_filmed(tmp_path):
 
 
 def test_a_late_clock_sees_people_where_they_are_later():
-    rig = SCENARIOS["match"].rig.model_copy(update={"cameras": 2, "clock_spread": 0.7})
+    rig = SCENARIOS["match"].rig.model_copy(update={"cameras": 2, "clock_std_frames": 0.7})
     scenario = short("match", rig=rig, noise=ObservationNoise.none(), broadcast=None)
     scene = simulate_scene(scenario, 5)
     off = {}
@@ -202,9 +202,9 @@ def test_people_touch_in_the_penalty_box():
 
 
 def test_all_bias_and_no_noise_is_the_same_in_all_frames_for_who_stands():
-    noise = ObservationNoise.none().model_copy(update={"shared_bias": 0.03})
+    noise = ObservationNoise.none().model_copy(update={"shared_bias_m": 0.03})
     crowd = SCENARIOS["tiny"].crowd.model_copy(
-        update={"speed": (0.0, 0.0), "people": 1, "actions": ActionRates.none()}
+        update={"speed_m_s": (0.0, 0.0), "people": 1, "actions": ActionRates.none()}
     )
     scene = simulate_scene(short("tiny", noise=noise, crowd=crowd), 1)
     steady = scene.observations["cam00"].keypoints[:, 0, 5:]

@@ -88,7 +88,7 @@ def test_a_point_clicked_twice_is_an_error():
 def test_exact_clicks_give_the_camera_back(index):
     camera, _ = people.seat(index)
     seen = people.visible(camera)
-    result = of(people.points(seen), click_noise=1e-4, survey_error=0.0)
+    result = of(people.points(seen), click_noise_px=1e-4, survey_error_m=0.0)
     # The prior pulls by (noise / spread)^2: with clicks of 0.1 thousandth of a pixel, nothing.
     np.testing.assert_allclose(result.estimate.camera.center, camera.center, atol=2e-2)
     np.testing.assert_allclose(result.estimate.camera.focal, camera.focal, rtol=2e-4)
@@ -202,7 +202,7 @@ def test_k3_is_earned_by_a_lens_that_has_it():
     camera, rng = people.seat(1)
     bent = replace(camera, distortion=np.array([-0.1, 0.02, 0.0, 0.0, -1.0]))
     drawn = people.draw(bent, PITCH.marking_names, rng, count=30, noise=0.2)
-    report = of(ClickedMarkings(drawn=drawn), drawn_noise=0.2).report
+    report = of(ClickedMarkings(drawn=drawn), drawn_noise_px=0.2).report
     assert "k3" in report.free
     assert any(decision.startswith("k3 solved for") for decision in report.decisions)
 

@@ -31,9 +31,9 @@ def share_inside(
         lines: refine on the lines of a picture, too.
     """
     rig, crowd = SCENARIOS[scenario].rig, SCENARIOS[scenario].crowd
-    x, y = crowd.area_center
+    x, y = crowd.area_center_m
     target = np.array([x, y, float(people.PITCH.height(x, y))])
-    settings = StaticCalibrationSettings(click_noise=stated)
+    settings = StaticCalibrationSettings(click_noise_px=stated)
     inside = []
     seed = 0
     while len(inside) < cameras:

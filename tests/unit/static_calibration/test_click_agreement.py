@@ -64,7 +64,7 @@ def test_a_camera_is_weak_where_its_expected_error_is_beyond_a_limit():
     error = of(clicked).report.ground_error
 
     def reasons(median, p95):
-        report = of(clicked, weak_median=median * error.median, weak_p95=p95 * error.p95).report
+        report = of(clicked, weak_median_m=median * error.median, weak_p95_m=p95 * error.p95).report
         assert report.weak == bool(report.reasons)
         return report.reasons
 

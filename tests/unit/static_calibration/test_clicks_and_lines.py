@@ -8,7 +8,7 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate
 
 PITCH, SIZE = people.PITCH, people.SIZE
-EXACT = StaticCalibrationSettings(survey_error=0.0)
+EXACT = StaticCalibrationSettings(survey_error_m=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def test_other_who_is_placed_again_makes_it_no_takeover(hidden):
 def test_takeover_of_a_track_too_short_to_be_a_person_is_left_out(hidden):
     cameras, keypoints, confidence = hidden
     keypoints[BACK:, 0, 1] = np.nan
-    keypoints[: LOST - 4, :, 1] = np.nan  # 4 frames of 0.02 s; min_track is 0.2 s
+    keypoints[: LOST - 4, :, 1] = np.nan  # 4 frames of 0.02 s; min_track_s is 0.2 s
     result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
     assert len(result.person) == 1
     assert result.takeovers == ()

@@ -35,7 +35,7 @@ def test_person_found_again_beyond_the_gate_is_counted(ring, people, seen):
     (join,) = result.joins
     assert (join.before, join.after, join.decided) == (0, 0, True)
     assert (join.last_frame, join.first_frame) == (19, 70)
-    slow = SETTINGS.model_copy(update={"agility": 0.2, "mean_speed": 0.1})
+    slow = SETTINGS.model_copy(update={"velocity_change_std_m_s": 0.2, "rms_speed_m_s": 0.1})
     assert len(track_people(ring(5), keypoints, confidence, FPS, slow, **pitch).tracks) == 2
 
 
@@ -172,7 +172,7 @@ def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
     places[28:] = [2.5, 0.0]
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[20:28] = np.nan
-    settings = SETTINGS.model_copy(update={"agility": agility})
+    settings = SETTINGS.model_copy(update={"velocity_change_std_m_s": agility})
     result = track_people(ring(5), keypoints, confidence, FPS, settings)
     assert result.report.births == births
 

@@ -125,7 +125,12 @@ def test_nobody_to_join_is_no_join():
 def test_doubt_where_somebody_goes_on_is_that_of_a_velocity_that_wanders(
     frames, velocity, variance
 ):
-    motion = {"paces": ((1.0, 1.0),), "agility": 2.5, "mean_speed": 2.0, "velocity_memory": 1.0}
+    motion = {
+        "paces": ((1.0, 1.0),),
+        "velocity_change_std_m_s": 2.5,
+        "rms_speed_m_s": 2.0,
+        "velocity_memory_s": 1.0,
+    }
     settings = SETTINGS.model_copy(update=motion)
     here, aside = (
         cost(end(0, 0, (0, 0)), end(1, frames, (x, 0), velocity), settings) for x in (0.0, 1.5)

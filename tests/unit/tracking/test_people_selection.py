@@ -238,7 +238,7 @@ def test_a_shadow_in_several_tracks_goes():
     person = track(0, (0, 6), 0.0)
     shadows = [track(n, (2 * n - 2, 2 * n - 1), 0.2, views=2) for n in (1, 2, 3)]
     assert found(person, *shadows) == [[0]]
-    assert len(found(person, *shadows, shadow_distance=0.0)) > 1
+    assert len(found(person, *shadows, shadow_distance_m=0.0)) > 1
 
 
 def test_a_track_apart_does_not_save_a_shadow():

@@ -129,7 +129,7 @@ def test_track_ends_when_a_person_is_unseen_for_longer(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 160))
     keypoints[20:140] = np.nan
     causal = SETTINGS.model_copy(update={"causal": True})
-    for setting in (causal, SETTINGS.model_copy(update={"max_gap": 2.0})):
+    for setting in (causal, SETTINGS.model_copy(update={"max_gap_s": 2.0})):
         result = track_people(ring(5), keypoints, confidence, FPS, setting)
         assert sorted(owners(result)) == [0, 0, 1, 1, 2, 2, 3, 3]
         assert result.report.losses == 4
@@ -153,7 +153,7 @@ def test_frames_without_any_detection_cost_no_step_and_change_nothing(
     monkeypatch.setattr(FrameTracker, "step", counted)
     result = track_people(ring(5), long, told, FPS, SETTINGS)
     assert steps[0] == 900
-    assert steps[-1] < 940 + FPS * max(SETTINGS.max_lost, SETTINGS.max_coast) + 2
+    assert steps[-1] < 940 + FPS * max(SETTINGS.max_lost_s, SETTINGS.max_coast_s) + 2
     alone = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
     np.testing.assert_array_equal(result.detection_index[900:940], alone.detection_index)
 

@@ -97,7 +97,7 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
 
 def test_parts_with_corrected_clocks_are_those_of_the_whole_clip(clip):
     camera, arrays = clip
-    settings = SETTINGS.model_copy(update={"correct_clocks": True, "clock_error": 10.0})
+    settings = SETTINGS.model_copy(update={"correct_clocks": True, "max_clock_error_frames": 10.0})
     whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, settings)
     model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, settings)
     assert model.clocks.determined.all()

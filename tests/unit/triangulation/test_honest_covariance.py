@@ -23,7 +23,7 @@ def simulated(seed, people=8):
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": people})
     # What all views share would hide whether the noise is honest.
-    noise = scenario.noise.model_copy(update={"shared_bias": 0.0, "own_bias": 0.0})
+    noise = scenario.noise.model_copy(update={"shared_bias_m": 0.0, "own_bias_m": 0.0})
     changes = {"duration": 0.8, "crowd": crowd, "broadcast": None, "noise": noise}
     return arrays_of(simulate_scene(scenario.model_copy(update=changes), seed), people)
 
@@ -56,7 +56,7 @@ def two_views_each(index, rng):
 
 def coverage(seeds):
     """Share of joints within their 95 % region, and their number, by case."""
-    settings = TriangulationSettings(common_bias=0.0)
+    settings = TriangulationSettings(common_bias_m=0.0)
     squared = {"exact": [], "calibrated": [], "two views": []}
     for seed in seeds:
         cameras, (keypoints, confidence, index), truth = simulated(seed)
@@ -98,7 +98,7 @@ def test_regions_hold_the_truth_of_one_clip():
 @pytest.mark.parametrize("name", ["match", "penalty-box", "corner-kick"])
 def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
     scenario, settings = SCENARIOS[name], TriangulationSettings()
-    rig = scenario.rig.model_copy(update={"clock_spread": 0.7})
+    rig = scenario.rig.model_copy(update={"clock_std_frames": 0.7})
     scenario = scenario.model_copy(update={"duration": 3.0, "broadcast": None, "rig": rig})
     deviations = []
     for seed in range(20, 30):

@@ -8,7 +8,7 @@ from worldpose.static_calibration.parameters import project_with_jacobian, stepp
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 from worldpose.triangulation.person_offsets import stated_errors
 
-SETTINGS = TriangulationSettings(common_bias=0.0)
+SETTINGS = TriangulationSettings(common_bias_m=0.0)
 PLAIN = SETTINGS.model_copy(update={"offsets": "none"})
 
 

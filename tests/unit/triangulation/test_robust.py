@@ -10,9 +10,9 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 SETTINGS = TriangulationSettings()
 # Noise as stated, cameras as given: one joint is then a textbook least-squares problem.
-STATED = TriangulationSettings(learn_noise=False, offsets="none", common_bias=0.0)
+STATED = TriangulationSettings(learn_noise=False, offsets="none", common_bias_m=0.0)
 # White pixel noise only: the noise that the Monte Carlo tests put in.
-WHITE = STATED.model_copy(update={"pixel_noise": 1.0, "joint_noise": 0.0})
+WHITE = STATED.model_copy(update={"pixel_noise_px": 1.0, "joint_noise_m": 0.0})
 
 
 def some_joints(persons=2, count=17, frames=1):
@@ -54,7 +54,7 @@ def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
     narrow = ring(2, arc=0.12)
     result = triangulate_joints(narrow, TrackedDetections(*seen(narrow, some_joints())), SETTINGS)
     assert np.isnan(result.joints).all()
-    wide = SETTINGS.model_copy(update={"min_angle": 0.03})
+    wide = SETTINGS.model_copy(update={"min_angle_rad": 0.03})
     assert np.isfinite(
         triangulate_joints(narrow, TrackedDetections(*seen(narrow, some_joints())), wide).joints
     ).all()
@@ -190,7 +190,7 @@ def monte_carlo(cameras: Camera, seen, scale):
     keypoints = (
         keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
     )
-    loose = WHITE.model_copy(update={"pixel_noise": scale, "max_deviation": 6.0})
+    loose = WHITE.model_copy(update={"pixel_noise_px": scale, "max_deviation": 6.0})
     result = triangulate_joints(cameras, TrackedDetections(keypoints, confidence, index), loose)
     return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
 
@@ -212,7 +212,7 @@ def test_twice_the_pixel_noise_is_four_times_the_covariance(ring, seen):
     views = seen(ring(5), joints)
     once = triangulate_joints(ring(5), TrackedDetections(*views), WHITE)
     twice = triangulate_joints(
-        ring(5), TrackedDetections(*views), WHITE.model_copy(update={"pixel_noise": 2.0})
+        ring(5), TrackedDetections(*views), WHITE.model_copy(update={"pixel_noise_px": 2.0})
     )
     np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-9)
 
@@ -222,7 +222,7 @@ def test_joint_noise_is_in_metres(ring, seen):
     # crossing rays with 5 cm across each give 5 cm in the plane of both.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    metric = STATED.model_copy(update={"pixel_noise": 1e-6, "joint_noise": 0.05})
+    metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
     result = triangulate_joints(cameras, TrackedDetections(*seen(cameras, joint)), metric)
     # x and y by one ray each, z by both. The point is 13 degrees off axis, where the picture is
     # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
@@ -309,7 +309,7 @@ def test_spread_is_the_widest_angle_between_rays(ring, seen):
 def test_shared_bias_is_in_the_covariance(ring, seen):
     keypoints, confidence, index = seen(ring(5), some_joints())
     without = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), STATED)
-    biased = STATED.model_copy(update={"common_bias": 0.03})
+    biased = STATED.model_copy(update={"common_bias_m": 0.03})
     result = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), biased)
     added = result.covariance - without.covariance
     np.testing.assert_allclose(added, np.broadcast_to(9e-4 * np.eye(3), added.shape), atol=1e-15)

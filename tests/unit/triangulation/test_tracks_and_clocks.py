@@ -15,7 +15,7 @@ from worldpose.triangulation import (
 from worldpose.triangulation.clocks import _Sums
 from worldpose.triangulation.smoothing import _factorize, _invert, _substitute, segments
 
-SETTINGS = TriangulationSettings(common_bias=0.0, offsets="none")
+SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
 
 
 def test_banded_solution_and_inverse_are_the_dense_ones():
@@ -137,7 +137,7 @@ def test_late_clocks_are_found(ring):
 def test_stated_errors_of_clocks_are_those_that_are_made(ring):
     late = np.array([0.0, 0.7, -0.3, 0.5, -0.5, 1.0])
     camera = ring(6)
-    anyhow = SETTINGS.model_copy(update={"clock_error": 1.0})
+    anyhow = SETTINGS.model_copy(update={"max_clock_error_frames": 1.0})
     errors, stated = [], []
     for seed in range(8):
         arrays = late_detections(camera, 50, late, noise=4.0, seed=10 * seed)
