@@ -1,4 +1,4 @@
-"""A person at the pages, in a real browser; pictures go to the folder WORLDPOSE_PAGE_SHOTS."""
+"""A person at the pages, in a real browser; images go to the folder WORLDPOSE_PAGE_SHOTS."""
 
 import json
 import os
@@ -22,7 +22,7 @@ IN_BROWSER = [
 
 
 def drive(script, task, folder, seconds):
-    """What a person saw who did a task on the pages, by a script beside the test."""
+    """Return the observations of a browser script that does a task on the pages."""
     given = {
         **task,
         "modules": str(MODULES / "package.json"),

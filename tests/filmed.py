@@ -15,7 +15,7 @@ def write_filmed(folder, greys, clips, *, offsets=None):
 
     Args:
         folder: to be made.
-        greys: of each camera, how bright each picture of its video is.
+        greys: of each camera, how bright each image of its video is.
         clips: name, first frame and number of frames of each.
         offsets: of cameras whose clocks differ [frame].
     """

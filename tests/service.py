@@ -1,4 +1,4 @@
-"""A project that `worldpose serve` serves, and somebody who asks it."""
+"""A project served by `worldpose serve`, and a client."""
 
 import json
 import os
@@ -17,9 +17,9 @@ from flows.orchestration.prefect_environment import authorization
 
 TOKEN = "a token of twenty-four.."
 PATIENCE = 900.0
-"""What a step may take on two busy cores [s]; it takes a tenth on idle ones."""
+"""Maximum time of a step on two busy cores [s]; a tenth on idle ones."""
 SLOWEST = 30.0
-"""What one answer may take on two busy cores [s]."""
+"""Maximum time of one answer on two busy cores [s]."""
 MOST_TROUBLES = 2
 """Answers of a wait that may be late or say that SQLite's one writer was busy."""
 
@@ -87,7 +87,7 @@ class Served:
         return len(left)
 
     def secret(self, name):
-        """What the service keeps for `prefect` and `metrics`."""
+        """The service's secrets for `prefect` and `metrics`."""
         return (self.project / "operations" / "secrets" / name).read_text().strip()
 
     def ask(self, path, body=None):

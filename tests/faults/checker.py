@@ -25,7 +25,7 @@ def problems_of(project, undisturbed):
 
 
 def differences(project, undisturbed):
-    """What is damaged, or not as in another project."""
+    """Yield damages, and differences from another project."""
     store, reference = Store.open(str(project)), Store.open(str(undisturbed))
     damage = [f"{each.path}: {each.problem}" for each in verify(store)]
     return compare_stores(store, reference) + damage
@@ -44,7 +44,7 @@ def doubled(store):
 
 
 def half_written(project):
-    """What can be read of a project though it is not whole, whatever is at work in it."""
+    """Read what a damaged or busy project still shows."""
     if not (project / "project.json").exists():
         return []
     store = Store.open(str(project))

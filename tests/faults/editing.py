@@ -111,7 +111,7 @@ class Editor:
 
 
 def account(project, editors):
-    """What is wrong with a journal after edits that were cut off; nothing, if all is well."""
+    """Return the faults of a journal after interrupted edits; empty if there are none."""
     store = Store.open(str(project))
     journal = read_journal(store, TINY)
     kept = [each for each in journal.records if isinstance(each, Correction)]

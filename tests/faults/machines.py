@@ -1,4 +1,4 @@
-"""The machines of a project as processes that are killed, cut off, filled up and begun again.
+"""The machines of a project as processes that are killed, disconnected, filled up and restarted.
 
 A Prefect server, a Dask scheduler, and Dask workers on the other side of a network link; the
 project lies on a small disk. Links and disks need the rights of root.
@@ -91,7 +91,7 @@ class Disk:
 
 
 class Part:
-    """A process that leads a group of its own, and can be begun again."""
+    """A process with its own process group that can be restarted."""
 
     def __init__(self, command, environment, log):
         self.command, self.environment, self.log = command, environment, log
@@ -120,7 +120,7 @@ class Part:
             self.process = None
 
     def kill_child(self):
-        """What a nanny looks after; whether there was one."""
+        """Kill the worker of a nanny; return whether there was one."""
         try:
             children = psutil.Process(self.process.pid).children(recursive=True)
         except psutil.NoSuchProcess:

@@ -1,4 +1,4 @@
-"""What faults struck, and when work went on after them."""
+"""Faults that occurred, and the time until work resumed."""
 
 import statistics
 from collections import defaultdict
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class Fault:
-    """One that struck: its kind, how long it lasted, and when work went on after it."""
+    """One fault: its kind, its duration, and the time at which work resumed."""
 
     kind: str
     seconds: float

@@ -47,7 +47,7 @@ FAULTS = {
     "disk full": (1.0, 10.0),
     "network cut": (1.0, 40.0),
 }
-"""Each with how long it lasts at least and at most [s]."""
+"""Faults by name, with minimum and maximum duration [s]."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class Stream:
     Attributes:
         machines: what computes.
         folders: of the matches.
-        beginnings: how often a match may be begun until it is done.
+        beginnings: maximum number of starts of a match.
         problems: what must not be.
     """
 
@@ -216,7 +216,7 @@ def soak(
         preload: a file that workers load when they begin, in which a test spoils them.
         kinds: of faults.
         between: from the end of one to the next, as a share of an undisturbed match's time.
-        beginnings: how often a match may be begun until it is done.
+        beginnings: maximum number of starts of a match.
     """
     folders = []
     for number in range(matches):

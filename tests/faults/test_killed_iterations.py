@@ -1,4 +1,4 @@
-"""Iterations killed anywhere, gone on with: the store is that of undisturbed ones, bit by bit."""
+"""Iterations, killed anywhere and resumed: the store equals that of undisturbed ones."""
 
 import json
 import multiprocessing
@@ -150,7 +150,7 @@ def test_two_loops_over_one_match_at_once_end_with_one_result(server, short, tmp
 
 
 def delete_a_box(project):
-    """What a person does on another machine meanwhile."""
+    """Edits of a person on another machine during the run."""
     store = Store.open(str(project))
     (match_id,) = store.matches()
     deleted = DeletedDetection(camera="cam01", frame=3, detection=0)
@@ -165,9 +165,9 @@ def standing(project):
 
 
 def assert_every_run_is_of_one_piece(project):
-    """What is made from a result of a run is made from just that one, or that of the pass before.
+    """Inputs of a run's results are results of the same run, or of the previous pass.
 
-    A pass goes on with the one before it, whose runs are therefore asked too.
+    A pass continues the previous one, whose runs are therefore included.
     """
     store = Store.open(str(project))
     (match_id,) = store.matches()

@@ -1,6 +1,6 @@
 """A few minutes of seeded random faults; and that their checks find what is wrong.
 
-`python tests/faults/soak.py --minutes 30` goes on for longer, and prints what it saw.
+`python tests/faults/soak.py --minutes 30` runs longer, and prints what it observed.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a run of some stages goes on from: of which pass its results are, and of which settings."""
+"""The starting point of a run of some stages: the pass and the settings of its inputs."""
 
 import pytest
 from stand_ins import publish_stand_in

@@ -1,4 +1,4 @@
-"""A camera that contradicts the others is named and left out; the match goes on without it."""
+"""A camera that contradicts the others is named and left out; the match continues without it."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Clicks that are farther off than stated are told of, from all cameras together."""
+"""A run warns of clicks with larger errors than stated, from all cameras together."""
 
 import pytest
 

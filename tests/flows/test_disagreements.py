@@ -1,4 +1,4 @@
-"""The view that the page shows is the one in which somebody's keypoints are farthest off."""
+"""The page shows the view in which a person's keypoints have the largest residuals."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Where gates stand, and which figures let a result pass."""
+"""Positions of gates, and the metrics that let a result pass."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A run waits where people are asked, goes on when they approve, and forgets nothing they said."""
+"""A run waits at its gates, continues on approval, and keeps all verdicts and corrections."""
 
 import json
 import shutil
@@ -166,11 +166,11 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
     origins = origins_of(store, match, latest_run(store, TINY))
     assert origins[WRONG] == "rejected"
     assert origins["static_calibration/cam00"] == "automatic"
-    # No policy builds upon what somebody refused.
+    # No policy uses a rejected result.
     refused = Gatekeeper(store, match, "never")
     latest = latest_run(store, TINY).results
     assert units(refused.held("static_calibration", latest)) == [WRONG]
-    # Taken back, everything is as it was; the refusal stands until somebody approves.
+    # After the withdrawal the state is the former one; the rejection stands until an approval.
     withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
     again = open_match(store, TINY)
     assert {unit.name: unit.key for unit in plan_run(store, again, {})} == before
@@ -261,7 +261,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
     assert f"next: worldpose review list {TINY}" in answer.out
 
     def say(*arguments):
-        """What a command prints, in this process: each of its own takes seconds."""
+        """Return the output of a command, run in this process to save seconds."""
         return CliRunner().invoke(app, [*map(str, arguments), *at])
 
     reviews = json.loads(say("review", "list", "--json").stdout)["reviews"]
@@ -278,7 +278,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
     assert say("run", tiny, "--gates", "sometimes").exception.found == "'sometimes'"
     done = json.loads(say("review", "approve", TINY, "--who", "Ada", "--json").stdout)
     assert set(done["reviews"]) == {each["id"] for each in reviews}
-    # The latest run waits: the next one goes on with its policy.
+    # The latest run waits: the next one continues with its policy.
     again = json.loads(say("run", tiny, "--json").stdout)
     assert (again["waiting"], again["executed"], again["gates"]) == (0, 0, "auto")
     assert "nothing waits" in say("review", "list").stdout

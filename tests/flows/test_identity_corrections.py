@@ -55,14 +55,14 @@ def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(st
     assert halves[: len(halves) // 2, 1].sum() == 0
     assert halves[len(halves) // 2 :, 0].sum() == 0
     assert data.attrs["objections"] == [None]
-    # Without the tracker's own result it tracks anew, and gives the very same bytes.
+    # Without the tracker's own result it tracks again, and gives the same bytes.
     for key in (before.key, after.key):
         store.withdraw(ResultId(TINY, "tracking", clip, key))
     again = compute(store, planned(store))
     assert again.content == first.content
     assert again.figures == first.figures
     compute(store, before)
-    # Merged again, everybody is who they were.
+    # Merged again, all identities are the former ones.
     merge = MergedTracks(clip=clip, kept=0, merged=new)
     say(store, b=merge)
     compute(store, planned(store))

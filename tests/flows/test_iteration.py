@@ -44,7 +44,7 @@ def keys(store, folder, number, overrides=None):
 
 
 def reached(match, number, *starts):
-    """What is made from `starts`, found by walking the stages' declared inputs alone."""
+    """Return the stages that depend on `starts`, from the declared inputs alone."""
     found = set()
     for each in range(1, number + 1):
         for stage in (stage for stage in METHOD if stage.first_pass <= each):

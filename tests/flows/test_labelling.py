@@ -12,7 +12,7 @@ from worldpose.training import read_labels
 
 
 class Brightness:
-    """Sees one person, whose keypoints say how bright the picture is."""
+    """Sees one person, whose keypoints say how bright the image is."""
 
     def detect(self, pictures):
         return [People(np.array([[1.0, 1.0, 9.0, 19.0]]), np.array([0.9])) for _ in pictures]

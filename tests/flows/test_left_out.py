@@ -1,4 +1,4 @@
-"""A camera that cannot be calibrated is left out; the match goes on and says so."""
+"""A camera that cannot be calibrated is left out; the match continues with a warning."""
 
 import json
 import shutil

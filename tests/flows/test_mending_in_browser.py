@@ -1,4 +1,4 @@
-"""A person mends a swap of two people and a wrong keypoint on the pages: in a real browser."""
+"""A person corrects a swap of two people and a wrong keypoint on the pages: in a real browser."""
 
 import json
 import os
@@ -87,7 +87,7 @@ def test_a_swap_and_a_wrong_keypoint_are_mended_and_the_final_figures_improve(
     tiny, project_copy, tmp_path
 ):
     store = Store.open(str(project_copy))
-    # Who is who as the tracker found it, which is right.
+    # The tracker's identities, which are correct.
     tracked = ways(identities_now(store, open_match(store, TINY), "clip").identities)
     one, other, tail, middle = swap(store)
     place, was = misplace(store)
@@ -104,7 +104,7 @@ def test_a_swap_and_a_wrong_keypoint_are_mended_and_the_final_figures_improve(
             "patience": 1200,
         }
         seen = drive(SCRIPT, {**task, "mends": True}, tmp_path, 1500)
-        # What people said is taken in by a run that asks them.
+        # A run with gates applies the corrections.
         waits = run_match(store, open_match(store, TINY), RunRequest({}, gates="auto"))
         assert waits.state == "waiting"
         after = drive(SCRIPT, {**task, "mends": False}, tmp_path, 1500)

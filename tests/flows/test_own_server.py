@@ -1,4 +1,4 @@
-"""What a run and its own Prefect server, alone on a machine, are spared."""
+"""Costs that a run with its own Prefect server avoids."""
 
 import dataclasses
 import gc
@@ -203,7 +203,7 @@ def test_secrets_go_to_the_parts_that_need_them(tmp_path, monkeypatch):
     }
     assert secrets.of("worker", bucket) == client
     assert secrets.of("watch", bucket).items() >= cloud.items()
-    # The same again at the next start, made anew where others may have read it.
+    # The same at the next start; renewed if others could read it.
     assert secrets_of(plan, "") == dataclasses.replace(secrets, pages="")
     (tmp_path / "state" / "secrets" / "prefect").chmod(0o640)
     (tmp_path / "state" / "secrets" / "metrics").unlink()
@@ -234,7 +234,7 @@ def test_own_workers_serve_their_run_alone():
             Client(address, security=Security.temporary(), **plain)
         with pytest.raises(OSError):
             Client(address.replace("tls://", "tcp://"), **plain)
-        # What listens is the scheduler, the nanny and the worker, each for TLS.
+        # Scheduler, nanny and worker listen, each with TLS.
         ports = listening() - before
         assert len(ports) == 3
         for port in ports:

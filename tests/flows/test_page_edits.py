@@ -32,7 +32,7 @@ def test_an_edit_of_what_somebody_changed_meanwhile_gets_the_difference(ada, bob
     difference = answer.json()["difference"]
     assert (difference["was"], difference["now"], difference["who"]) == (was, theirs, "Bob")
     assert difference["marking"] == name
-    # Another point of the same camera is nobody's business but hers.
+    # Another point of the same camera does not conflict with her edit.
     clicked = ada.get(f"{MATCH}/pictures/cam03").json()["points"]
     other = max(clicked)
     assert other != name

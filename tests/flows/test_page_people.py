@@ -91,7 +91,7 @@ def test_other_cameras_say_where_they_expect_a_keypoint(ada, project_copy):
             )
             assert np.nanmin(np.linalg.norm(shown - curve[len(curve) // 2], axis=1)) < 3.0
         assert least <= np.median(distances) <= most
-        # A joint off the others' is off in every picture, by what all cameras make of it.
+        # A displaced joint has a residual in every image, against the joint from all cameras.
         assert (answer["here"]["error"][joint] > 5.0) == (least > 0)
 
 
@@ -153,7 +153,7 @@ def test_who_is_certain_is_accepted_at_once_and_the_rest_one_by_one(ada, bob, pr
     one = {"people": [[first["frame"], first["detection"]]]}
     after = bob.post(f"{path}/acceptances", json=one).json()
     assert after["left"] == queue["left"] - 1
-    # Nothing is computed anew from it.
+    # It causes no recomputation.
     store = Store.open(str(project_copy))
     plan = plan_run(store, open_match(store, TINY), {})
     results = store.run(TINY).results

@@ -124,7 +124,7 @@ def test_a_clip_is_accepted_with_its_video_and_its_figures_over_time(
     frames.mkdir()
     size = spec.camera("cam02")
     grey = np.full((size.height, size.width, 3), 90, dtype=np.uint8)
-    for number in range(clip.frame_count - 1):  # the last picture is missing
+    for number in range(clip.frame_count - 1):  # the last image is missing
         cv2.imwrite(str(frames / f"{number:04d}.png"), grey, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     opened = PageContext.match
 

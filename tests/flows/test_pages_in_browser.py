@@ -1,4 +1,4 @@
-"""A person calibrates a rendered camera from nothing, and the run goes on: in a real browser."""
+"""A person calibrates a rendered camera from nothing, and the run continues: in a real browser."""
 
 import json
 from pathlib import Path
@@ -44,7 +44,7 @@ def rendered(request, tmp_path):
 
 
 def in_picture(camera, pitch, margin=15.0):
-    """The named points that a camera sees, well inside of its picture."""
+    """The named points that a camera sees, well inside of its image."""
     names = list(pitch.points)
     pixels = camera.project(pitch.positions(names))
     inside = ((pixels > margin) & (pixels < camera.image_size - margin)).all(axis=1)
@@ -84,7 +84,7 @@ def ground_errors(found, truth, pitch):
 
 
 def calibrate_in_browser(rendered, base, tmp_path, *, then_run):
-    """What a browser saw while somebody clicked 20 points and 10 markings, as far as in sight."""
+    """Return the browser's observations during up to 20 clicks and 10 drawn markings."""
     _, match, camera, truth, pitch = rendered
     rng = np.random.default_rng(5)
     points = {

@@ -1,4 +1,4 @@
-"""Who is looked for again is made from the iteration before, and of given 2D poses nobody is."""
+"""Redetection depends on the previous iteration, and does not exist for given 2D poses."""
 
 import pytest
 from filmed import write_filmed

@@ -1,4 +1,4 @@
-"""People whom the first pass missed in rendered videos, found again by the second."""
+"""The second pass finds people in rendered videos that the first pass missed."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_who_was_missed_is_found_again_where_the_bodies_are(server, tmp_path):
     folder, project = tmp_path / "match", tmp_path / "project"
     scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.4, "--cameras", CAMERAS)
     succeed("simulate", *scenario, "--render", "--no-stills", "--calibrated", "--out", folder)
-    # Of five people, each camera leaves out the one of whom it is the least sure.
+    # Of five people, each camera leaves out the one with the lowest score.
     asked = ("run", folder, "--project", project, "--iterations", 2)
     asked += ("--set", "detection.stride=2", "--set", f"detection.max_people={PEOPLE - 1}")
     answer = succeed(*asked, "--json").json
@@ -51,7 +51,7 @@ def test_who_was_missed_is_found_again_where_the_bodies_are(server, tmp_path):
             reach = 0.2 * np.linalg.norm(trunk, axis=-1)
             seen = np.isfinite(away[0])
             right.append((away < reach[:, None])[:, seen].mean(axis=1).max())
-    # One a picture is missing; some are half hidden or cut, and not looked for.
+    # One an image is missing; some are half hidden or cut, and not looked for.
     assert sought >= FRAMES * CAMERAS / 4
     assert found >= sought / 2
     # As sure as what detectors find themselves: see docs/explanation/detection.md.

@@ -162,7 +162,7 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     written = EXPORTS["tracks"](run, tmp_path / "out")
     assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
     rows = np.loadtxt(written[1], delimiter=",")
-    # The second person is lost in the third picture, the camera in the fourth.
+    # The second person is lost in the third image, the camera in the fourth.
     assert rows[:, :2].tolist() == [[1, 4], [1, 9], [2, 4], [2, 9], [3, 4]]
     EXPORTS["challenge"](run, tmp_path / "challenge")
     boxes = read_challenge(tmp_path / "challenge")["A_1"].boxes

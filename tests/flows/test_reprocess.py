@@ -1,4 +1,4 @@
-"""What an edit makes stale, match by match: what was made from it, found without running."""
+"""Stale results of an edit, by match, found without a run."""
 
 import json
 import sys

@@ -120,7 +120,7 @@ def test_a_moved_camera_recomputes_all_that_sees_through_it(tiny, tmp_path, serv
     lines[row] = f"translation = {json.dumps(numbers)}"
     calibration.write_text("\n".join(lines) + "\n")
     answer = run_json(moved, "--project", project, "--until", "triangulation")
-    # One camera is taken anew; everything from the comparison of cameras on depends on it.
+    # One camera changes; all stages from the comparison of cameras on depend on it.
     assert answer["executed"] == 4
     assert answer["reused"] == len(Store.open(str(project)).run(TINY, "0001").results) - 4
 

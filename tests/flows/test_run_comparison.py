@@ -1,4 +1,4 @@
-"""Two runs in figures: who is better or worse by the stated rule, whatever ids people have."""
+"""Metrics of two runs: better or worse by the stated rule, independent of person ids."""
 
 import numpy as np
 import pytest
@@ -152,7 +152,7 @@ def test_who_stands_where_somebody_stood_is_that_person():
     # Frames in which one is missing say nothing of them.
     after[0, 0] = np.nan
     assert pair_people(before, after) == {0: 1, 1: 0}
-    # Beyond a metre, or with another nearer, it is somebody else.
+    # Beyond a metre, or with another one nearer, it is another person.
     assert pair_people(before, after + 2.0) == {}
     assert pair_people(before, np.repeat(before[:, :1], 2, axis=1)) == {0: 0}
     assert pair_people(before[:, :0], after) == {}
@@ -184,7 +184,7 @@ def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):
     (picture,) = comparison._worst(bodies, "cam01", {"cam01": camera}, {"cam01": camera})
     assert (picture.camera, picture.frame, picture.person) == ("cam01", 11, 7)
     assert picture.moved_px == pytest.approx(10.0)
-    # Nobody in the picture, nothing to look at.
+    # Nobody in the image, nothing to look at.
     away = BodiesOfBoth(
         "clip", *map(np.array, ([10, 11, 12], [4, 7], [0, 1])), before + 9.0, after + 9.0
     )

@@ -1,4 +1,4 @@
-"""A run that waits for a page goes on where it stopped, whatever is killed meanwhile."""
+"""A run that waits for a review resumes where it stopped, whatever is killed meanwhile."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ from flows.match import process_match
 process_match.serve(name="reviewed", pause_on_shutdown=False)
 """
 PATIENCE = 300.0
-"""What a process may take to begin, and a flow to its end, on two busy cores [s]."""
+"""Maximum time for the start of a process and for a flow on two busy cores [s]."""
 
 
 class Servers:

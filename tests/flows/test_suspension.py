@@ -25,7 +25,7 @@ from flows.match import process_match
 process_match.serve(name="suspension", pause_on_shutdown=False)
 """
 PATIENCE = 240.0
-"""What a flow's process may take to begin and to reach its end on two busy cores [s]."""
+"""Maximum time for the start and end of a flow's process on two busy cores [s]."""
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ BEGUN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 
 class Told:
-    """A store of one run: unit to when it ended after the run's begin, and how long it took [s]."""
+    """A store of one run: unit to end time since the run's start, and duration [s]."""
 
     units = {
         "ingest/a": (12.0, 2.0),

@@ -1,6 +1,6 @@
 """Many cases, resumable, with a report: `python -m tests.fuzz --cases 500 --seed 1 --out fuzz`.
 
-Each case is a line of `cases.jsonl`; a killed run goes on where it was with the same command.
+Each case is a line of `cases.jsonl`; the same command resumes a killed run.
 Defects are reproduced with `--case 'KIND+KIND:SEED' --keep FOLDER`.
 """
 

@@ -70,7 +70,7 @@ SPOILS = {
     "with_lone_surrogate": lambda c, rng: c.replace(b'"name"', b'"\\ud800"', 1),
     "of_a_page": lambda c, rng: b"<!DOCTYPE html><html>not found</html>",
 }
-"""What is done to a file's bytes."""
+"""Mutations of a file's bytes."""
 
 FILES_OF = {
     "yaml": lambda draft, rng: "match.yaml",

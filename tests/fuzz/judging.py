@@ -19,7 +19,7 @@ CPU_SECONDS = 60
 """Of a case; the clock of a loaded machine says little."""
 WALL_SECONDS = 300
 MEMORY = 6 << 30
-"""Address space of a case [byte], beside what its parent has mapped."""
+"""Address space of a case [byte], in addition to that of its parent."""
 NEAR = 0.5
 """A person is found within this distance [m]."""
 COVERAGE, MEAN_ERROR = 0.85, 0.12
@@ -132,7 +132,7 @@ def _place(stack):
 
 
 def failure_class(error):
-    """What an exception is called: refused, or the class of its defect; and its message."""
+    """Return the class of an exception, refused or a defect, and its message."""
     from worldpose.errors import DegenerateError, InputError, StoreError, WorldposeError
 
     message = f"{type(error).__name__}: {error}"
@@ -221,7 +221,7 @@ def warnings_said(record, match):
 
 
 def gate_objections(record):
-    """What `--gates auto` would ask about, beside what clicks without a still always raise."""
+    """Questions of `--gates auto`, except those that clicks without a still always raise."""
     from flows.gates import GATES
 
     usual = ("expected_ground_error", "weak is")
@@ -283,7 +283,7 @@ def score(store, match_id, record, truth):
 
 
 def visible_truth(draft):
-    """Frame to joints (people, 17, 3) [m] of those whom two cameras see."""
+    """Frame to joints (people, 17, 3) [m] of people that two cameras see."""
     truth = {}
     views = np.zeros(draft.people.shape[:2], dtype=int)
     for name, camera in draft.cameras.items():
@@ -337,7 +337,7 @@ def judge(draft, store, match, record, failures):
 
 
 def leftovers(project):
-    """What a finished or refused run must not leave in a project."""
+    """Leftovers that a finished or refused run must not have in a project."""
     root = Path(project)
     found = [str(path) for path in (root / "staging").rglob("*") if path.is_file()]
     found += [str(path) for path in root.glob("runs/*/*.open.json")]

@@ -40,7 +40,7 @@ def kind(group, *, name=None, phase=DATA, base="any", harmless=False, blind=Fals
         phase: when it strikes.
         base: the match that it needs.
         harmless: the result must be right.
-        blind: nobody can say what the right result is any more.
+        blind: the right result is unknown.
     """
 
     def register(apply):

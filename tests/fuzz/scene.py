@@ -251,7 +251,7 @@ def film(draft, rng):
 
 
 def detections_of(draft, camera, rng):
-    """What a detector finds of the people: pixels with noise, in no stated order."""
+    """Return detections of the people: pixels with noise, in arbitrary order."""
     frames, count = draft.people.shape[:2]
     order = np.array([rng.permutation(count) for _ in range(frames)])
     pixels = camera.pixels(draft.people) + rng.normal(

@@ -16,7 +16,7 @@ HERE = "http://127.0.0.1:8571"
 
 
 class Project:
-    """A finished project, copied to be spoilt, and what is asked of its pages.
+    """A finished project, copied for damage, and the requests to its pages.
 
     Attributes:
         root: the store.

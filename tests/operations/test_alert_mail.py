@@ -104,7 +104,7 @@ def test_an_alert_is_a_letter_to_all_who_are_named(post_office, tmp_path):
 
 @pytest.fixture
 def localhost_tls(tmp_path):
-    """A server's TLS as `localhost`, and the file of its certificate, which nobody vouches for."""
+    """A server's TLS as `localhost`, and the file of its self-signed certificate."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
     make = ["openssl", "req", "-x509", *curve, "-nodes", "-days", "2"]
@@ -142,7 +142,7 @@ def test_a_server_that_offers_starttls_gets_log_in_and_letter_under_it(
     mail = Mail.at(f"smtp://ann:a%40secret@localhost:{server.port}/?to=ann@example.org")
     teller = AlertDispatcher(StateFolder(tmp_path), [mail], pause=0.0)
     assert teller.tell([ALERT]) == []
-    # A certificate that nobody vouches for was refused: nothing was said after it.
+    # The untrusted certificate was refused: nothing was sent after it.
     assert server.verbs == ["EHLO", "STARTTLS"]
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     server.verbs.clear()

@@ -1,4 +1,4 @@
-"""Somebody is told of each matter once: a real server takes what is posted."""
+"""Each alert is sent once, to a real server."""
 
 import socket
 from datetime import UTC, datetime, timedelta

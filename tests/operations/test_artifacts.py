@@ -1,4 +1,4 @@
-"""What a deployment's run shows at Prefect: how far it is, its units, where to review."""
+"""Display of a deployment's run at Prefect: progress, units, and links to reviews."""
 
 import json
 import os

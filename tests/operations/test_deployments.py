@@ -1,4 +1,4 @@
-"""What is installed at a Prefect server, and which runs begin again there."""
+"""Deployments at a Prefect server, and the runs that restart there."""
 
 import asyncio
 import importlib
@@ -170,7 +170,7 @@ def test_installed_again_changes_limits_and_another_project_is_refused(plan):
             return (await client.read_work_pool("ops")).concurrency_limit
 
     assert asyncio.run(limit()) == 3
-    # Whose server is its own has nobody else's deployments there: it was moved.
+    # A service with its own server has no foreign deployments there: it was moved.
     for owns_prefect, advice in ((False, "--name"), (True, "Was the project moved?")):
         changes = {"project": "/another", "owns_prefect": owns_prefect}
         with pytest.raises(InputError, match=re.escape(advice)):

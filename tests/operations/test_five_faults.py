@@ -270,7 +270,7 @@ def shown(what, took):
 
 
 def log_lines(sizes):
-    """What the logs say since, each different line once; fails where a fault fills them."""
+    """Return new log lines, each different one once; fails if a fault fills the logs."""
     lines = []
     for log, size in sorted(sizes.items()):
         with log.open(errors="replace") as file:

@@ -1,4 +1,4 @@
-"""What is not well is said, with what to do about it."""
+"""Health checks name each fault with its remedy."""
 
 import os
 from datetime import UTC, datetime, timedelta
@@ -59,7 +59,7 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
         assert "pages.log" in found["pages"].mend
         assert "inbox" in found["inbox"].mend
         assert all(each.mend for each in found.values() if not each.is_well)
-        # Without its server nothing is known of deployments, and the server is to be mended first.
+        # Without the server, deployments are unknown, and the server must be fixed first.
         state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
         (tmp_path / "inbox").mkdir()
         found = by_part(check(state))
@@ -69,7 +69,7 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
 
 
 class Prefect:
-    """What a Prefect server answers, by the end of its address; all is well there."""
+    """Answers of a healthy Prefect server, by the end of the address."""
 
     def __init__(self):
         self.asked = {}

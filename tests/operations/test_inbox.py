@@ -106,7 +106,7 @@ def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
 def test_time_that_was_waited_before_a_reboot_does_not_count(desk, drop, clock):
     drop()
     desk.look(quiet=10.0)
-    clock.now = 3.0  # it begins anew
+    clock.now = 3.0  # it begins again
     assert desk.look(quiet=10.0) == 0
     clock.now = 12.9
     assert desk.look(quiet=10.0) == 0
@@ -316,7 +316,7 @@ def test_unclicked_cameras_are_said_and_no_run_is_begun(desk, drop):
 
 
 def hostile(folder, kind):
-    """Make an arrival that must not be taken in; gives what is said of it."""
+    """Make an arrival that must be refused; return the reason."""
     if kind == "a link to a match":
         outside = shutil.move(folder, folder.parent.parent / "outside")
         folder.symlink_to(outside)

@@ -203,7 +203,7 @@ def test_prometheus_scrapes_services_that_are_there():
             assert port in text, target
     (rules,) = yaml.safe_load((INFRA / "prometheus" / "alerts.yml").read_text())["groups"]
     assert all({"alert", "expr", "annotations"} <= set(rule) for rule in rules["rules"])
-    # The figures' server answers to the name under which it is scraped.
+    # The metrics server answers to the name under which it is scraped.
     assert "--host-name=serve" in SERVICES["serve"]["command"]
 
 
@@ -254,7 +254,7 @@ def test_kubernetes_manifests_refer_to_what_is_there():
 
 
 def needs(tool):
-    """A mark: set-ups are looked at by their own tools where these are installed."""
+    """A mark: set-ups are checked by their own tools if installed."""
     return pytest.mark.skipif(shutil.which(tool) is None, reason=f"{tool} is not installed")
 
 

@@ -16,7 +16,7 @@ from listeners import listening, says_nothing
 
 
 class Plain(BaseHTTPRequestHandler):
-    """Answers everybody."""
+    """Answers any client."""
 
     def do_GET(self):
         self.send_response(404)

@@ -1,4 +1,4 @@
-"""Many matches at once, many small units, and a finished match begun again."""
+"""Many matches at once, many small units, and a finished match run again."""
 
 import resource
 import shutil
@@ -113,7 +113,7 @@ def test_ten_thousand_small_units_are_computed_and_found_again(tmp_path, capsys)
 
 
 def seconds_in_a_loop(folder, project):
-    """What a unit takes where one process computes and publishes one after another."""
+    """Return the time per unit in one process that computes and publishes units in turn."""
     from flows.match import task_of  # late: Dask and Prefect take seconds to import
 
     store = Store.create(str(project))
@@ -131,7 +131,7 @@ def seconds_in_a_loop(folder, project):
 
 
 def processor_seconds():
-    """What processes that were begun here and have ended have taken, their own ones included."""
+    """Return the processor time of ended child processes, including their children."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

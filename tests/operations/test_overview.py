@@ -25,7 +25,7 @@ FIGURES = {
 
 
 def record(run_id="0002", waits=True):
-    """A run of one camera, whose clicks somebody has to look at."""
+    """A run of one camera whose clicks need a review."""
     waiting = WaitingUnit(unit=UNIT, request=REQUEST, reasons=(WRONG,))
     return RunRecord.model_validate(
         {

@@ -22,7 +22,7 @@ from worldpose.store import Store, verify
 
 LOGIN = new_login()
 START_SECONDS = 300
-"""What a server may take to begin on a busy machine."""
+"""Maximum time for the start of a server on a busy machine."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Which runs begin again by themselves."""
+"""Runs that restart automatically."""
 
 import asyncio
 from datetime import UTC, datetime, timedelta

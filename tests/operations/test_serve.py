@@ -41,7 +41,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
 
     wait_until(lambda: served.runs(name)[0]["state_name"] == "Suspended", served.explain)
     note("first question")
-    # Everything is killed while the run waits, and goes on when begun again.
+    # Everything is killed while the run waits, and resumes after a restart.
     assert served.end(signal.SIGKILL) == 0
     assert served.check().code == 1
     served.begin()
@@ -50,7 +50,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert browser.approve_all(name) > 0
     note("approved")
 
-    # Killed while the run is at work: begun again it goes on by itself.
+    # Killed during the run: after a restart it resumes automatically.
     wait_until(lambda: served.runs(name)[0]["state_name"] == "Running", served.explain)
     assert served.end(signal.SIGTERM) == 0
     served.begin()
@@ -60,7 +60,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     def is_done():
         browser.approve_all(name)
         (run,) = served.runs(name)
-        # Between the two it is "Crashed" for a moment, until it begins again.
+        # In between it is "Crashed" for a moment, until it restarts.
         assert run["state_name"] != "Failed", run["state"]["message"]
         return run["state_name"] == "Completed"
 

@@ -34,7 +34,7 @@ def scraped(text):
 
 @pytest.fixture
 def served(project_copy):
-    """A project that is served, and a function that asks its figures' server."""
+    """A served project, and a function that queries its metrics server."""
     state = StateFolder(project_copy / "operations")
     now = datetime.now(UTC)
     for name, known in (("a", "taken"), ("b", "refused"), ("c", "refused")):
@@ -88,7 +88,7 @@ def test_a_scrape_says_what_the_store_says_and_all_that_the_dashboard_asks_for(
     assert found["worldpose_store_bytes",] == sum(p.stat().st_size for p in files if p.is_file())
     assert found["worldpose_arrivals", ("state", "refused")] == 2
     assert found["worldpose_alerts", ("alert", "disk_low")] == 1
-    # The dashboard and the rules name figures that are there, with labels that they have.
+    # The dashboard and the rules name existing metrics with existing labels.
     names = {name for name, *_ in found}
     asked = [target["expr"] for panel in panels() for target in panel["targets"]]
     rules = (INFRA / "prometheus" / "alerts.yml").read_text()

@@ -1,4 +1,4 @@
-"""Clients that are slow, or say nothing at all, keep nobody else from the pages."""
+"""Slow or silent clients do not block the pages for others."""
 
 import http.client
 import os
@@ -120,7 +120,7 @@ def still_open(opened):
 
 
 def attack(port, count, seconds):
-    """Seconds that each request of somebody else takes while so many connections are held."""
+    """Seconds per request of another client while so many connections are open."""
     opened = open_many(port, count)
     took, end = [], time.monotonic() + seconds
     try:

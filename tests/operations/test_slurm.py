@@ -99,7 +99,7 @@ def test_a_job_computes_a_match_on_two_nodes_and_goes_on_when_it_is_requeued(
         return said.read_text() if said.exists() else ""
 
     wait_for(lambda: " static_calibration/cam" in text(), 900, text)
-    # As when a node fails: the job begins again by itself.
+    # As when a node fails: the job restarts automatically.
     subprocess.run(["scontrol", "requeue", job], env=slurm, check=True)
     state = ["scontrol", "show", "job", job]
     wait_for(lambda: "JobState=COMPLETED" in ask(slurm, *state), 1200, text)

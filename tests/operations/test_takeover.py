@@ -109,7 +109,7 @@ def settle(served, runs):
 
 
 def runs_by_request(served):
-    """Return the ids of runs that somebody asked for; the schedule plans its own at any time."""
+    """Return the ids of requested runs; the schedule plans its own at any time."""
     runs = served.ask("/flow_runs/filter", {"limit": 200})
     return {run["id"] for run in runs if not run["auto_scheduled"]}
 
@@ -124,7 +124,7 @@ def test_a_stranger_can_begin_no_run(served, pwned):
         status, answered, _ = request(port, "POST", path, headers, scheduled(command))
         assert status in REFUSALS, who
         assert "access-control-allow-origin" not in answered, who
-        # What a browser would ask first.
+        # The preflight request of a browser.
         asking = {
             "origin": "http://evil.example",
             "access-control-request-method": "POST",

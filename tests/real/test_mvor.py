@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def measured():
-    """What the benchmark measures with default settings: errors [cm] and people, by views."""
+    """The benchmark's results with default settings: errors [cm] and people, by views."""
     spec = importlib.util.spec_from_file_location("mvor", BENCHMARK)
     mvor = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(mvor)

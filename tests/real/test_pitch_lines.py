@@ -1,4 +1,4 @@
-"""Cameras from hand-drawn lines of real broadcast pictures; skipped where the data is absent.
+"""Cameras from hand-drawn lines of real broadcast images; skipped where the data is absent.
 
 WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, homographies.json, calib_eval.py) and
 `sn22_lines` (lines.json). Settings were chosen on the even half of each; the odd half is scored.
@@ -35,7 +35,7 @@ def bench():
     [
         # Seen on this half: 98.7, 98.9, 98.9.
         ("wc14", (98.4, 98.6, 98.6)),
-        # Seen on this half: 94.8, 96.4, 96.5, all pictures kept.
+        # Seen on this half: 94.8, 96.4, 96.5, all images kept.
         ("sn22", (94.6, 96.0, 96.2)),
     ],
 )

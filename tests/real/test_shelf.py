@@ -1,7 +1,7 @@
 """Real multi-view detections of people around a shelf; skipped where the data is absent.
 
 WORLDPOSE_TEST_DATA names a folder with `shelf_dev/import` (calibration.toml, detections) and
-`shelf_dev/pcp.py` and `gt.npz` (the scorer of the published PCP3D figures).
+`shelf_dev/pcp.py` and `gt.npz` (the scorer of the published PCP3D).
 """
 
 import importlib.util

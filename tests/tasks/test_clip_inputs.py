@@ -38,7 +38,7 @@ def test_rejected_keypoints_are_gone_and_lasting_errors_taken_off():
 
 
 def test_who_was_looked_for_again_is_taken_as_he_was_found_this_time():
-    # One was detected in each of two frames; behind, somebody was found again in the second.
+    # One detection in each of two frames; then a redetected person in the second.
     ones = np.ones((2, 2, 17, 2), dtype=np.float32)
     ones[0, 1] = np.nan
     camera = xr.Dataset(

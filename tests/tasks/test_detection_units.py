@@ -25,7 +25,7 @@ CLIPS = [("early", 2, 12), ("late", 20, 10)]
 
 
 class Reading:
-    """Finds one person whose box begins at the number that is burnt into the picture."""
+    """Finds one person whose box begins at the number that is burnt into the image."""
 
     view_size = None
 
@@ -71,7 +71,7 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     names = [stage.name for stage in METHOD]
     results = computed(store, match, names.index("tracking"))
     late = store.open_result("filmed", "ingest", "right", results["ingest/right"])
-    # Frames 20 to 29 are pictures 23 to 32 of `right`, which has 31.
+    # Frames 20 to 29 are images 23 to 32 of `right`, which has 31.
     assert late.attrs["video"]["missing_frames"] == [[28, 29]]
     plan = RunPlan(store, match, {}, results=results)
     planned = plan.plan_stage(METHOD[names.index("tracking")])

@@ -1,4 +1,4 @@
-"""What bodies are fitted to: keypoints as triangulated, other clips' shapes, late pictures."""
+"""Inputs of body fitting: triangulated keypoints, other clips' shapes, clock offsets."""
 
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in
 
 
 def stored(**arrays):
-    """A result with these arrays, whose dimensions nobody asks for."""
+    """A result with these arrays and arbitrary dimensions."""
     return {name: xr.DataArray(np.asarray(values)) for name, values in arrays.items()}
 
 
@@ -76,7 +76,7 @@ def beside(frames):
 
 
 def runner(frame):
-    """Joints (frames, 1, 17, 3) of somebody who goes 0.7 m a frame, slanting away."""
+    """Joints (frames, 1, 17, 3) of a person who moves 0.7 m per frame, diagonally away."""
     body = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], -1)
     return (body + (frame - 5.5)[:, None, None] * [0.5, 0.5, 0.0])[:, None]
 
@@ -106,7 +106,7 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
     store = SimpleNamespace(manifest=lambda *_: calibrated)
     work = of_clip(offset_frames=4, broadcast_offset_frames=4.25)
     pictures = refitting._pictures(store, work, np.arange(100, 103))
-    # Match frame 100 is at 104.25 of the video: its picture 104 was taken a quarter earlier. The
+    # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
     # feed was measured to show what static cameras show one and a half frames on.
     assert pictures.late == late
     assert pictures.number.tolist() == [104, 105, 106]
@@ -128,7 +128,7 @@ def test_lines_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, la
     assert there.sum() >= 10
     # He runs straight on, so that the middle of two of his places is one.
     np.testing.assert_allclose(view.points[there], runner(frame)[there], atol=1e-6)
-    # 7 mrad a frame along the picture, and what bends of it in between.
+    # 7 mrad a frame along the image, and what bends of it in between.
     own = camera.project(runner(frame)[:, 0])[:, None]
     here = constrain_to_rays(camera, own, runner(frame)).across
     np.testing.assert_allclose(view.across[there], here[there], atol=1e-4)

@@ -1,4 +1,4 @@
-"""Clips in which nobody is tracked: every stage has a result, of nobody."""
+"""Clips without tracked people: every stage has an empty result."""
 
 import shutil
 
@@ -13,12 +13,12 @@ from flows.run_plan import plan_run
 from worldpose.store import Store
 
 NOBODY = {"tracking": {"size_range": [3.0, 4.0]}}
-"""Everybody who is seen is too small, or too tall."""
+"""All detected people are too small, or too tall."""
 
 
 @pytest.fixture
 def empty(tiny, tmp_path):
-    """A store and a match of two clips whose people have names, which are of nobody here."""
+    """A store and a match of two clips with named people, without any track."""
     folder = shutil.copytree(tiny, tmp_path / "match")
     shutil.copy(folder / "reference" / "calibration.toml", folder)
     (folder / "detections" / "clip.npz").unlink(missing_ok=True)  # of a clip's own camera

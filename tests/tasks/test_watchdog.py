@@ -28,7 +28,7 @@ def at_work(monkeypatch, scratch, scheduler):
 
 
 def die(work):
-    """What is left of a process that ended while it was at work."""
+    """Leftovers of a process that ended during its work."""
     pid = os.fork()
     if pid == 0:
         with kill_on_timeout(work):

@@ -1,4 +1,4 @@
-"""What errors say, and that a bug in worldpose is called one."""
+"""Messages of errors, and that a bug in worldpose is called one."""
 
 import pickle
 

@@ -48,7 +48,7 @@ def read(tmp_path, stream: bytes, key: str = "a"):
 
 @pytest.fixture(autouse=True)
 def warm(tmp_path):
-    """What is imported on first use is imported before events are counted."""
+    """Modules that load on first use are imported before events are counted."""
     for protocol in (0, 2):
         stream = pickled({"a": Ch(scipy.sparse.csc_matrix(NUMBERS))}, protocol)
         (tmp_path / "warm.pkl").write_bytes(stream)

@@ -115,7 +115,7 @@ def test_one_clip_alone_stays_what_it_is():
 @pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
 def test_clips_that_say_nothing_leave_the_betas_of_anybody_whatever_these_weigh(weight):
     silent = Shape(np.zeros(3), np.eye(3) / weight)
-    # What one clip knows of the first component besides: precision 4, at 2.
+    # Additional information of one clip on the first component: precision 4, at 2.
     told = Shape(
         np.array([8.0 / (weight + 4.0), 0.0, 0.0]), np.diag(1.0 / (weight + np.r_[4.0, 0.0, 0.0]))
     )

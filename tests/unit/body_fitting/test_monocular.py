@@ -1,4 +1,4 @@
-"""Files of methods of one picture: their names, shapes and conventions."""
+"""Files of methods of one image: their names, shapes and conventions."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_a_body_of_the_whole_picture_is_not_turned_to_its_ray():
     off = place_monocular_poses(crop, camera, np.arange(1), joints).orient[0] @ true.swapaxes(
         -1, -2
     )
-    # 7 degrees and less beside the middle of the picture.
+    # 7 degrees and less beside the middle of the image.
     ray = camera[0].normalize(center)
     np.testing.assert_allclose(
         np.linalg.norm(Rigid(off, np.zeros(3)).rotvec, axis=-1),
@@ -291,7 +291,7 @@ def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known(erro
 
 
 def people_in_a_gap(seed=5):
-    """A walker whose arms and legs nobody triangulates for a second, and his true bodies."""
+    """A walker whose limbs are not triangulated for a second, and the true bodies."""
     rng = np.random.default_rng(seed)
     truth = walker(100, rng)
     joints, covariance = seen(truth, 0.01, rng)

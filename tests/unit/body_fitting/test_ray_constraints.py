@@ -21,7 +21,7 @@ CAMERA = broadcast(1)
 
 
 def scene(frames, hidden):
-    """Who weaves before one camera, and his joints, without those of `hidden` frames."""
+    """A person who weaves before one camera, and the joints, without `hidden` frames."""
     rng = np.random.default_rng(6)
     truth = walker(frames, rng)
     weaving = 0.3 * np.sin(2.0 * np.pi * 0.8 * np.arange(frames) / 50.0)
@@ -46,7 +46,7 @@ def test_lines_pass_through_the_joints_they_see():
     # The joints of a person stand 0.8 rad / 70 from his middle at most, and the points 1 m too far
     # or too near.
     assert np.linalg.norm(off, axis=-1)[10:20].max() < 0.015
-    # What is asked of the line's point: near the track, whose walker swings his arms.
+    # Required distance of the line's point from the track, whose walker swings the arms.
     assert np.linalg.norm(lines.points - exact[:, None], axis=-1)[10:20].max() < 0.8
 
 

@@ -40,7 +40,7 @@ def test_neither_people_nor_offsets_grow_with_the_length_of_a_clip(frames):
 def test_a_clip_is_looked_at_for_no_longer_than_is_asked():
     _, joints = people(1, 1000, 0.02)
     broken = {p: (j.copy(), c) for p, (j, c) in joints.items()}
-    # Between the two parts of a second each, at both ends, nothing is looked at.
+    # Nothing is used between the two parts of a second each, at both ends.
     broken[0][0][60:940] += 100.0
     settings = SETTINGS.model_copy(update={"shape_time_s": 2.0})
     solver = Solver(SOLVER.chained, SOLVER.prior, settings, None)

@@ -20,7 +20,7 @@ def played(name, duration, seed):
 
 
 def bearing_errors(found, true):
-    """Angles between directions of picture points, which no choice of principal point hides."""
+    """Angles between directions of image points, which no choice of principal point hides."""
     pixels = np.stack(np.meshgrid([200.0, 960.0, 1720.0], [120.0, 540.0, 960.0]), axis=-1)
     one, two = (c.camera.unproject(pixels.reshape(-1, 2)).directions for c in (found, true))
     return np.degrees(np.linalg.norm(one - two, axis=-1))

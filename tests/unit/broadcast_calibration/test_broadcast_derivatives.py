@@ -124,6 +124,6 @@ def test_evidence_of_nothing_costs_nothing():
     prior = build_prior(BroadcastPrior(), camera.focal, camera.image_size)
     problem = Problem(PointEvidence.none(), FlowEvidence.none(), prior)
     bare = equations_at(camera, np.zeros((0, 3)), problem)
-    # What is left is the prior's: 5 numbers of the clip, 4 of each frame.
+    # The remaining residuals are the prior's: 5 of the clip, 4 of each frame.
     assert np.count_nonzero(bare.system.blocks[0].diagonal(axis1=1, axis2=2)) == 3 * 4
     assert not bare.system.border.any()

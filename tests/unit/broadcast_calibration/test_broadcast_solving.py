@@ -71,7 +71,7 @@ def test_noisy_evidence_gives_the_camera_within_its_covariance():
 
 
 def place_covariance(camera, uncertainty, place, frame=10):
-    """Covariance of a place in one frame's picture [px^2]."""
+    """Covariance of a place in one frame's image [px^2]."""
     pixel, rows = np.empty(2), np.empty((2, 12))
     point_row(camera.rotation[frame], camera.center, camera.lens(frame), place, pixel, rows)
     return rows @ uncertainty.frame[frame] @ rows.T

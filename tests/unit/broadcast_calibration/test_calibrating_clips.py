@@ -1,4 +1,4 @@
-"""Whole clips of rendered pictures: every frame's camera against the true one."""
+"""Whole clips of rendered images: every frame's camera against the true one."""
 
 import numpy as np
 import pytest
@@ -73,7 +73,7 @@ def clicks(true, frame, noise=1.0, renamed=None):
 
 
 def place_errors(camera, true):
-    """Distances in the picture of places on the pitch that the true camera sees [px]."""
+    """Distances in the image of places on the pitch that the true camera sees [px]."""
     x, y = np.meshgrid(np.linspace(-25.0, 25.0, 11), np.linspace(-20.0, 20.0, 9))
     places = np.stack([x.ravel(), y.ravel(), clip.PITCH.height(x.ravel(), y.ravel())], axis=-1)
     seen, found = true.camera.project(places), camera.camera.project(places)
@@ -207,7 +207,7 @@ def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true,
         )
         for what in ("report", "correct")
     )
-    # Half a frame is what a static camera's clock is off at most.
+    # The clock offset of a static camera is at most half a frame.
     assert said.report.feed_offset.frames == pytest.approx(2.0, abs=0.5)
     assert any("frames later in the static cameras" in each for each in said.report.reasons)
     assert corrected.report.reasons == ()

@@ -1,4 +1,4 @@
-"""A broadcast clip of a match in which the static cameras track nobody."""
+"""A broadcast clip of a match in which the static cameras track no person."""
 
 import numpy as np
 import pytest

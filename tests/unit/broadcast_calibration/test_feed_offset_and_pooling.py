@@ -107,7 +107,7 @@ def test_a_single_clip_is_its_own_place():
 
 def test_a_camera_goes_to_the_common_place_and_its_frames_go_along():
     camera = clip.moving(3)
-    # Six centimetres beside, and a turn about y that went along: a milliradian a metre.
+    # A displacement of six centimetres with a rotation about y: a milliradian per metre.
     known = np.tile(1e-12 * np.eye(12), (3, 1, 1))
     known[:, 7:10, 7:10] = 0.04 * np.eye(3)
     known[:, 1, 7] = known[:, 7, 1] = 1e-3 * 0.04
@@ -142,7 +142,7 @@ def test_drawing_a_clip_to_its_own_place_changes_nothing():
         # Every person is worth one in 0.3 s: 600 people in 15 frames each are 40.
         (100, 0.4, 0.25),
         (100, 0.025, 1.0),
-        # Of 800 frames every second is looked at, so that there are 80.
+        # Every second of 800 frames is used, which gives 80.
         (800, 0.2, 0.25),
     ],
 )

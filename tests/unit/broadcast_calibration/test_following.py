@@ -1,4 +1,4 @@
-"""Followed points, what they say of the camera, and which are no part of the picture."""
+"""Followed points, what they say of the camera, and which are no part of the image."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ SHIFT = np.array([3.0, -2.0])
 
 
 def textured(rng):
-    """A picture with structure at the size of a tracking window."""
+    """An image with structure at the size of a tracking window."""
     coarse = rng.uniform(0.0, 255.0, (40, 60))
     return np.kron(coarse, np.ones((8, 8))).astype(np.uint8)
 

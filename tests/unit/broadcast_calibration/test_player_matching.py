@@ -65,7 +65,7 @@ def test_boxes_of_nobody_are_missing():
 
 
 def standing():
-    """Joints of somebody upright, arms a little off: nearly what COCO's points are [m]."""
+    """Joints of an upright person with slightly spread arms, nearly COCO's points [m]."""
     sides = np.array(
         [[0.0, 0.03, -0.03, 0.07, -0.07, 0.2, -0.2, 0.3, -0.3, 0.32, -0.32, 0.12, -0.12]]
     )

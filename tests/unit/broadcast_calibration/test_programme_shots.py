@@ -18,7 +18,7 @@ FPS = 10.0
 
 
 def filmed(center, aims, focal):
-    """Pictures of an empty pitch from a tripod."""
+    """Images of an empty pitch from a tripod."""
     poses = [look_at(np.array(center), np.array([*aim, 0.0]), 0.0) for aim in aims]
     count = len(poses)
     cameras = Camera(
@@ -50,7 +50,7 @@ def wipe():
 
 @pytest.fixture(scope="module")
 def programme():
-    """Names of what follows one another, and its pictures."""
+    """Names of what follows one another, and its images."""
     main = (0.0, -80.0, 16.0)
     shots = [
         ("main", filmed(main, sweep(-25.0, 15.0, 44), 600.0)),
@@ -99,10 +99,10 @@ def test_only_live_pans_of_the_main_camera_are_proposed(found):
 
 
 def test_a_pan_is_measured_in_widths_of_the_picture(found):
-    # 40 m at 77.6 m, and half of it to either side: 27 degrees of 0.533 rad wide pictures.
+    # 40 m at 77.6 m, and half of it to either side: 27 degrees of 0.533 rad wide images.
     turned = np.arctan((25.0 + 15.0) / 2.0 / np.hypot(76.0, 16.0)) * 2.0 / (320.0 / 600.0)
     # Aimed at 25 m to the left and 15 m to the right, which is not the same angle to both sides,
-    # and followed at a twentieth of the picture's size.
+    # and followed at a twentieth of the image's size.
     assert abs(found[0].pan - turned) < 0.15 * turned
 
 
@@ -111,7 +111,7 @@ def test_a_person_close_by_is_tall():
     assert grass_and_people(lawn) == (1.0, 0.0)
     near = lawn.copy()
     near[30:180, 140:180] = (200, 30, 30)
-    # The picture's border closes him off from below; the hull of the grass is the whole picture.
+    # The image's border closes him off from below; the hull of the grass is the whole image.
     share, tallest = grass_and_people(near)
     assert tallest == pytest.approx(150.0 / 180.0, abs=0.02)
     assert share == pytest.approx(1.0 - 40.0 * 150.0 / (180.0 * 320.0), abs=0.02)
@@ -128,7 +128,7 @@ def test_a_stretch_is_cut_out_picture_for_picture(programme, tmp_path):
     video, cut = tmp_path / "programme.mp4", tmp_path / "cut.mp4"
     write_video(video, programme[1][:90], FPS)
     place = cut_video(video, 41, 70, cut)
-    # A key frame a second: 10 pictures.
+    # A key frame a second: 10 images.
     assert place == 41 % 10
     assert index_frames(cut).fps == pytest.approx(FPS)
     with VideoReader(video) as one, VideoReader(cut) as two:

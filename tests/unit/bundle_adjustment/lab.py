@@ -1,6 +1,6 @@
 """A laboratory of its own: few given cameras around people who cross, no pitch, biased keypoints.
 
-Nothing of it is taken from `worldpose.simulation`: another skeleton, another way to walk, another
+It uses nothing of `worldpose.simulation`: another skeleton, another way to walk, another
 detector and another rig.
 """
 

@@ -1,4 +1,4 @@
-"""What people and markings weigh in the adjustment."""
+"""Weights of people and markings in the adjustment."""
 
 from dataclasses import replace
 

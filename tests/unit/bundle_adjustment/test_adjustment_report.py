@@ -111,7 +111,7 @@ def test_planted_exchanges_of_people_head_the_list_at_the_length_of_what_was_pla
     listed = found(replace(made, detection_index=index), true)
     entries = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     first = set(entries[: len(planted)])
-    # At the planted length precision and recall are one figure.
+    # At the planted length precision equals recall.
     assert len(first & planted) >= 0.95 * len(planted)
 
 

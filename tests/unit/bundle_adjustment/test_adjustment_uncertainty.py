@@ -1,4 +1,4 @@
-"""What all cameras share of a survey's errors, and how sure it leaves them."""
+"""Survey errors that all cameras share, and the resulting uncertainty."""
 
 from dataclasses import replace
 

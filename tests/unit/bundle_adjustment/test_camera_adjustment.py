@@ -102,7 +102,7 @@ def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
     adjusted = adjust_cameras(given, QUICK)
     assert adjusted.accepted.all()
     np.testing.assert_array_equal(adjusted.cameras.principal_point, given.cameras.principal_point)
-    # What all of them err by in common no keypoint can tell, and it stays.
+    # No keypoint reveals their common error, which remains.
     assert errors(adjusted.cameras, true).mean() < 0.85 * errors(given.cameras, true).mean()
     assert adjusted.evidence.shift < 0.002
 

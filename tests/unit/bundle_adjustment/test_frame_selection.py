@@ -1,4 +1,4 @@
-"""Which frames cameras are adjusted on."""
+"""Selection of frames for the adjustment."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_a_frame_that_shows_another_part_of_the_pitch_comes_before_more_of_the_s
     alike = replace(made, joints=joints, views=views)
     chosen = propose_frames(alike, count=2, gap=0.0, min_views=3)
     assert chosen.tolist() == [0, 3]
-    # What is proposed already is not collected: then nothing is new here, and the first come.
+    # Proposed places are not collected again: nothing is new here, in given order.
     assert propose_frames(alike, 2, 0.0, 3, taken=np.array([3])).tolist() == [0, 1]
 
 

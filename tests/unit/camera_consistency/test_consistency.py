@@ -1,4 +1,4 @@
-"""Cameras with one planted fault each; people are rigid figures that walk straight on."""
+"""Cameras with one planted fault each; people are rigid bodies that walk straight on."""
 
 from dataclasses import replace
 
@@ -157,7 +157,7 @@ def test_a_wrong_clock_is_named_in_frames(late):
 def test_a_wrong_frame_rate_is_named():
     cameras = rig()
     keypoints = seen(cameras, walkers())
-    # A camera of 50 frames per second whose frames are taken for 25 per second.
+    # A camera of 50 frames per second, stated as 25 per second.
     keypoints[:, 2] = shifted(keypoints[:, 2], np.arange(FRAMES) // 2)
     result = check(cameras, keypoints)
     assert named(result) == [(2, "frame_rate")]

@@ -24,7 +24,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def poses(model):
-    """People who run about with moving limbs; one is missing for a while."""
+    """Running people with moving limbs; one is missing for a while."""
     rng = np.random.default_rng(3)
     time = np.arange(FRAMES)[None, :, None] / FPS
     heading = rng.uniform(-np.pi, np.pi, (PERSONS, 1))

@@ -1,4 +1,4 @@
-"""What is done to a sound data set so that its check must find it."""
+"""Faults planted in a sound data set, which its check must find."""
 
 import numpy as np
 

@@ -22,7 +22,7 @@ def people(*rows):
 
 
 def followed(found, **settings):
-    """Frames in, frames out: who is found a frame, None where nobody looked."""
+    """Frames in, frames out: people per frame, None in skipped frames."""
     cleaner = BoxCleaner(DetectionSettings(**settings))
     frames = [(number, PICTURE, one) for number, one in enumerate(found)]
     return [(number, out) for number, _, out in cleaner.clean(frames)], cleaner

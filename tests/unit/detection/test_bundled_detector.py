@@ -1,4 +1,4 @@
-"""Who stands close together is looked at from nearer, and comes back to his place."""
+"""People who stand close together are detected in an enlarged view, in frame coordinates."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def test_neighbours_make_a_group_and_others_none():
 
 def test_a_group_that_fills_the_picture_is_not_worth_a_second_look():
     row = [(x, 10.0, x + 20.0, 50.0) for x in np.arange(0.0, 1900.0, 10.0)]
-    # The part is 1920 x 70 px; enlarged it has at most as many pixels as the picture.
+    # The part is 1920 x 70 px; enlarged it has at most as many pixels as the image.
     (group,) = find_groups(people(*row), (280, 1920, 3))
     np.testing.assert_allclose(group.zoom, 2.0)
     assert find_groups(people(*row), (60, 1920, 3)) == []
@@ -42,7 +42,7 @@ def test_a_box_seen_from_nearer_lies_where_it_is_in_the_picture():
     rows, columns = np.nonzero(shown > 127)
     seen = (columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5)
     back = group.to_frame(people(seen))
-    # A pixel of the enlarged part is half a pixel of the picture; edges are known to half of one.
+    # A pixel of the enlarged part is half a pixel of the image; edges are known to half of one.
     np.testing.assert_allclose(back.boxes, [[34.5, 39.5, 54.5, 89.5]], atol=0.3)
-    # Who is no part of the group, or of another size, is left to the look at the whole.
+    # People outside of the group, or of another size, come from the view of the whole frame.
     assert len(group.to_frame(people((0.0, 0.0, 400.0, 500.0), (5.0, 5.0, 9.0, 9.0))).scores) == 0

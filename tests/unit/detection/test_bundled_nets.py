@@ -55,7 +55,7 @@ def test_a_crop_of_a_large_box_is_smooth_and_in_its_place():
     mapping = frame_from_crop(np.array([450.0, 450.0, 7.3]), CROP)
     crop = cut_crop(picture, mapping, CROP)
     edge = (399.5 - mapping[1, 2]) / mapping[1, 1]
-    # Rows at both ends are outside of the picture; a crop pixel covers 7 stripes, one more or less.
+    # Rows at both ends are outside of the image; a crop pixel covers 7 stripes, one more or less.
     assert np.all(np.abs(crop[3 : int(edge) - 1, :, 0].astype(int) - 100) < 15)
     assert np.all(crop[int(edge) + 2 : -3, :, 0] == 100)
 
@@ -95,7 +95,7 @@ def test_boxes_stand_at_peaks_best_first():
 def test_people_and_poses_do_not_depend_on_the_batch():
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (90, 130, 3), dtype=np.uint8)
-    # The second has no neighbour: whoever else is asked for, his pose is the same.
+    # The second has no neighbour: the pose is the same whatever other boxes are given.
     boxes = np.array(
         [[85.0, 5.0, 110.0, 80.0], [-8.0, 20.0, 40.0, 120.0], [90.0, 1.0, 112.0, 60.0]]
     )
@@ -148,7 +148,7 @@ def test_whose_box_is_another_than_the_one_given_is_looked_at_again(monkeypatch)
 
 def test_who_has_a_neighbour_is_looked_at_again_and_told_of_him(monkeypatch):
     pose, asked = looks(monkeypatch, lambda boxes: boxes)
-    # Two who share a third, a second box of the first, and somebody apart.
+    # Two people who overlap by a third, a second box of the first, and a separate person.
     boxes = np.array(
         [[0.0, 0.0, 40.0, 80.0], [20.0, 0.0, 60.0, 80.0], [2.0, 0.0, 42.0, 80.0], [90, 0, 130, 80]]
     )

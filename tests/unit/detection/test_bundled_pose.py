@@ -1,4 +1,4 @@
-"""Whom others hide is found beside them, and nobody is found twice."""
+"""Occluded people are found next to the person in front, and no person is found twice."""
 
 import numpy as np
 import pytest
@@ -22,9 +22,9 @@ FAR = FRONT + [300.0, 0.0, 300.0, 0.0]
 
 
 class Told:
-    """Sees of those who are there the one nearest to what is asked for, but nobody it was told of.
+    """Finds the present person nearest to the box, except those given as neighbours.
 
-    Where it was told of everybody it sees whom it was told of.
+    If all are given as neighbours, it finds one of them.
     """
 
     def __init__(self, *there, fit=0.9):
@@ -89,7 +89,7 @@ def test_an_answer_that_is_not_sure_is_none():
 
 
 class Finding:
-    """Finds the one in front; asked about him, it finds whom he hides."""
+    """Finds the person in front; with that one as neighbour, it finds the occluded one."""
 
     view_size = None
 

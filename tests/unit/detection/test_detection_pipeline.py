@@ -66,7 +66,7 @@ def test_players_stay_over_the_touch_line_too_and_the_crowd_goes(camera):
 
 def test_whose_feet_the_border_cuts_off_is_told_by_the_head(camera):
     boxes = boxes_of(camera, np.array([[0.0, -33.0, 0.0], [0.0, -36.0, 0.0]]))
-    height = int(boxes[0, 3]) - 1  # the picture ends at the player's feet
+    height = int(boxes[0, 3]) - 1  # the image ends at the player's feet
     assert boxes[1, 1] < height - 4 < height < boxes[1, 3]
     boxes[:, 3] = height - 1
     # By the border the second would stand at the first one's feet.
@@ -74,7 +74,7 @@ def test_whose_feet_the_border_cuts_off_is_told_by_the_head(camera):
 
 
 class Knowing:
-    """Boxes and keypoints as they are, from the number that a picture carries."""
+    """Boxes and keypoints as they are, from the number that an image carries."""
 
     view_size = None
 

@@ -1,4 +1,4 @@
-"""What nets put out, in pixels of the picture: every known form, by numbers made by hand."""
+"""Outputs of nets in pixels of the image: every known form, with hand-made numbers."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_what_leans_to_one_side_is_set_right_by_the_mirror():
     boxes = np.array([[20.0, 5.0, 100.0, 45.0]])
     poses = FlipTest(Leaning()).estimate(picture, boxes)
     expected = 20.0 + 10.0 * np.arange(17) + (0.8 * 2.0 - 0.4 * 2.0) / 1.2
-    expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the picture
+    expected[9] = 20.0 + 90.0 - 2.0  # seen in the mirror alone, and the other in the image
     expected[10] = 20.0 + 100.0 + 2.0
     np.testing.assert_allclose(poses.keypoints[0, :, 0], expected)
     np.testing.assert_allclose(poses.keypoints[0, :, 1], 5.0)

@@ -35,7 +35,7 @@ def test_an_ensemble_agrees_on_the_mean_weighted_by_score():
 
 
 def test_a_member_never_joins_two_people_of_its_own():
-    # Two people of a duel, whom each member tells apart, and who overlap by half.
+    # Two people in a duel, whom each detector separates, and who overlap by half.
     duel = people([0, 0, 10, 20, 0.9], [3, 0, 13, 20, 0.8])
     assert len(fuse([duel, duel], 0.6).scores) == 2
 
@@ -72,7 +72,7 @@ def test_everybody_is_found_once_and_whole_whichever_view_shows_them():
     found = TiledDetector(Blobs(), (1.0,), view_overlap=0.4, overlap=0.3).detect([picture])[0]
     whole = found.boxes[np.lexsort(found.boxes.T)]
     expected = np.array(true, dtype=np.float64)[np.lexsort(np.array(true).T)]
-    # The whole picture in one view is blurred: it may find a box as well, never another person.
+    # The whole image in one view is blurred: it may find a box as well, never another person.
     assert len(whole) == len(expected)
     assert np.abs(whole - expected).max() <= 4.0
 

@@ -52,7 +52,7 @@ def test_nothing_in_common_is_nan():
 
 def test_a_mirrored_box_is_turned_onto_its_thinnest_side():
     # A mirror and half a turn make a mirror of any axis; that of the thinnest side costs least:
-    # every corner is off by twice its half of 1 m.
+    # every corner has an error of twice its half of 1 m.
     for axis in range(3):
         mirrored = BOX * np.where(np.arange(3) == axis, -1.0, 1.0)
         np.testing.assert_allclose(residuals(mirrored, BOX, False), 2.0, atol=1e-12)

@@ -73,7 +73,7 @@ def test_case_u_a_focal_length_one_per_cent_too_long():
 
 
 def grid_in_view(true):
-    """The default grid on the flat pitch, 2.5 m, within the picture of a camera looking down."""
+    """The default grid on the flat pitch, 2.5 m, within the image of a camera looking down."""
     x, y = np.meshgrid(np.linspace(-52.5, 52.5, 43), np.linspace(-34.0, 34.0, 29), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
     pixels = true.project(points)

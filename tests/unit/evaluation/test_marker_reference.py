@@ -124,7 +124,7 @@ def test_known_error_stays(markers, prediction):
     wrong = JointTracks(prediction.frames, prediction.person_ids, joints)
     reference, _ = align_reference(wrong, markers, RATE, FPS)
     scores, _ = evaluate_joints(wrong, reference)
-    # A shift of everybody by 1/17 of it takes the mean from the others: (48 + ...) / 17 of 50.
+    # A shift of all people by 1/17 of it takes the mean from the others: (48 + ...) / 17 of 50.
     assert scores.mpjpe_mm == pytest.approx((16 / 17 * 50 + 16 * 50 / 17) / 17, rel=0.1)
 
 

@@ -191,7 +191,7 @@ def test_switches_per_minute_count_match_time():
     scores = score(tracks(joints), truth, fps=25.0)
     # One in 10 / 25 s.
     assert (scores.switches, scores.switches_per_minute) == (1, pytest.approx(150.0, rel=1e-12))
-    # Both pieces are the same person: merged, nothing is missing and nothing is off.
+    # Both parts are the same person: merged, nothing is missing and no error is left.
     assert scores.track_coverage == 1.0
     assert scores.g_mpjpe_mm == pytest.approx(0.0, abs=MM)
 
@@ -229,7 +229,7 @@ SIDE_VIEW = Camera(
 
 def test_boxes_match_people_who_are_far_off_along_the_line_of_sight():
     truth = tracks([[person(-4.0), person(4.0)]] * 5)
-    # A tenth nearer to the camera and a tenth smaller: the same picture.
+    # A tenth nearer to the camera and a tenth smaller: the same image.
     center = SIDE_VIEW.center
     prediction = replace(truth, joints=center + 0.9 * (truth.joints - center))
     by_boxes = score(prediction, truth, camera=SIDE_VIEW)

@@ -10,7 +10,7 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 
 SPREAD = 0.015
-"""Of the bodies' joints [m]: what fitting leaves of people whom several cameras see."""
+"""Standard deviation of the bodies' joints [m], for people that several cameras see."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Planted:
         views: the bodies.
         suspects: the detections, taken for the people that they are.
         displaced: (frames, cameras, detections, 17) keypoints put far off.
-        person: (frames, cameras, detections) who each is; -1 = nobody.
+        person: (frames, cameras, detections) person of each; -1 = none.
     """
 
     cameras: Camera

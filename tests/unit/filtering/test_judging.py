@@ -1,4 +1,4 @@
-"""Keypoints and boxes beside bodies: what is put wrong on purpose is found, little else."""
+"""Keypoints and boxes compared with bodies: planted errors are found, and few others."""
 
 from dataclasses import replace
 

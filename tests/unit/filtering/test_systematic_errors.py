@@ -77,7 +77,7 @@ def missed_by(scene, late, noise=0.5):
     cameras, joints = scene.cameras, scene.joints
     rng = np.random.default_rng(3)
     motion = watch_motion(cameras, joints, np.gradient(joints, axis=0))
-    # As adjustment would: people all together stand a little beside where they are.
+    # As after an adjustment: all people have a small common displacement.
     turns = Rigid.from_rotvec(rng.normal(0.0, 0.0005, (len(late), 3)), np.zeros(3)).rotation
     pose = cameras.cam_from_world
     moved = replace(
@@ -126,7 +126,7 @@ def with_a_late_camera(scene, frames, held):
     """The scene's systematic, and what was detected there with a camera of which that is late.
 
     Args:
-        held: share of the lateness that people's offsets hold.
+        held: share of the clock offset in people's offsets.
     """
     motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
     late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
@@ -144,7 +144,7 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     true, motion, suspects = with_a_late_camera(scene, 0.6, held=0.0)
     people = (scene.cameras, scene.joints, scene.views, motion, suspects)
     systematic = learn_systematic_errors(*people, FilteringSettings(), 25.0)
-    # What leans to the sides' account, or to the clocks', leaves less than a tenth of a frame.
+    # The exchange between viewing-angle errors and clocks is below a tenth of a frame.
     late = true.late - true.late.mean()
     np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
     right = suspects.subtract(systematic.shift(motion, scene.views))

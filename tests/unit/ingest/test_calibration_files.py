@@ -50,7 +50,7 @@ grid_count = 20
 fisheye = false
 """
 
-# Stands 10 m up at (1, 2), looks straight down; its picture's right is world x, its up is world y.
+# Stands 10 m up at (1, 2), looks straight down; its image's right is world x, its up is world y.
 QUALISYS = """<?xml version='1.0' encoding='UTF-8'?>
 <calibration created="2024-01-01 10:00:00" type="regular"><!-- wand <!> -->
 <cameras>
@@ -223,7 +223,7 @@ def test_qualisys_camera_projects_as_it_stands(read):
             np.array([point]), cv2.Rodrigues(rotation)[0], t, _matrix(camera), None
         )[0].ravel()
 
-    # 1 m at 10 m distance is a tenth of the focal length; world y is up in the picture.
+    # 1 m at 10 m distance is a tenth of the focal length; world y is up in the image.
     np.testing.assert_allclose(pixel([1.0, 2.0, 0.0]), [960, 540], atol=1e-9)
     np.testing.assert_allclose(pixel([2.0, 2.0, 0.0]), [1060, 540], atol=1e-9)
     np.testing.assert_allclose(pixel([1.0, 3.0, 0.0]), [960, 430], atol=1e-9)

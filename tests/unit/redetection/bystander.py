@@ -1,4 +1,4 @@
-"""People who stand before one camera, by hand: where everything must be is arithmetic."""
+"""People in front of one camera, by hand: all expected positions are arithmetic."""
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def standing(*places):
 
 
 def expected(*places, deviation=0.02):
-    """What the camera should see of them in one frame."""
+    """Expected view of them in one frame."""
     joints = standing(*places)
     covariance = np.broadcast_to(np.eye(3) * deviation**2, (*joints.shape[:3], 3, 3))
     views: BodyViews = view_bodies(Camera.stack([camera()]), joints, covariance)

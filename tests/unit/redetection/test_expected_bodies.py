@@ -1,4 +1,4 @@
-"""Where bodies should be seen, how large, and who hides whom."""
+"""Expected positions, sizes and occlusions of bodies."""
 
 import numpy as np
 from bystander import STANDING, expected
@@ -32,7 +32,7 @@ def test_half_a_body_behind_another_is_half_hidden():
 
 
 def test_people_side_by_side_at_one_depth_hide_nothing_of_one_another():
-    # Which of the two is before the other is not known to a hand's breadth.
+    # The depth order of the two is uncertain.
     assert not expected((0.0, 0.0), (0.1, 0.1)).hidden(0).any()
 
 

@@ -1,4 +1,4 @@
-"""Who is looked for again: whom the camera should show well and does not."""
+"""People to search again: clearly visible ones without a detection."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_who_was_not_detected_is_looked_for_where_the_body_is():
     [
         ((0.0, 40.0), 0.02),  # 31 px high
         ((0.0, 0.0), 0.2),  # may be anybody there
-        ((10.05, 0.0), 0.02),  # at the border: seven joints are in the picture
+        ((10.05, 0.0), 0.02),  # at the border: seven joints are in the image
         ((0.0, -30.0), 0.02),  # behind the camera
     ],
 )
@@ -56,11 +56,11 @@ def test_nobody_is_looked_for_off_the_pitch():
 
 
 def test_seen_is_who_has_a_detection_that_fits_or_that_nobody_could_judge():
-    # Of one frame: tracking's detection of five people, and of each detection whom it fits.
+    # One frame: tracking's detection of five people, and the person that each detection fits.
     index = np.array([[0, 1, 2, -1, 9]])  # 9: found again in the iteration before
     fits = np.array([[0, -1, -1, 3]])
     dropped = np.array([[False, True, False, False]])
-    # Fits; fits nobody; has too few keypoints to tell; nobody's till now; looked for anew.
+    # Fits; fits no person; too few keypoints; unassigned; searched again.
     assert find_detected_people(index, fits, dropped).tolist() == [[True, False, True, True, False]]
 
 

@@ -1,4 +1,4 @@
-"""Whose the answers are: the person's, nobody's, or somebody else's."""
+"""Assignment of results: to the person, to no one, or to another person."""
 
 from dataclasses import replace
 
@@ -130,7 +130,7 @@ def test_every_answer_is_of_one_kind(answers, detected):
 
 
 class Seeing:
-    """Sees everybody in the middle of the box, an arm's keypoints hardly."""
+    """Finds a person in the middle of each box, with low confidence in one arm."""
 
     def estimate(self, picture, boxes):
         middle = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:])
@@ -145,7 +145,7 @@ def test_pictures_are_asked_for_everybody_who_is_sought_in_them():
     sought = replace(sought, frame=np.array([2, 5]))
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     answers = search_missing_people([(2, picture), (3, picture), (5, None)], sought, Seeing(), 0.05)
-    assert np.isnan(answers.keypoints[1]).all()  # a picture that could not be decoded
+    assert np.isnan(answers.keypoints[1]).all()  # an image that could not be decoded
     assert np.flatnonzero(np.isnan(answers.confidence[0])).tolist() == [9]
     middle = 0.5 * (sought.boxes[0, :2] + sought.boxes[0, 2:])
     np.testing.assert_allclose(answers.keypoints[0, 0], middle, atol=1e-12)
@@ -154,7 +154,7 @@ def test_pictures_are_asked_for_everybody_who_is_sought_in_them():
 
 
 class Asked(Seeing):
-    """Keeps whom it was asked about."""
+    """Records the requested boxes."""
 
     def estimate(self, picture, boxes):
         self.boxes = boxes.tolist()

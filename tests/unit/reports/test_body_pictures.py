@@ -39,7 +39,7 @@ def test_a_part_enlarged_shows_the_same_places():
     camera = camera_at()
     points = np.random.default_rng(1).uniform(-5.0, 5.0, (20, 3))
     near = zoom_camera(camera, np.array([99.5, 49.5]), 3.0, (900, 600))
-    # Pixel 100 is the first of the part: its left border is the new picture's.
+    # Pixel 100 is the first of the part: its left border is the new image's.
     expected = (camera.project(points) - np.array([99.5, 49.5])) * 3.0 - 0.5
     np.testing.assert_allclose(near.project(points), expected, atol=1e-9)
 

@@ -1,4 +1,4 @@
-"""Pan, tilt and roll of cameras turned by known angles, and the picture of their course."""
+"""Pan, tilt and roll of cameras rotated by known angles, and their plot."""
 
 import io
 
@@ -77,7 +77,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     after = cameras(turned(), turned())
     # Half a degree in the second frame: all move by 35 px, who is aside by more.
     before = cameras(turned(), turned(tilt=0.5))
-    # The third stands where the picture ends, and is not shown.
+    # The third stands where the image ends, and is not shown.
     tracks = people((0.0, 80.0), (9.0, 80.0), (18.2, 80.0))
     assert largest_pose_changes(before, after, tracks) == (1, 1)
     still = np.full((1080, 1920, 3), 90, np.uint8)

@@ -91,7 +91,7 @@ def test_nobody_detected_and_nobody_found_is_still_a_picture(camera):
 
 
 def painted(camera):
-    """A picture of grass with the markings as the camera has them, 5 px wide."""
+    """An image of grass with the markings as the camera has them, 5 px wide."""
     still = np.full((540, 960, 3), (40, 110, 45), dtype=np.uint8)
     for line in markings(PitchSpec()):
         pixels = camera.project(line)

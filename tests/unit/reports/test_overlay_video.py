@@ -1,4 +1,4 @@
-"""Markings and people drawn over pictures, where their camera has them."""
+"""Markings and people drawn over images, where their camera has them."""
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def test_markings_are_drawn_where_there_is_a_pitch():
 
 
 def standing(places, ids):
-    """People who stand at places (persons, 2) [m] in frame 10 and are gone in frame 11."""
+    """People at positions (persons, 2) [m] in frame 10 and absent in frame 11."""
     model = load_open_body()
     transl = np.full((2, len(ids), 3), np.nan)
     transl[0] = np.concatenate([places, np.full((len(ids), 1), 1.2)], axis=1)
@@ -88,11 +88,11 @@ def standing(places, ids):
 
 
 CLOSE = 3000.0
-"""Focal length [px] at which people are 40 px tall in the half picture."""
+"""Focal length [px] at which people are 40 px tall in the half image."""
 
 
 def middle(place):
-    """Pixel of the half picture where somebody's chest is."""
+    """Pixel of a person's chest in the half-size image."""
     x, y = 0.5 * camera(1, CLOSE)[0].project(np.array([[*place, 1.35]]))[0] - 0.25
     return round(y), round(x)
 

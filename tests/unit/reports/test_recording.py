@@ -37,7 +37,7 @@ def test_recording_has_people_markings_and_cameras(tmp_path):
         path, tracks, 50.0, cameras={"north": camera[0]}, broadcast=camera, pitch=PitchSpec()
     )
     assert "/world/pitch" in printed(path)
-    # The printer cuts long cells: the first end of everybody's first bone is there, frame by frame.
+    # The printer cuts long cells: each person's first bone begins there, by frame.
     starts = re.findall(r"\[\[\[([^\]]+)\]", printed(path, "/world/people"))
     found = np.array([[float(number) for number in start.split(",")] for start in starts])
     np.testing.assert_allclose(found, tracks.joints[:, 0, COCO17_BONES[0][0]], atol=1e-6)
@@ -50,7 +50,7 @@ def test_recording_has_people_markings_and_cameras(tmp_path):
 
 
 def printed(path, place=None):
-    """What the viewer's own program says is in a recording, or at a place of it."""
+    """Return the viewer program's listing of a recording, or of one entity."""
     chosen = () if place is None else ("--entity", place)
     return subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", *chosen, path],

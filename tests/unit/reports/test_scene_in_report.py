@@ -1,4 +1,4 @@
-"""What a page plays is what was found, to half a centimetre."""
+"""The page plays the results, to half a centimetre."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""Whoever nobody looked at is left, the least certain first."""
+"""Unreviewed detections remain, the least certain first."""
 
 from datetime import UTC, datetime
 

@@ -1,4 +1,4 @@
-"""What an annotator changed is found, and nothing else."""
+"""An annotator's changes are found, and nothing else."""
 
 from dataclasses import replace
 

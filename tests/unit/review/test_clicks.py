@@ -233,7 +233,7 @@ def test_what_a_person_does_not_say_is_taken_from_what_they_see(folder):
     assert add_previous_value(folder, edit).was == (1.0, 2.0)
     drawn = RedrawnMarking(camera="a", marking=LINE, xy=())
     assert add_previous_value(folder, drawn).was == ((5.0, 6.0),)
-    # What is said stays: two people may look at different states.
+    # Entries stay: two people may see different states.
     assert add_previous_value(folder, moved((9.0, 9.0), None)).was is None
 
 
@@ -257,7 +257,7 @@ def test_edits_of_one_who_sees_the_present_all_apply(folder, moves):
 
 
 class MemoryBlobs:
-    """What the journal asks of a medium, in memory."""
+    """The journal's storage interface, in memory."""
 
     url = "memory"
 

@@ -44,7 +44,7 @@ def added(detection, frame=FIRST + 1, nose=(3.0, 4.0)):
 
 
 def changed(edit):
-    """What an edit changed, as (name, place) of every value."""
+    """Return the changes of an edit, as (name, index) of every value."""
     found, before = observations(), observations()
     replay = replay_detections(found, [edit])
     assert replay.objections == (None,)

@@ -1,4 +1,4 @@
-"""What was said is kept whole, in order, whatever is killed, cut short or raced."""
+"""The journal keeps entries whole and in order, whatever is killed, truncated or concurrent."""
 
 import threading
 import uuid
@@ -217,7 +217,7 @@ def test_a_writer_that_was_overtaken_writes_nothing(store):
 
 
 def test_many_writers_at_once_lose_and_double_nothing(store):
-    """Each says its ten things one by one, deciding anew when another was quicker."""
+    """Each writes its ten entries one by one, and decides again after a conflict."""
     writers = [
         threading.Thread(
             target=lambda writer: [

@@ -1,4 +1,4 @@
-"""What other cameras say of a keypoint, against points that are known."""
+"""Predictions of a keypoint from other cameras, against known points."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SIZE = np.array([1920, 1080])
 
 
 def camera(center, target, distortion=(-0.25, 0.08, 1e-3, -5e-4, 0.0), focal=1800.0):
-    """A camera that looks at a place, its picture's bottom towards the ground."""
+    """A camera that looks at a place, its image's bottom towards the ground."""
     center, target = np.array(center, dtype=float), np.array(target, dtype=float)
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])

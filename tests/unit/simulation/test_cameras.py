@@ -131,7 +131,7 @@ def grid(spacing):
 
 
 def person_heights(camera, feet):
-    """Pixels from foot to head of people of 1.8 m; NaN where not wholly in the picture."""
+    """Pixels from foot to head of people of 1.8 m; NaN where not wholly in the image."""
     low, high = camera.project(feet), camera.project(feet + UP)
     inside = ((low >= 0) & (low <= [1919, 1079]) & (high >= 0) & (high <= [1919, 1079])).all(-1)
     return np.where(inside, np.linalg.norm(high - low, axis=-1), np.nan)
@@ -150,7 +150,7 @@ def test_every_point_of_the_pitch_is_well_seen_by_four_cameras(seed):
 def test_people_are_40_to_150_px_tall_nearly_wherever_a_camera_looks():
     tall = np.array([person_heights(camera, grid(2.5)) for camera in stadium(0)])
     tall = tall[np.isfinite(tall)]
-    # What lies beyond a camera's own part, across the whole pitch, is smaller.
+    # People beyond a camera's own area, across the pitch, are smaller.
     assert ((tall >= 40.0) & (tall <= 150.0)).mean() > 0.85
     assert tall.min() > 25.0
     assert tall.max() < 160.0

@@ -200,7 +200,7 @@ def test_confidence_is_above_0_and_at_most_1(camera):
 
 
 def test_a_few_joints_at_the_border_are_no_person(camera):
-    # At 20 m the picture ends 9.6 m to the right: the right half of the body stays in.
+    # At 20 m the image ends 9.6 m to the right: the right half of the body stays in.
     person = standing(9.6, 20.0)
     projections = project_bodies(camera, bodies(person))
     inside = int(projections.seen.sum())

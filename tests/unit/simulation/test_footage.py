@@ -83,7 +83,7 @@ def test_boxes_are_opencvs_and_masks_are_under_the_mid_hips(view, cast):
         u, v = np.rint(hip).astype(int)
         assert frame.person_ids[v, u] == person
         rows, columns = np.nonzero(frame.person_ids == person)
-        # What fills half a pixel reaches its border within a pixel.
+        # A shape that fills half a pixel reaches its border within a pixel.
         found = [columns.min(), rows.min(), columns.max(), rows.max()]
         np.testing.assert_allclose(found, expected, atol=1.5)
     np.testing.assert_array_equal(frame.visible, 1.0)

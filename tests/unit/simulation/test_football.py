@@ -156,7 +156,7 @@ def test_the_ball_is_played_by_those_who_are_there(minute):
                 assert np.linalg.norm(place - at) < 3.5
                 kicks += action.motion.name == "kick"
                 headers += action.motion.name == "jump"
-    # 18 touches a minute, of which some find nobody near enough.
+    # 18 touches per minute; for some, no person is near enough.
     assert 6 <= kicks <= 20
     assert headers <= 10
 

@@ -131,7 +131,7 @@ def test_a_tracked_player_is_followed_within_the_smoothing():
 
 
 def write_motion(folder, frames=90):
-    """Write a recording of somebody who stands and swings the left arm."""
+    """Write a recording of a standing person who swings the left arm."""
     names = [options[0] for options in JOINTS.values()]
     places = {
         **{"neck": (0.0, 0.0, 1.45), "chest": (0.0, 0.0, 1.2), "head": (0.0, 0.0, 1.55)},

@@ -204,7 +204,7 @@ TIME = np.arange(0.0, 6.0, 0.1)
 
 
 def tracked(path, **changes):
-    """Somebody who runs along x at 4 m/s, and somebody who stands."""
+    """A person who runs along x at 4 m/s, and a standing one."""
     runner = np.stack([4.0 * TIME - 10.0, 0.0 * TIME + 5.0], axis=-1)
     keeper = np.tile([-50.0, 1.0], (len(TIME), 1))
     content = {"xy": np.stack([runner, keeper], axis=1), "time": TIME + 100.0, **changes}

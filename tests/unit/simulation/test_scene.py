@@ -75,7 +75,7 @@ def test_without_noise_everybody_in_the_picture_is_there_and_nobody_else(exact):
 
 
 def test_views_count_the_cameras_that_saw_a_joint(scene, exact):
-    # Who is before whom does not depend on noise.
+    # The depth order does not depend on noise.
     np.testing.assert_array_equal(scene.truth.views, exact.truth.views)
     assert scene.truth.views.max() <= 6
     # Six cameras around an area that all of them see: nearly everything is seen by many.

@@ -228,7 +228,7 @@ def test_planted_feet_stand_still_from_heel_to_toe(crowd, joints, poses):
     moved, toes = np.concatenate(moved), np.concatenate(toes)
     assert len(moved) > 2000
     assert moved.max() < 1e-4
-    # Who turns by more than hips can, pivots.
+    # A person who turns by more than hips allow, pivots.
     assert (toes < 1e-4).mean() > 0.9
 
 

@@ -28,7 +28,7 @@ def reconstructed(scene, cameras, fps):
 
 
 def from_clicks(scene):
-    """The static cameras by the plain calibration: clicks, without the lines in the pictures."""
+    """The static cameras by the plain calibration: clicks, without the lines in the images."""
     pitch = PitchTemplate.from_spec(scene.surveyed)
     plain = StaticCalibrationSettings(lines=False)
     return Camera.stack(

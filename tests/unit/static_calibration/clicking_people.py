@@ -1,4 +1,4 @@
-"""What a person would click in the picture of a known camera."""
+"""Simulated clicks in the image of a known camera."""
 
 from types import SimpleNamespace
 
@@ -15,14 +15,14 @@ PITCH = PitchTemplate.standard()
 
 
 def seat(index: int, seed: int = 0):
-    """A camera of the synthetic stadium, and the generator that goes on from it."""
+    """A camera of the synthetic stadium, and the generator that continues from it."""
     rng = np.random.default_rng([seed, index])
     rig = SCENARIOS["match"].rig
     return place_camera(rig, index, np.zeros(3), PitchSpec(), rng), rng
 
 
 def visible(camera, names=None):
-    """Pixels by name of the template's points that the camera sees well inside its picture."""
+    """Pixels by name of the template's points that the camera sees well inside its image."""
     names = list(PITCH.points) if names is None else names
     pixels = camera.project(PITCH.positions(names))
     inside = np.isfinite(pixels).all(axis=1)

@@ -41,7 +41,7 @@ def test_points_on_one_line_are_an_error_and_the_message_names_points_off_it():
     assert len(seen) == 4
     with pytest.raises(InputError, match="all on one line") as error:
         of(people.points(seen))
-    # Nothing that is asked for lies on a goal line.
+    # No requested point lies on a goal line.
     assert "back" not in error.value.todo
 
 
@@ -186,7 +186,7 @@ def test_the_expected_ground_error_is_that_of_repeated_clicks():
         expected.append(known.expected[row, column])
     rms = float(np.sqrt(np.mean(np.square(errors))))
     # 40 draws of two dimensions tell an rms to 1 / sqrt(2 x 80) = 8 %; the prior is wider than
-    # the truth is off, and the nearest grid place is up to 1.4 m away.
+    # the truth lies off the grid, up to 1.4 m from the nearest grid place.
     assert rms == pytest.approx(np.median(expected), rel=0.3)
 
 

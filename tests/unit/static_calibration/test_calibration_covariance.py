@@ -28,7 +28,7 @@ def share_inside(
         clicks: what is clicked.
         cameras: how many at least.
         stated: noise of a click that calibration is told [px].
-        lines: refine on the lines of a picture, too.
+        lines: refine on the lines of an image, too.
     """
     rig, crowd = SCENARIOS[scenario].rig, SCENARIOS[scenario].crowd
     x, y = crowd.area_center_m

@@ -1,4 +1,4 @@
-"""When clicks contradict each other too much for any camera, and what is said of one given."""
+"""Clicks that contradict each other too much for any camera, and the messages about them."""
 
 from types import SimpleNamespace
 

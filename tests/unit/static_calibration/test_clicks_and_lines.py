@@ -1,4 +1,4 @@
-"""Clicks that are worse than stated, or wrong, before a picture whose lines tell."""
+"""Clicks that are worse than stated, or wrong, before an image whose lines tell."""
 
 import clicking_people as people
 import numpy as np

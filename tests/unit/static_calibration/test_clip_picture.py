@@ -1,4 +1,4 @@
-"""The median of frames in which somebody walks."""
+"""The median of frames with a walking person."""
 
 import tracemalloc
 

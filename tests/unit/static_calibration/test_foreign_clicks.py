@@ -22,7 +22,7 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
 def cameras(count, clicks, noise, first=0, **lens):
-    """Yield cameras with clicks, and a generator that goes on."""
+    """Yield cameras with clicks, and a generator that continues."""
     found = 0
     for seed in range(first, first + 20 * count):
         rng = np.random.default_rng([seed, 77])

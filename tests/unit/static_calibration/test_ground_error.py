@@ -1,4 +1,4 @@
-"""Which points to click next."""
+"""Points to click next."""
 
 import numpy as np
 from clicking_people import PITCH, seat, visible

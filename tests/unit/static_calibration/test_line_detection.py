@@ -1,4 +1,4 @@
-"""Bars in pictures drawn here by area coverage, so that their middles are exact."""
+"""Bars in images drawn here by area coverage, so that their middles are exact."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from worldpose.static_calibration.line_detection import (
 
 
 def bars(middle, width, *, left=80.0, right=80.0, paint=200.0, shape=(40, 80)):
-    """A picture with a vertical bar: the mean of what each pixel covers, through a sharp lens."""
+    """An image with a vertical bar: the mean of what each pixel covers, through a sharp lens."""
     low, high = middle - 0.5 * width, middle + 0.5 * width
     x = np.arange(shape[1])
     before = np.clip(low - (x - 0.5), 0.0, 1.0)

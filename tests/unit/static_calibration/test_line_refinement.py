@@ -1,4 +1,4 @@
-"""Line refinement against the camera that a picture was rendered with."""
+"""Line refinement against the camera that an image was rendered with."""
 
 from dataclasses import replace
 from functools import cache
@@ -67,7 +67,7 @@ def start(seed, factor=1.0, true=None):
 
 
 def line_error(estimate, true=None):
-    """Root mean square over the markings in the picture [px]."""
+    """Root mean square over the markings in the image [px]."""
     true = true or camera()
     points = PITCH.sample_lines(1.0).points_world
     pixels = true.project(points)
@@ -83,7 +83,7 @@ def test_start_pixels_off_comes_to_a_fraction_of_one(light):
         found = refine_on_lines(first, PITCH, picture(light=light), survey_error=EXACT)
         assert line_error(first) > 2.0
         assert found.refined
-        # Along lines a picture of a few tells less than across: the bar is 0.25 px.
+        # Along lines an image of a few tells less than across: the bar is 0.25 px.
         assert line_error(found.estimate) < 0.25
         assert found.rms < 0.25
 
@@ -173,7 +173,7 @@ def test_covariance_holds_the_truth_and_says_more_than_the_start():
         gained = np.linalg.eigvalsh(first.covariance[:11, :11] - covariance)
         # A principal point may be told a little less after the turn: rounding of the linear step.
         assert gained.min() > -0.02 * np.diag(first.covariance).max()
-    # Mean of chi-square with 11 degrees of freedom is 11; of 12 starts with one picture, below 17
+    # Mean of chi-square with 11 degrees of freedom is 11; of 12 starts with one image, below 17
     # in all but one case of ten thousand. The template is exact here, which makes it smaller.
     assert np.mean(distances) < 17.0
 
@@ -243,7 +243,7 @@ def test_curvature_is_that_of_the_projected_arc():
 
 
 def test_samples_near_other_markings_and_the_goal_are_left_out():
-    # From behind the goal the crossbar crosses the goal area's front in the picture only.
+    # From behind the goal the crossbar crosses the goal area's front in the image only.
     view = replace(
         camera(),
         cam_from_world=look_at(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),

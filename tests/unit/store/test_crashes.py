@@ -40,7 +40,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 def check_never_half(store: Store) -> None:
-    """What a reader can see is whole and right."""
+    """All visible results are complete and correct."""
     assert verify(store) == ()
     for result in store.results():
         data = store.open_result(result.match_id, result.stage, result.unit, result.key)

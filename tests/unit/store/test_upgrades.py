@@ -1,4 +1,4 @@
-"""What another version of worldpose wrote opens, or is refused with the reason."""
+"""Projects of another version of worldpose open, or are refused with the reason."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_store_of_another_format_is_refused_before_anything_is_read(folder_sto
 
 
 def test_a_run_that_an_earlier_version_recorded_opens(folder_store: Store) -> None:
-    # What a failed unit's key, gates, questions and iterations were added to.
+    # Records before a failed unit's key, gates, questions and iterations existed.
     failure = UnitFailure(unit="tracking/late", error="StoreError", message="x")
     recipe = sample_recipe()
     publish(folder_store, recipe)

@@ -1,4 +1,4 @@
-"""Each reason for finding no person is told from the detections, with its numbers."""
+"""Each reason for finding no person is diagnosed from the detections, with numbers."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""People whom exactly two cameras show: what speaks for a pair of detections, and what against."""
+"""People in exactly two cameras: evidence for and against a pair of detections."""
 
 import numpy as np
 import pytest
@@ -124,7 +124,7 @@ def test_people_out_of_proportion_have_lower_odds(people):
 
 
 def known_sight(cameras, frames=98):
-    """What cameras are like that have shown somebody, everywhere they look, in every frame."""
+    """Statistics of cameras that detected a person everywhere in view, in every frame."""
     visibility = CameraVisibility(cameras)
     visibility.reach[:] = 40.0
     visibility.shown[:], visibility.missed[:] = frames, 0.0
@@ -180,7 +180,7 @@ def test_sight_learns_how_often_a_camera_misses_and_how_far_it_sees(people):
         visibility.learn(body, directions, weights, np.array(show, dtype=bool))
     middle = body.mean(axis=1)[0]
     np.testing.assert_allclose(visibility.reach, np.linalg.norm(cameras.center - middle, axis=1))
-    # Until frame 1 the third had shown nobody, so frame 0 does not count.
+    # Until frame 1 the third had no detection, so frame 0 does not count.
     assert visibility.shown.tolist() == [10, 10, 9]
     assert visibility.missed.tolist() == [0, 0, 4]
 

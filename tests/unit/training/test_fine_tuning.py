@@ -11,7 +11,7 @@ from worldpose.training.settings import Refinement
 
 
 def pictures(folder, count, people=1):
-    """Small grey pictures of a bright person each."""
+    """Small grey images of a bright person each."""
     made = []
     for number in range(count):
         path = folder / f"{number:03d}.png"
@@ -81,5 +81,5 @@ def test_both_nets_learn_from_the_footage_nearly_as_it_is(tmp_path, monkeypatch,
     monkeypatch.setattr(fine_tuning, name, recorded(getattr(fine_tuning, name)))
     settings = FineTuningSettings(training=Refinement(steps=1))
     fine_tune(kind, pictures(tmp_path, 8), tmp_path / "new.safetensors", settings)
-    # Fog, grey pictures and strong colours of others would be learned in place of this footage.
+    # Fog, grey images and strong colours would replace this footage.
     assert looks == [MILD] and MILD.fog == MILD.grey == 0.0 and MILD.strength < 0.5

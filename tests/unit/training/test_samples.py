@@ -32,7 +32,7 @@ NOSE, LEFT_EAR, RIGHT_EAR = 0, 3, 4
 
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory):
-    """A grey picture of one box of 60 x 120 px: a red left ear and a blue right one."""
+    """A grey image of one box of 60 x 120 px: a red left ear and a blue right one."""
     path: Path = tmp_path_factory.mktemp("pictures") / "a.png"
     picture = np.full((300, 400, 3), 60, dtype=np.uint8)
     left, right = (230, 120), (190, 150)

@@ -79,7 +79,7 @@ def test_people_of_other_heights_do_not_count():
 
 
 def test_pictures_share_one_ranking():
-    # The wrong box of the second picture is the surest of both.
+    # The wrong box of the second image is the surest of both.
     said = [found([NEAR], [0.5]), found([AWAY], [0.9])]
     assert average_precision(said, [truth([NEAR]), truth([])]) == pytest.approx(0.5)
 

@@ -22,7 +22,7 @@ def simulated(seed, people=8):
     """Cameras, arrays and the truth of a short stretch of the match."""
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": people})
-    # What all views share would hide whether the noise is honest.
+    # The common bias of all views would hide whether the noise is honest.
     noise = scenario.noise.model_copy(update={"shared_bias_m": 0.0, "own_bias_m": 0.0})
     changes = {"duration": 0.8, "crowd": crowd, "broadcast": None, "noise": noise}
     return arrays_of(simulate_scene(scenario.model_copy(update=changes), seed), people)

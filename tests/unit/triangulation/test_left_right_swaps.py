@@ -134,6 +134,6 @@ def test_an_exchange_needs_as_much_evidence_as_it_is_rare(aside, legs_fit, parts
     )
     index, noise = np.zeros((1, 1, 1), np.int64), (1.0, 0.0)
     observed = Observations.from_rig(Rig.from_cameras(camera), keypoints, precision, index)
-    # The square of how far it is off, less that with sides exchanged, neither beyond 25.
+    # The squared residual, minus that with sides swapped, both at most 25.
     flags = find_swaps(observed, noise, 25.0, found)
     assert np.flatnonzero(flags).tolist() == parts

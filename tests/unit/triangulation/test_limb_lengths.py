@@ -23,7 +23,7 @@ BAD = 7
 
 
 def walker(frames=12):
-    """Joints (frames, 1, 17, 3) of somebody who walks 2 cm a frame and keeps his pose."""
+    """Joints (frames, 1, 17, 3) of a person who moves 2 cm per frame in a fixed pose."""
     body = np.zeros((17, 3))
     body[:5] = [0.1, 0.0, 1.7]
     for side, (shoulder, elbow, wrist, hip, knee, ankle) in (

@@ -1,4 +1,4 @@
-"""A camera with a NaN is missing: the others place everybody as if it were not there."""
+"""A camera with NaN is missing: the others place all people as if it were absent."""
 
 from dataclasses import replace
 

@@ -128,7 +128,7 @@ def test_given_camera_covariance_widens_that_of_the_joints(ring):
     error = result.joints - joints
     inverse = np.linalg.inv(result.covariance)
     squared = np.einsum("...i,...ij,...j->...", error, inverse, error)
-    # One draw of six cameras moves everybody alike: the mean of three chi squares, wide.
+    # One draw of six cameras moves all people alike: the mean of three chi squares, wide.
     assert 0.3 < squared.mean() < 9.0
 
 

@@ -218,13 +218,13 @@ def test_twice_the_pixel_noise_is_four_times_the_covariance(ring, seen):
 
 
 def test_joint_noise_is_in_metres(ring, seen):
-    # Noise that grows with the picture of a person has the same effect near and far: two
+    # Noise that grows with the image of a person has the same effect near and far: two
     # crossing rays with 5 cm across each give 5 cm in the plane of both.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
     metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
     result = triangulate_joints(cameras, TrackedDetections(*seen(cameras, joint)), metric)
-    # x and y by one ray each, z by both. The point is 13 degrees off axis, where the picture is
+    # x and y by one ray each, z by both. The point is 13 degrees off axis, where the image is
     # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
     np.testing.assert_allclose(
         result.covariance[0, 0, 0], np.diag([0.05**2, 0.05**2, 0.05**2 / 2]), rtol=0.06, atol=4e-6

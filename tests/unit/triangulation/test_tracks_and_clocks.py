@@ -102,7 +102,7 @@ def test_single_frame_and_no_joint_are_passed_through(ring):
 
 
 def late_detections(camera, frames, late, noise=1.0, seed=0):
-    """What cameras see whose frame t shows the time t + late."""
+    """Return the views of cameras whose frame t shows the time t + late."""
     views = [
         detections(camera[c : c + 1], runner_at(np.arange(frames) + d), noise, seed=seed + c)
         for c, d in enumerate(late)
@@ -191,7 +191,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     [
         # They say 3, -1 and 1, together 1: a third each, which leaves 2, -2 and 0 of 1 - 1/3.
         ([100.0, 100.0, 100.0], [3.0, -1.0, 1.0], np.sqrt(2.0) * 100.0 * 2.0 / (2.0 / 3.0)),
-        # 1, 0 and 0, together 0.6; who has more than half the say is taken to have half.
+        # 1, 0 and 0, together 0.6; a weight above half counts as half.
         ([180.0, 60.0, 60.0], [1.0, 0.0, 0.0], np.hypot(180.0 * 0.4 / 0.5, np.sqrt(2.0) * 45.0)),
     ],
 )
@@ -201,7 +201,7 @@ def test_a_clock_errs_by_what_each_person_misses_the_others_by(
     weights = np.array(weights)
     information = np.zeros((3, 2, 2))
     information[:, 0, 0] = information[:, 1, 1] = weights
-    # Before the first camera alone does anybody say anything.
+    # Only in front of the first camera there is evidence.
     score = np.stack([weights * seen, np.zeros(3)], axis=-1)
     sums = _Sums(information, score, np.zeros(2), np.zeros(2), np.zeros(2))
     monkeypatch.setattr("worldpose.triangulation.clocks._sum_equations", lambda *_: sums)

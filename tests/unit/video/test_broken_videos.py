@@ -15,7 +15,7 @@ SIZE = (48, 64)
 
 
 def numbered(count):
-    """Grey pictures whose left half tells their number in steps of 4, the codec's error below 2."""
+    """Grey images whose left half tells their number in steps of 4, the codec's error below 2."""
     pictures = np.full((count, *SIZE, 3), 128, dtype=np.uint8)
     pictures[:, :, :32] = (10 + 4 * np.arange(count, dtype=np.uint8))[:, None, None, None]
     return pictures
@@ -101,7 +101,7 @@ def test_a_file_cut_off_ends_early_and_says_where(tmp_path):
     good = [number for number, found in read if found is not None]
     assert 10 <= len(good) < 50
     assert all(found == number for number, found in read if found is not None)
-    # What is whole on disk is whole: nothing before the cut is lost but the last group's rest.
+    # Complete data on disk is read: only the rest of the last group before the cut is lost.
     assert good[: len(good) // 10 * 10] == list(range(len(good) // 10 * 10))
 
 

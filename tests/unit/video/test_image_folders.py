@@ -1,4 +1,4 @@
-"""A folder of images gives single pictures as a video does."""
+"""A folder of images gives single images as a video does."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Some pictures of a video: the same ones as in passing, without decoding all of it."""
+"""Some images of a video: the same as by decoding all of it, without doing so."""
 
 import numpy as np
 from test_broken_videos import encode, number_of
@@ -17,7 +17,7 @@ def test_a_jump_is_made_to_the_key_frame_before_a_picture_where_that_saves_many(
     keys = [0, 20, 40, 60]
     assert groups([3, 4, 45], keys) == [[3, 4], [45]]
     assert groups([3, 12, 19], keys) == [[3, 12, 19]]  # no key frame between
-    assert groups([18, 22], keys) == [[18, 22]]  # one picture is not worth it
+    assert groups([18, 22], keys) == [[18, 22]]  # one image is not worth it
     assert groups([0, 61, 99], keys) == [[0], [61, 99]]
     assert groups([], keys) == []
     assert groups([7, 90], [5]) == [[7, 90]]  # the only place to begin is behind

@@ -13,7 +13,7 @@ SIZE = (48, 64)
 
 
 def numbered(count):
-    """Pictures whose grey level tells their number; 4 levels are more than the codec's error."""
+    """Images whose grey level tells their number; 4 levels are more than the codec's error."""
     return [np.full((*SIZE, 3), 10 + 4 * n, dtype=np.uint8) for n in range(count)]
 
 

@@ -1,4 +1,4 @@
-"""What is written comes back as it was, and what is not as it must be is refused with a reason."""
+"""Written files are read unchanged, and invalid files are refused with a reason."""
 
 import json
 from dataclasses import fields
@@ -68,7 +68,7 @@ def test_every_bit_comes_back(tmp_path_factory, form, seed):
 
 
 def test_formats_count_from_where_their_annotators_do(tmp_path):
-    """A keypoint at the centre of the first pixel, in a picture of 200 x 100."""
+    """A keypoint at the centre of the first pixel, in an image of 200 x 100."""
     keypoints, visible = np.full((17, 2), np.nan), np.zeros(17, dtype=np.int8)
     keypoints[0], visible[0] = 0.0, 2
     one = AnnotatedPerson(np.array([0.0, 0.0, 20.0, 10.0]), keypoints, visible)

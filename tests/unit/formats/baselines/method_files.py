@@ -15,7 +15,7 @@ from worldpose.geometry import Camera, Rigid
 
 FRAMES, PEOPLE, WALK = 16, 2, 8.0
 FIRST = 40
-"""Match frame of the clip's first picture."""
+"""Match frame of the clip's first image."""
 STEP = 0.01
 """Everybody is this far too high or too low by turns [m]."""
 # Summed over any four frames it is zero, and so is its product with time: neither shift nor
@@ -241,7 +241,7 @@ def write_wham(folder, bodies, camera):
 
     seen = in_camera(bodies, camera)
     results = defaultdict(dict)
-    # The method takes the picture's diagonal for its focal length: the depth follows.
+    # The method takes the image's diagonal for its focal length: the depth follows.
     deeper = np.hypot(1920, 1080) / 3000.0
     hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
     for person in range(PEOPLE):
@@ -326,7 +326,7 @@ def write_prompthmr(folder, bodies, camera):
         people[person + 1] = {
             "frames": np.arange(FRAMES),
             "track_id": person + 1,
-            "bboxes": boxes[person] / 2.0,  # its pictures are smaller
+            "bboxes": boxes[person] / 2.0,  # its images are smaller
             "smplx_world": {
                 "pose": single(pose),
                 "shape": single(np.ones((FRAMES, 10))),

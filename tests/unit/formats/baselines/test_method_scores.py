@@ -30,7 +30,7 @@ from worldpose.formats.baselines import METHODS
 
 LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
 NOT_SEEN = "smpl"
-"""Its file says nothing about the picture: it is matched by its paths."""
+"""Its file says nothing about the image: it is matched by its paths."""
 
 
 @pytest.fixture(scope="module")

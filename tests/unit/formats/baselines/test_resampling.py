@@ -13,7 +13,7 @@ from worldpose.formats.baselines import MethodResult, resample_result
 
 
 def straight(frames, speed, persons=1):
-    """Who moves along x by so much in each picture."""
+    """A person who moves along x by so much in each image."""
     joints = np.zeros((len(frames), persons, 17, 3))
     joints[..., 0] = speed * np.asarray(frames)[:, None, None]
     boxes = np.repeat(joints[:, :, 0, :1], 4, axis=-1)
@@ -56,7 +56,7 @@ def test_a_person_who_is_missing_in_one_of_two_pictures_is_missing_between_them(
 
 def test_a_file_of_every_second_picture_scores_as_one_of_all(tmp_path):
     bodies, camera = scene()
-    # Rigid bodies on straight ways: what lies between two pictures is known exactly.
+    # Rigid bodies on straight ways: what lies between two images is known exactly.
     still = BodyParameters(
         bodies.betas,
         np.repeat(bodies.global_orient[:, :1], FRAMES, axis=1),
@@ -68,7 +68,7 @@ def test_a_file_of_every_second_picture_scores_as_one_of_all(tmp_path):
     half = still[:, ::2]
     path = WRITERS["smpl"](tmp_path / "out", half, camera)
     (score,) = score_methods([f"smpl={path}"], str(tmp_path), fps=50.0, seen_fps={"smpl": 25.0})
-    # All but the last frame, which lies behind the last picture of the half.
+    # All but the last frame, which lies behind the last image of the half.
     assert score.evaluation.g_mpjpe_mm == pytest.approx(0.0, abs=0.01)
     assert score.notes["resampled"] == "from 25 to 50 images per second, by linear interpolation"
     with pytest.raises(UsageError, match="--method-fps tram"):
