@@ -114,7 +114,7 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     figures |= {
         "jerk over the truth's": jerk(fit.joints, scenario.fps) / jerk(truth, scenario.fps),
         "standing feet, height [mm]": 1e3 * float(np.nanmedian(above)),
-        "standing feet, skating [mm a frame]": 1e3 * float(np.nanmedian(slides)),
+        "standing feet, skating [mm per frame]": 1e3 * float(np.nanmedian(slides)),
         "height of people [mm]": 1e3 * float(np.median([abs(a[0] - b[0]) for a, b in shapes])),
         "limbs [mm]": 1e3 * float(np.median([np.abs(a[1] - b[1]) for a, b in shapes])),
         "upper arm over time, spread [mm]": 1e3 * float(np.nanmax(spread)),

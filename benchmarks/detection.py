@@ -80,7 +80,7 @@ def main() -> None:
         hours = each * MATCH_FRAMES / 3600.0
         print(
             f"match, stride {stride}: {hours:.0f} core hours, {hours / 2:.0f} h on 2 cores, "
-            f"{hours / 16:.1f} h on 16, at {persons / count:.1f} people a picture"
+            f"{hours / 16:.1f} h on 16, at {persons / count:.1f} people per image"
         )
 
 

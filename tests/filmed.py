@@ -11,7 +11,7 @@ SIZE = (64, 48)
 
 
 def write_filmed(folder, greys, clips, *, offsets=None):
-    """Write the match folder of a match called filmed, at 25 frames a second.
+    """Write the match folder of a match called filmed, at 25 frames per second.
 
     Args:
         folder: to be made.

@@ -18,7 +18,7 @@ _BODIES = {
     "residual_m": ("body from joints mm", 1000.0, 1),
     "reprojection_px": ("body from keypoints px", 1.0, 2),
     "bone_spread_m": ("bones change by mm", 1000.0, 1),
-    "skating_m": ("standing feet slide mm a frame", 1000.0, 3),
+    "skating_m": ("standing feet slide mm per frame", 1000.0, 3),
     "jerk_m_s3": ("jerk m/s³", 1.0, 0),
 }
 """Title of each body metric, its display factor, and decimals."""

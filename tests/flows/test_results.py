@@ -24,7 +24,7 @@ def test_figures_against_truth(tiny, tiny_run):
         *("evaluate", "--prediction", tiny, "--reference", tiny / "reference"),
         *("--project", tiny_run, "--json"),
     ).json
-    # Noise of a few pixels at 115 px a person, averaged over six views: seen 29 mm.
+    # Noise of a few pixels at 115 px per person, averaged over six views: seen 29 mm.
     assert 5 < figures["mpjpe_mm"] < 60
     assert figures["pcp3d"] > 97
     assert figures["coverage"] == 1

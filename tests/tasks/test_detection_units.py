@@ -168,7 +168,7 @@ def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp
     text = (filmed / "match.yaml").read_text()
     for old, new, told in (
         ("width: 64", "width: 66", "66 x 48 px"),
-        ("fps: 25.0", "fps: 50.0", "50 frames a second"),
+        ("fps: 25.0", "fps: 50.0", "50 frames per second"),
         ("first_frame: 20", "first_frame: 60", "frames 60 to 69"),
     ):
         assert old in text

@@ -95,7 +95,7 @@ class FrameIndex:
         if self.time_base is not None and odd > RATE_SLACK * max(len(picture), len(slot)):
             raise InputError(
                 where,
-                expected=f"{fps:g} frames a second, the rate in match.yaml",
+                expected=f"{fps:g} frames per second, the rate in match.yaml",
                 found=f"{self.fps:.4g}",
                 todo="Correct fps in match.yaml, or convert the video to that rate.",
             )

@@ -40,7 +40,7 @@ def test_the_offset_is_found_within_half_a_frame(late):
     camera, moving = people(late, 5.0, np.random.default_rng(1))
     found = estimate_feed_offset(camera, moving, reach=10.0)
     assert found.determined
-    # A runner goes 0.1 m a frame, 2 px; 8 people of 17 joints at 1 px.
+    # A runner goes 0.1 m per frame, 2 px; 8 people of 17 joints at 1 px.
     assert found.frames == pytest.approx(late, abs=0.2)
 
 

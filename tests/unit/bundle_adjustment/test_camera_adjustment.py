@@ -31,7 +31,7 @@ def test_people_bring_cameras_together(clip):
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     assert adjusted.converged
-    # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints a camera leave;
+    # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
     # what all cameras share stays as calibration has it.
     assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
     assert (adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]).all()

@@ -45,7 +45,7 @@ def test_a_bias_that_goes_with_the_side_is_found():
     misses, *seen = seen_from_all_sides(bias.shift)
     misses.missed[:1000, 3] = np.nan
     found = learn_view_bias(misses, *seen)
-    # 1 px at 55 px a metre over 3,000 rows: 0.5 mm; five of these.
+    # 1 px at 55 px per metre over 3,000 rows: 0.5 mm; five of these.
     np.testing.assert_allclose(found.coefficient, bias.coefficient, atol=0.0025)
 
 

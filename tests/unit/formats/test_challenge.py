@@ -111,7 +111,7 @@ def test_a_skeleton_put_back_by_the_camera_is_the_submission(truth, camera):
 
 def test_a_box_is_cut_at_the_pictures_edge(model, camera):
     edge = BodyParameters(np.zeros(10), np.array([np.pi / 2, 0, 0]), np.zeros(69), np.zeros(3))
-    # 4000 px / 71 m is 56 px a metre: the image's edge lies 17 m beside the centre spot.
+    # 4000 px / 71 m is 56 px per metre: the image's edge lies 17 m beside the centre spot.
     shifted = BodyParameters(
         edge.betas, edge.global_orient, edge.body_pose, np.array([[[17.0, 0.0, 1.1]] * FRAMES])
     )

@@ -6,7 +6,7 @@ from bystander import STANDING, expected
 
 def test_a_box_goes_from_the_top_of_the_head_to_the_soles():
     (box,) = expected((0.0, 0.0)).boxes[0]
-    # 50 px a metre; the camera is 1 m high. Joints end at 1.63 and 0.10 m and at 0.33 m aside.
+    # 50 px per metre; the camera is 1 m high. Joints end at 1.63 and 0.10 m and at 0.33 m aside.
     np.testing.assert_allclose(box[[0, 2]], 499.5 + 50.0 * np.array([-0.45, 0.45]), atol=1e-9)
     np.testing.assert_allclose(box[[1, 3]], 299.5 - 50.0 * np.array([0.83, -1.0]), atol=1e-9)
 

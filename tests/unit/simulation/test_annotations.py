@@ -114,7 +114,7 @@ def test_lines_are_drawn_where_points_are_few(camera):
         assert 2 <= len(marking.xy) <= 8
         line = samples.points_world[samples.marking == samples.names.index(marking.name)]
         gap = np.linalg.norm(camera.project(line) - np.array(marking.xy)[:, None], axis=-1)
-        # Samples 2 cm apart are up to half a pixel apart at 30 px a metre.
+        # Samples 2 cm apart are up to half a pixel apart at 30 px per metre.
         assert gap.min(axis=1).max() < 0.5
 
 

@@ -55,7 +55,7 @@ def test_the_lens_is_that_of_the_released_clips(camera):
 
 def test_zooms_are_as_quick_as_operators_zoom(camera):
     step = np.abs(np.diff(camera.focal[:, 0]))
-    # The clips' 95th percentile is 4 to 20 px a frame.
+    # The clips' 95th percentile is 4 to 20 px per frame.
     assert 2.0 < np.percentile(step, 95) < 24.0
 
 

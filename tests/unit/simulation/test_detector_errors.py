@@ -28,7 +28,7 @@ FRAMES = 2000
 
 @pytest.fixture
 def camera():
-    """At the origin, looks along y, x to the right, z up, 100 px a metre at 20 m."""
+    """At the origin, looks along y, x to the right, z up, 100 px per metre at 20 m."""
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     return Camera(
         focal=np.array([2000.0, 2000.0]),
@@ -69,7 +69,7 @@ def detected(camera, noise, *people, frames=FRAMES):
 
 def test_pixels_and_size_of_a_person_straight_ahead(camera):
     projections = project_bodies(camera, bodies(standing(0.0, 20.0)))
-    # Left ankle: 0.1 m to the right, 0.9 m down, at 100 px a metre.
+    # Left ankle: 0.1 m to the right, 0.9 m down, at 100 px per metre.
     assert projections.keypoints[0, 0, 15].tolist() == pytest.approx([969.5, 629.5], abs=1e-9)
     assert projections.size[0, 0] == pytest.approx(180.0, abs=1e-9)
     assert projections.seen.all()
@@ -88,7 +88,7 @@ def test_people_side_by_side_hide_nothing(camera):
 
 def test_half_a_body_width_apart_hides_the_covered_joints_only(camera):
     # The nearer person covers 0.2 m + a third of 0.4 m to either side of x = 0: up to 33 px.
-    # The farther one stands at 25 px of its own 50 px a metre: its near side lies within.
+    # The farther one stands at 25 px of its own 50 px per metre: its near side lies within.
     projections = project_bodies(camera, bodies(standing(0.5, 40.0), standing(0.0, 20.0)))
     u = projections.keypoints[0, 0, :, 0] - 959.5
     np.testing.assert_array_equal(projections.hidden[0, 0], u <= 100 * (0.2 + 0.4 / 3))
@@ -280,7 +280,7 @@ def test_bias_shifts_what_is_reported_but_not_what_is_seen(camera):
     projections, plain = project_bodies(camera, shifted), project_bodies(camera, people)
     np.testing.assert_array_equal(projections.keypoints, plain.keypoints)
     found = detect(projections, ObservationNoise.none(), EVEN, FPS, rngs(1))
-    # 0.1 m at 100 px a metre.
+    # 0.1 m at 100 px per metre.
     np.testing.assert_allclose(
         found.keypoints - projections.keypoints, [[[[10.0, 0.0]] * 17]], atol=1e-9
     )

@@ -326,7 +326,7 @@ def test_a_main_camera_built_into_its_stand_or_above_it_sees_the_far_stand(heigh
     start = [0.0, -75.0, height]  # the near stand is 18.2 m high there
     color, distance = look(start, [0.0, 60.0, 9.9])
     assert min(color) >= 0.0
-    # Rows rise 0.55 m a metre from 42 m behind the middle: 9.9 m high 60 m behind it.
+    # Rows rise 0.55 m per metre from 42 m behind the middle: 9.9 m high 60 m behind it.
     assert distance == pytest.approx(np.linalg.norm([135.0, height - 9.9]), abs=1e-6)
 
 

@@ -211,4 +211,4 @@ def test_all_bias_and_no_noise_is_the_same_in_all_frames_for_who_stands():
     # float32 pixels.
     assert np.ptp(steady, axis=0).max() < 2e-4
     truth = scene.cameras["cam00"].project(scene.truth.joints[0, 0, 5:])
-    assert 0.5 < np.abs(steady[0] - truth).max() < 12.0  # 3 cm at 64 px a metre and 3 sigma
+    assert 0.5 < np.abs(steady[0] - truth).max() < 12.0  # 3 cm at 64 px per metre and 3 sigma

@@ -87,7 +87,7 @@ def test_people_who_cross_keep_their_identity(ring, people, seen, fps):
 
 
 def test_prediction_carries_a_sprinter_through_a_low_frame_rate(ring, people, seen):
-    # From standing to 8 m/s at 5 m/s^2, at 10 frames a second: in the end 0.8 m a frame, beyond
+    # From standing to 8 m/s at 5 m/s^2, at 10 frames per second: in the end 0.8 m per frame, beyond
     # the gate, but the change from frame to frame is 5 cm.
     time = np.arange(0.0, 2.4, 0.1)
     run = np.where(time < 1.6, 2.5 * time**2, 6.4 + 8.0 * (time - 1.6)) - 7.0

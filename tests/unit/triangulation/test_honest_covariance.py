@@ -45,7 +45,7 @@ def squared_deviations(result, truth):
 
 
 def two_views_each(index, rng):
-    """Keep two cameras a person, of those that see him nearly always."""
+    """Keep two cameras per person, of those that see him nearly always."""
     index = index.copy()
     for person in range(index.shape[2]):
         always = np.flatnonzero((index[:, :, person] >= 0).mean(axis=0) > 0.8)

@@ -76,7 +76,7 @@ def test_uneven_times_count_for_the_nearest_frame(tmp_path):
 
 def test_a_video_of_another_rate_is_refused(tmp_path):
     index = index_video(encode(tmp_path / "slow.mp4", 80 * np.arange(20)))
-    with pytest.raises(InputError, match="25 frames a second"):
+    with pytest.raises(InputError, match="25 frames per second"):
         index.on_clock(25.0, "slow")
 
 
