@@ -124,7 +124,7 @@ def test_white_noise_is_a_share_of_the_height_by_joint(camera):
 
 def test_the_floor_adds_in_squares(camera):
     projections, keypoints, _ = detected(
-        camera, one_setting(white=0.02, floor=3.0), standing(0.0, 20.0)
+        camera, one_setting(white=0.02, floor_px=3.0), standing(0.0, 20.0)
     )
     spread = (keypoints - projections.keypoints)[:, 0].std(axis=(0, 2))
     np.testing.assert_allclose(spread, np.hypot(3.6 * DIFFICULTY, 3.0), rtol=0.06)
@@ -304,7 +304,7 @@ def test_blur_goes_along_the_motion_and_grows_with_it(camera):
     x = np.linspace(-4.0, 4.0, FRAMES)
     people = Bodies(np.array([[standing(at, 20.0)] for at in x]), np.array([1.8]))
     projections = project_bodies(camera, people)
-    found = detect(projections, one_setting(blur=0.005), EVEN, FPS, rngs(1))
+    found = detect(projections, one_setting(blur_s=0.005), EVEN, FPS, rngs(1))
     error = (found.keypoints - projections.keypoints)[:, 0]
     speed = 8.0 / (FRAMES - 1) * FPS * 100.0  # [px/s]
     assert np.abs(error[..., 1]).max() < 1e-9  # the motion is level: rounding
@@ -344,7 +344,10 @@ def test_displaced_joints_are_flagged_and_far_off_and_no_less_confident(camera):
 def test_small_people_are_missed_and_exchanged_twice_as_often(camera):
     for small, share in ((0.0, 0.2), (1000.0, 0.36)):
         _, keypoints, _ = detected(
-            camera, one_setting(person_missed=0.2, small=small), standing(0.0, 20.0), frames=20000
+            camera,
+            one_setting(person_missed=0.2, small_px=small),
+            standing(0.0, 20.0),
+            frames=20000,
         )
         # One source in five, or either of two: 1 - 0.8^2; 800 bursts or more.
         assert np.isnan(keypoints[..., 0]).mean() == pytest.approx(share, abs=0.04)

@@ -63,7 +63,7 @@ def share_inside(
 @pytest.mark.parametrize(("scenario", "clicks"), [("match", FEW), ("penalty-box", SPREAD_OUT)])
 def test_regions_contain_the_truth(scenario, clicks):
     # Of 32 cameras 95 % are inside give or take 3.9 %: three of those, and no lower.
-    assert share_inside(scenario, clicks, 32, stated=clicks.noise) >= 0.83
+    assert share_inside(scenario, clicks, 32, stated=clicks.noise_px) >= 0.83
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_regions_contain_the_truth(scenario, clicks):
 @pytest.mark.parametrize(("scenario", "clicks"), [("match", SPREAD_OUT), ("penalty-box", FEW)])
 def test_95_percent_regions_contain_the_truth_93_to_97_percent_of_the_time(scenario, clicks):
     # 3000 cameras tell the share to 0.4 %.
-    assert 0.93 <= share_inside(scenario, clicks, 3000, stated=clicks.noise) <= 0.97
+    assert 0.93 <= share_inside(scenario, clicks, 3000, stated=clicks.noise_px) <= 0.97
 
 
 @pytest.mark.slow
