@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="PNG to write, of the first seed")
     options = parser.parse_args()
     settings = BroadcastCalibrationSettings(survey_error_m=options.survey_error)
-    scenario = SCENARIOS[options.scenario].model_copy(update={"survey_error_m": options.survey_error})
+    scenario = SCENARIOS[options.scenario].model_copy(update={"survey_error": options.survey_error})
     tables = {}
     for seed in options.seeds:
         picture = options.picture if seed == options.seeds[0] else None
