@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import functools
 import sys
 from collections.abc import Iterator, Mapping
@@ -14,6 +13,7 @@ from typing import Any, Literal
 from data_contracts.work import Recipe
 from worldpose.errors import StoreError
 from worldpose.store.documents import canonical_json, digest
+from worldpose.store.sources import DATA_SUFFIXES, Import, SourceCache, own_cache_file
 
 FOLLOWED = ("tasks", "worldpose", "data_contracts")
 """Packages whose imports affect a result."""
@@ -22,9 +22,6 @@ NOT_FOLLOWED = "worldpose.store"
 STORE_FORMAT = "1"
 """Increased when the same arrays are written as other bytes."""
 NUMERIC_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "zarr", "numcodecs")
-
-PARSING_ATTEMPTS = 10
-"""Attempts to parse a source while other threads parse, too; see `_parse`."""
 
 _HOME = (Path(__file__).resolve().parents[2],)
 
@@ -55,7 +52,13 @@ def code_version(root_module: str, roots: tuple[Path, ...] = _HOME) -> dict[str,
         versions |= of_module
         waiting.extend(imported - seen)
         seen |= imported
+    _source_cache(roots).save()
     return dict(sorted(versions.items()))
+
+
+@functools.cache
+def _source_cache(roots: tuple[Path, ...]) -> SourceCache:
+    return SourceCache(own_cache_file() if roots == _HOME else None)
 
 
 @functools.cache
@@ -68,16 +71,17 @@ def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], fr
             "worldpose with its sources, for example with `pip install -e .`."
         )
     try:
-        tree = _parse(path.read_bytes())
+        parsed = _source_cache(roots).parsed(name, path.read_bytes())
     except (OSError, SyntaxError, ValueError) as error:
         raise StoreError(f"{path}: cannot read module {name}: {error}") from error
-    nodes = _drop_text(tree)
-    versions = {name: digest(ast.unparse(tree).encode())}
+    versions = {name: parsed.code}
     versions |= {
-        f"{name}:{data.name}": digest(data.read_bytes()) for data in _data_files(nodes, path)
+        f"{name}:{data.name}": digest(data.read_bytes()) for data in _data_files(parsed.data, path)
     }
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    return versions, frozenset(filter(_is_followed, _imported_modules(nodes, package, roots)))
+    return versions, frozenset(
+        filter(_is_followed, _imported_modules(parsed.imports, package, roots))
+    )
 
 
 @functools.cache
@@ -95,20 +99,6 @@ def libraries() -> dict[str, str]:
     return versions
 
 
-def _parse(source: bytes) -> ast.Module:
-    """Parse a source, also while another thread parses.
-
-    Python 3.11 shares its recursion depth counter between threads, and raises an error if the count
-    is wrong at the end (python/cpython issue 106905).
-    """
-    for _ in range(PARSING_ATTEMPTS - 1):
-        try:
-            return ast.parse(source)
-        except SystemError:
-            continue
-    return ast.parse(source)
-
-
 def _is_followed(name: str) -> bool:
     inside_store = name == NOT_FOLLOWED or name.startswith(NOT_FOLLOWED + ".")
     return name.split(".")[0] in FOLLOWED and not inside_store
@@ -123,55 +113,29 @@ def _source_file(name: str, roots: tuple[Path, ...]) -> Path | None:
     return None
 
 
-def _data_files(nodes: list[ast.AST], path: Path) -> Iterator[Path]:
-    """Yield files next to a module that a string in it names."""
-    texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
+def _data_files(names: list[str], path: Path) -> Iterator[Path]:
+    """Yield the files of these names next to a module."""
     yield from (
         file
         for file in sorted(path.parent.iterdir())
-        if file.suffix in (".npz", ".safetensors") and file.name in texts
+        if file.suffix in DATA_SUFFIXES and file.name in names
     )
 
 
-def _imported_modules(nodes: list[ast.AST], package: str, roots: tuple[Path, ...]) -> Iterator[str]:
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                parents = package.split(".")
-                parents = parents[: len(parents) - node.level + 1]
-                base = ".".join([*parents, base] if base else parents)
-            for alias in node.names:
-                inner = f"{base}.{alias.name}"
-                yield inner if _source_file(inner, roots) else base
-
-
-def _drop_text(tree: ast.Module) -> list[ast.AST]:
-    """Return all nodes of a tree, after removing string statements from it.
-
-    These are docstrings and field docstrings.
-    """
-    nodes: list[ast.AST] = [tree]
-    for node in nodes:  # the list grows during the loop
-        for name, value in ast.iter_fields(node):
-            if isinstance(value, ast.AST):
-                nodes.append(value)
-            elif isinstance(value, list):
-                kept = [each for each in value if not _is_text(each)]
-                if name == "body" and not kept:
-                    kept = [ast.Pass()]
-                value[:] = kept
-                nodes.extend(each for each in kept if isinstance(each, ast.AST))
-    return nodes
-
-
-def _is_text(node: object) -> bool:
-    """Return whether this is a statement that contains only a string."""
-    if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
-        return False
-    return isinstance(node.value.value, str)
+def _imported_modules(
+    imports: list[Import], package: str, roots: tuple[Path, ...]
+) -> Iterator[str]:
+    for module, level, names in imports:
+        base = module
+        if level:
+            parents = package.split(".")
+            parents = parents[: len(parents) - level + 1]
+            base = ".".join([*parents, base] if base else parents)
+        if not names:
+            yield base
+        for name in names:
+            inner = f"{base}.{name}"
+            yield inner if _source_file(inner, roots) else base
 
 
 KEY_LENGTH = 32

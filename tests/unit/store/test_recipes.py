@@ -11,7 +11,7 @@ from store_samples import sample_recipe
 
 from worldpose.errors import StoreError
 from worldpose.store import code_version, explain_difference, libraries, recipe_key
-from worldpose.store.recipes import _read_module
+from worldpose.store.recipes import _read_module, _source_cache
 
 
 def test_key_is_the_first_half_of_the_sha256_of_the_recipe() -> None:
@@ -123,6 +123,7 @@ def forget() -> None:
     """Read sources again, as a new process would."""
     code_version.cache_clear()
     _read_module.cache_clear()
+    _source_cache.cache_clear()
 
 
 def edited(tree: Path, name: str, old: str, new: str) -> set[str]:
