@@ -25,7 +25,7 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scenario, Scene, simulate_scene
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import StaticCalibration, calibrate, project_with_jacobian
+from worldpose.static_calibration import StaticCalibration, calibrate_camera, project_with_jacobian
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -42,7 +42,7 @@ def calibrated(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticC
         still = render_pitch(camera, painted, scene.truth.joints[0], seed)
         grey = cv2.cvtColor(still, cv2.COLOR_RGB2GRAY)
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
-        found[name] = calibrate(surveyed, scene.clicks[name].markings, size, picture=grey)
+        found[name] = calibrate_camera(surveyed, scene.clicks[name].markings, size, picture=grey)
     return found
 
 
@@ -55,22 +55,10 @@ def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Cl
     index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
     placed = triangulate_joints(cameras, TrackedDetections(*arrays, index), settings, covariance)
     surveyed = PitchTemplate.from_spec(scene.surveyed)
-    clicks = []
-    for name, each in known.items():
-        agree = {point.name: point.inlier for point in each.report.points}
-        points = scene.clicks[name].markings.points
-        clicks.append(
-            Clicks(
-                names=tuple(point.name for point in points),
-                points_world=surveyed.positions([point.name for point in points]),
-                points_image=np.array([point.xy for point in points]).reshape(-1, 2),
-                inlier=np.array([agree[point.name] for point in points], dtype=np.bool_),
-            )
-        )
     return Clip(
         cameras=cameras,
         covariance=covariance,
-        clicks=tuple(clicks),
+        clicks=tuple(Clicks.of(each, surveyed) for each in known.values()),
         frame=scene.truth.frames,
         fps=fps,
         keypoints=seen.keypoints,

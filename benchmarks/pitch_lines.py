@@ -31,7 +31,7 @@ from worldpose.static_calibration import (
     CameraPrior,
     StaticCalibration,
     StaticCalibrationSettings,
-    calibrate,
+    calibrate_camera,
 )
 
 # The scorer's template is flat. Broadcast images are crops of a zoom lens with a varying principal
@@ -100,7 +100,7 @@ def fit(lines: dict, size: tuple[int, int], settings: StaticCalibrationSettings)
     """Return the camera of one image."""
     start = time.perf_counter()
     try:
-        found = calibrate(PITCH, soccernet_markings(lines, size), size, settings=settings)
+        found = calibrate_camera(PITCH, soccernet_markings(lines, size), size, settings=settings)
     except InputError as error:
         return Fitted(None, str(error), time.perf_counter() - start)
     return Fitted(found, "", time.perf_counter() - start)

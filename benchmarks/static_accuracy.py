@@ -28,7 +28,7 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
+from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate_camera
 
 SHARES = (0.5, 0.8, 0.95, 0.99)
 BORDER = 4.0
@@ -106,7 +106,7 @@ def calibrated(
     surveyed: PitchTemplate, clicked: ClickedMarkings, size: tuple[int, int], still: Image
 ) -> list[StaticCalibration]:
     """Return the calibration from clicks, and that with the image's lines."""
-    return [calibrate(surveyed, clicked, size, picture=each) for each in (None, still)]
+    return [calibrate_camera(surveyed, clicked, size, picture=each) for each in (None, still)]
 
 
 def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:

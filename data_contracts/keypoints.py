@@ -80,6 +80,25 @@ class KeypointDetections:
             frame=parts[0].frame,
         )
 
+    @classmethod
+    def stack(cls, cameras: Sequence[KeypointDetections]) -> KeypointDetections:
+        """Return the detections of several cameras as (frames, cameras, detections).
+
+        Args:
+            cameras: (frames, detections) of each camera. The result has every frame that a camera
+                has; a camera's missing frames and detections are NaN.
+        """
+        frame = np.unique(np.concatenate([each.frame for each in cameras]))
+        most = max(each.score.shape[1] for each in cameras)
+        stacked = {}
+        for name, array in cameras[0].arrays().items():
+            shape = (len(frame), len(cameras), most, *array.shape[2:])
+            stacked[name] = np.full(shape, np.nan, dtype=array.dtype)
+            for c, each in enumerate(cameras):
+                rows = np.searchsorted(frame, each.frame)
+                stacked[name][rows, c, : each.score.shape[1]] = each.arrays()[name]
+        return cls(frame=frame, **stacked)
+
     def __getitem__(self, frames: slice | NDArray[np.intp]) -> KeypointDetections:
         """Return the detections of some rows of the frame dimension."""
         return KeypointDetections(

@@ -27,7 +27,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CalibrationReport,
     StaticCalibrationSettings,
-    calibrate,
+    calibrate_camera,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
@@ -64,7 +64,7 @@ def static_calibration(work: Work) -> str:
         settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
         picture = _still(work)
         try:
-            calibration = calibrate(
+            calibration = calibrate_camera(
                 pitch,
                 clicked_markings(clicked),
                 (width, height),

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from data_contracts.keypoints import TrackedDetections
-from data_contracts.static_calibration import ClickedPoint
 from worldpose.body import find_body
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.bundle_adjustment import (
@@ -27,7 +26,11 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration import StaticCalibration, StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import (
+    StaticCalibration,
+    StaticCalibrationSettings,
+    calibrate_camera,
+)
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -145,7 +148,7 @@ def _calibrated(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibrati
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
         settings = StaticCalibrationSettings(lines=False)
         try:
-            found[name] = calibrate(
+            found[name] = calibrate_camera(
                 pitch, scene.clicks[name].markings, size, settings=settings, where=name
             )
         except InputError:
@@ -168,10 +171,7 @@ def _clip(
     return Clip(
         cameras=cameras,
         covariance=np.stack([known.estimate.covariance for known in calibrations.values()]),
-        clicks=tuple(
-            _clicks(known, scene.clicks[name].markings.points, pitch)
-            for name, known in calibrations.items()
-        ),
+        clicks=tuple(Clicks.of(known, pitch) for known in calibrations.values()),
         frame=scene.truth.frames,
         fps=fps,
         keypoints=keypoints,
@@ -180,19 +180,6 @@ def _clip(
         joints=placed.joints,
         views=placed.views.astype(np.int64),
         triangulation=_OURS,
-    )
-
-
-def _clicks(
-    known: StaticCalibration, points: Iterable[ClickedPoint], pitch: PitchTemplate
-) -> Clicks:
-    inlier = {point.name: point.inlier for point in known.report.points}
-    places = {point.name: point.xy for point in points}
-    return Clicks(
-        names=tuple(places),
-        points_world=pitch.positions(list(places)),
-        points_image=np.array(list(places.values())).reshape(-1, 2),
-        inlier=np.array([inlier[name] for name in places], dtype=np.bool_),
     )
 
 

@@ -14,7 +14,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate
+from worldpose.static_calibration import calibrate_camera
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
 
@@ -26,7 +26,9 @@ def calibrated(side, *, correct_labels):
     points = {name: tuple(place) for name, place in places.items()}
     pitch = PitchTemplate.from_spec(PitchSpec(crown=CROWN, points=points))
     clicked = [{"name": name, "xy": pixel} for name, pixel in pixels.items()]
-    return calibrate(pitch, ClickedMarkings.model_validate({"points": clicked}), (3072, 1728))
+    return calibrate_camera(
+        pitch, ClickedMarkings.model_validate({"points": clicked}), (3072, 1728)
+    )
 
 
 @pytest.mark.parametrize(("side", "count"), [("left", 38), ("right", 39)])
@@ -57,10 +59,10 @@ def test_a_pitch_in_yards_is_told_by_hand_clicks_of_points_of_the_laws(side):
         clicked = [{"name": name, "xy": xy} for name, xy in pixels.items() if name in pitch.points]
         markings = ClickedMarkings.model_validate({"points": clicked})
         if unit == 1.0:
-            assert calibrate(pitch, markings, (3072, 1728)).report.wrong == ()
+            assert calibrate_camera(pitch, markings, (3072, 1728)).report.wrong == ()
             continue
         with pytest.raises(InputError, match="in yards"):
-            calibrate(pitch, markings, (3072, 1728))
+            calibrate_camera(pitch, markings, (3072, 1728))
 
 
 @pytest.mark.usefixtures("server")

@@ -115,7 +115,7 @@ class ClipEvidence:
 def fit_bodies(
     model: BodyModel,
     evidence: ClipEvidence,
-    settings: BodyFittingSettings,
+    settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
     ground: Ground | None = None,
     known_shapes: Mapping[int, Shape] | None = None,
 ) -> BodyFit:

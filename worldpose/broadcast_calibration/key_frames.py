@@ -24,7 +24,7 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.errors import DegenerateError, InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate
+from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate_camera
 from worldpose.static_calibration.residuals import nearest_on_markings
 
 _ROUNDS = 3
@@ -80,7 +80,7 @@ def calibrate_keys(
         place = f"{where}: frame {key.frame}"
         try:
             # The joint fit of all key frames below adds painted lines.
-            found[key.frame - first] = calibrate(
+            found[key.frame - first] = calibrate_camera(
                 pitch, key.markings, image_size, settings=settings.key_frame, where=place
             )
         except (InputError, DegenerateError) as error:

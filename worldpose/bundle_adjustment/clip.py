@@ -7,11 +7,13 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
 from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import StaticCalibration
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 
@@ -30,6 +32,18 @@ class Clicks:
     points_world: Floats
     points_image: Floats
     inlier: Flags
+
+    @classmethod
+    def of(cls, calibration: StaticCalibration, pitch: PitchTemplate) -> Clicks:
+        """Return the clicked points that a camera was calibrated on."""
+        points = calibration.report.points
+        names = tuple(point.name for point in points)
+        return cls(
+            names=names,
+            points_world=pitch.positions(names),
+            points_image=np.array([point.pixel for point in points]).reshape(-1, 2),
+            inlier=np.array([point.inlier for point in points], dtype=np.bool_),
+        )
 
     @classmethod
     def none(cls) -> Clicks:
@@ -64,11 +78,11 @@ class Clip:
     clicks: tuple[Clicks, ...]
     frame: Integers
     fps: float
-    keypoints: Floats
-    confidence: Floats
-    detection_index: Integers
+    keypoints: AnyFloats
+    confidence: AnyFloats
+    detection_index: NDArray[np.integer]
     joints: Floats
-    views: Integers
+    views: NDArray[np.integer]
     triangulation: TriangulationSettings
     pitch: PitchTemplate | None = None
     on_lines: Flags | None = None
@@ -124,9 +138,9 @@ class Observations(NamedTuple):
 
 
 def keypoints_by_person(
-    keypoints: Floats,
-    confidence: Floats,
-    detection_index: Integers,
+    keypoints: AnyFloats,
+    confidence: AnyFloats,
+    detection_index: NDArray[np.integer],
 ) -> tuple[Floats, Floats]:
     """Return keypoints (frames, cameras, persons, 17, 2) and their confidence, by person.
 

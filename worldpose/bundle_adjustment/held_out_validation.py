@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
@@ -101,8 +101,8 @@ def _triangulate(
     clip: Clip,
     cameras: Camera,
     camera: int | None,
-    keypoints: Floats,
-    confidence: Floats,
+    keypoints: AnyFloats,
+    confidence: AnyFloats,
     index: NDArray[np.int16],
 ) -> Floats:
     others = index.copy()

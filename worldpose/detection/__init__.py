@@ -6,7 +6,7 @@ Outputs: `KeypointDetections` in chunks of frames, without the crowd.
 
 from worldpose.detection.interfaces import Detector, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose, weights_of
-from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place
+from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place, detect_people
 from worldpose.detection.settings import DetectionSettings
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "PeopleFinder",
     "Place",
     "PoseEstimator",
+    "detect_people",
     "load_detectors",
     "load_pose",
     "weights_of",

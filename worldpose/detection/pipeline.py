@@ -12,6 +12,7 @@ from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
+from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.views import TiledDetector
@@ -262,6 +263,40 @@ class PeopleFinder:
             self.report.detections += count
         self.report.frames += len(rows)
         return chunk
+
+
+def detect_people(
+    images: Iterable[Image],
+    settings: DetectionSettings = DetectionSettings(),  # noqa: B008
+    *,
+    camera: Camera | None = None,
+    pitch: PitchTemplate | None = None,
+) -> KeypointDetections:
+    """Return the people in consecutive images of one camera.
+
+    Args:
+        images: (height, width, 3) RGB, in order; read once.
+        settings: detectors, pose net and thresholds. The defaults are the bundled nets.
+        camera: calibrated camera; with `pitch`, people beside the pitch are left out.
+        pitch: pitch in the camera's view.
+
+    Returns:
+        Detections (frames, detections), with frame numbers from 0 on.
+
+    Raises:
+        InputError: a net or its file is missing or invalid.
+    """
+    finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
+    place = None if camera is None or pitch is None else Place(camera, pitch)
+    chunks = list(finder.find(enumerate(images), place))
+    if not chunks:
+        return KeypointDetections.from_keypoints(np.empty((0, 0, 17, 2)), np.empty((0, 0, 17)))
+    most = max(int(np.isfinite(chunk.score).sum(axis=1).max()) for chunk in chunks)
+    chunks = [chunk.select(slice(0, most)) for chunk in chunks]
+    names = ("keypoints", "confidence", "boxes", "score", "frame")
+    return KeypointDetections(
+        **{name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
+    )
 
 
 def find_poses(

@@ -10,6 +10,7 @@ is `cam_3`, as in its Anipose export. The reader ignores `metadata` and further 
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.files import SETTINGS_BYTES, read_toml, require_file
+from worldpose.geometry import Camera
 
 SIZE_LIMIT: Final = 1 << 16
 """Maximum width and height of an image [px]; OpenCV's own limit for most operations."""
@@ -392,6 +394,19 @@ def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
         rotation=rotation,
         translation=-rotation @ center,
     )
+
+
+def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """Return the cameras of a calibration file by name, in file order.
+
+    Args:
+        path: file as in `read_calibration`.
+
+    Raises:
+        InputError: an unknown file type, or an invalid entry, with file and key.
+    """
+    given = read_calibration(Path(path))
+    return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}
 
 
 def read_calibration(path: Path) -> dict[str, CameraCalibration]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,13 +39,13 @@ class JointTracks:
 
     frames: NDArray[np.int64]
     """(frames,) match frames, ascending."""
-    person_ids: NDArray[np.int64]
+    person_ids: NDArray[np.integer]
     """(persons,), unique."""
     joints: NDArray[np.float64]
     """(frames, persons, 17, 3) [m], world, COCO-17 order; NaN where missing."""
     covariance: NDArray[np.float64] | None = None
     """(frames, persons, 17, 3, 3) [m^2]; None if unknown."""
-    views: NDArray[np.int64] | None = None
+    views: NDArray[np.integer] | None = None
     """(frames, persons, 17) number of cameras used for the joint, or that saw it for ground
     truth."""
 
@@ -93,7 +94,7 @@ class JointTracks:
         )
 
 
-def write_joints(path: Path, tracks: JointTracks) -> None:
+def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
     """Write a joints file, whole or not at all; equal tracks give equal bytes.
 
     Members: `frames` (frames,) int64, `person_ids` (persons,) int64, `joints` (frames, persons,
@@ -109,17 +110,17 @@ def write_joints(path: Path, tracks: JointTracks) -> None:
         arrays["covariance"] = tracks.covariance.astype(np.float64)
     if tracks.views is not None:
         arrays["views"] = tracks.views.astype(np.uint8)
-    write_archive(path, arrays)
+    write_archive(Path(path), arrays)
 
 
-def read_joints(path: Path) -> JointTracks:
+def read_joints(path: str | os.PathLike[str]) -> JointTracks:
     """Read the tracks of a joints file.
 
     Raises:
         InputError: names file and place: absent, truncated, members missing or unknown, wrong
             shapes, infinite values.
     """
-    arrays = read_archive(path, MEMBERS)
+    arrays = read_archive(Path(path), MEMBERS)
     try:
         return JointTracks(**arrays)
     except InputError as error:

@@ -14,6 +14,7 @@ little-endian order, NaN where missing (`data_contracts.keypoints`).
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
@@ -413,7 +414,7 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
 
 
 def read_observations(
-    path: Path, ranges: Sequence[tuple[int, int]] | None = None
+    path: str | os.PathLike[str], ranges: Sequence[tuple[int, int]] | None = None
 ) -> KeypointDetections:
     """Return the detections of one camera, dense over ranges of the camera's own frames.
 
@@ -427,6 +428,7 @@ def read_observations(
         InputError: with file and place: unreadable, invalid, or all people are outside the wanted
             frames.
     """
+    path = Path(path)
     people = read_keypoint_arrays(path) if path.suffix == ".npz" else read_coco_results(path)
     seen = people.frame
     if ranges is None:

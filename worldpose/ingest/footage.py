@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -192,7 +193,7 @@ STILL_BYTES = 1 << 28
 """Maximum size of a still [byte]; a noisy 4K image has 25 MB."""
 
 
-def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
+def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the image (height, width, 3), RGB.
 
     Args:
@@ -202,6 +203,7 @@ def read_still(path: Path, image_size: tuple[int, int]) -> NDArray[np.uint8]:
     Raises:
         InputError: no such file, no image, or another image size.
     """
+    path = Path(path)
     size = require_file(path)
     content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)
     declared = declared_size(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,7 +54,7 @@ class MatchFolder:
     estimates: Mapping[str, Path] = field(default_factory=dict)
 
 
-def read_match(folder: Path) -> MatchFolder:
+def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
 
     Args:
@@ -64,6 +65,7 @@ def read_match(folder: Path) -> MatchFolder:
             permission); a file or key is missing, unknown, contradicts another or leads out of the
             folder; a static camera has neither video nor detections.
     """
+    folder = Path(folder)
     with reachable(folder):
         return _read_match(folder)
 

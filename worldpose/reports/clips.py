@@ -272,7 +272,7 @@ class ReconstructedPeople:
 
     joints: Floats
     """(persons, 17, 3) [m], world; NaN where missing."""
-    person_ids: NDArray[np.int64]
+    person_ids: NDArray[np.integer]
     """(persons,)."""
     seen: NDArray[np.bool_]
     """(persons,) whether the drawn camera's own detections support any joint of the person."""

@@ -70,7 +70,7 @@ def _paint(
     canvas: Image,
     camera: Camera,
     joints: Floats,
-    person_ids: NDArray[np.int64],
+    person_ids: NDArray[np.integer],
     frame: int,
     bodies: BodyTracks | None,
 ) -> set[int]:

@@ -24,7 +24,7 @@ from worldpose.review.detections import DetectionEdit
 from worldpose.static_calibration import (
     CalibrationReport,
     StaticCalibrationSettings,
-    calibrate,
+    calibrate_camera,
 )
 
 
@@ -354,7 +354,7 @@ def preview(
     Raises:
         InputError: the clicks do not determine a camera; the message says which clicks to add.
     """
-    found = calibrate(
+    found = calibrate_camera(
         drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
     )
     camera = found.estimate.camera

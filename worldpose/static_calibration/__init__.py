@@ -3,7 +3,7 @@
 Input: a pitch template, clicked points and drawn markings. Output: a camera and its covariance.
 """
 
-from worldpose.static_calibration.calibration import calibrate
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.clip_picture import median_picture
 from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
 from worldpose.static_calibration.parameters import (
@@ -36,7 +36,7 @@ __all__ = [
     "PointResidual",
     "StaticCalibration",
     "StaticCalibrationSettings",
-    "calibrate",
+    "calibrate_camera",
     "calibration_arrays",
     "calibration_attributes",
     "calibration_coordinates",

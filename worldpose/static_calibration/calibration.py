@@ -85,7 +85,7 @@ _YARD: Final = 0.9144
 """[m]"""
 
 
-def calibrate(
+def calibrate_camera(
     pitch: PitchTemplate,
     clicked: ClickedMarkings,
     image_size: tuple[int, int],

@@ -87,7 +87,7 @@ def track_people(
     keypoints: ClipArray,
     confidence: ClipArray,
     fps: float,
-    settings: TrackingSettings,
+    settings: TrackingSettings = TrackingSettings(),  # noqa: B008
     progress: Callable[[int, int], None] | None = None,
     *,
     pitch_size: tuple[float, float] | None = None,

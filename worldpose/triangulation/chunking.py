@@ -207,7 +207,7 @@ def reconstruct_joints(
     cameras: Camera,
     detections: TrackedDetections,
     fps: float,
-    settings: TriangulationSettings,
+    settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: NDArray[np.float64] | None = None,
 ) -> Reconstruction:
     """Return a clip's triangulated and smoothed joints, and its cameras' clock offsets.

@@ -101,7 +101,7 @@ class Triangulation:
 def triangulate_joints(
     cameras: Camera,
     detections: TrackedDetections,
-    settings: TriangulationSettings,
+    settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: Floats | None = None,
     model: DetectorModel | None = None,
 ) -> Triangulation:

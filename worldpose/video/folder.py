@@ -5,6 +5,7 @@ PNG and JPEG images are decoded in memory, after a check of the size in their he
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from collections.abc import Iterator
@@ -206,8 +207,11 @@ def index_video(path: Path) -> FrameIndex:
     return index_images(path) if path.is_dir() else index_frames(path)
 
 
-def open_video(path: Path, index: FrameIndex | None = None) -> VideoReader | ImageFolder:
+def open_video(
+    path: str | os.PathLike[str], index: FrameIndex | None = None
+) -> VideoReader | ImageFolder:
     """Open a video file or a folder of images, to be read by frame number."""
+    path = Path(path)
     return ImageFolder(path, index) if path.is_dir() else VideoReader(path, index)
 
 

@@ -9,7 +9,7 @@ from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -33,7 +33,7 @@ def from_clicks(scene):
     plain = StaticCalibrationSettings(lines=False)
     return Camera.stack(
         [
-            calibrate(pitch, clicks.markings, (1920, 1080), settings=plain).estimate.camera
+            calibrate_camera(pitch, clicks.markings, (1920, 1080), settings=plain).estimate.camera
             for clicks in scene.clicks.values()
         ]
     )

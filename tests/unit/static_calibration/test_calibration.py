@@ -8,13 +8,13 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 
 PITCH, SIZE = people.PITCH, people.SIZE
 
 
 def of(clicked, **settings):
-    return calibrate(PITCH, clicked, SIZE, settings=StaticCalibrationSettings(**settings))
+    return calibrate_camera(PITCH, clicked, SIZE, settings=StaticCalibrationSettings(**settings))
 
 
 # Degenerate input first.
@@ -164,7 +164,7 @@ def test_a_flat_template_is_measurably_worse_than_the_crowned_one():
         clicked = people.points(people.visible(camera))
         places = people.on_the_pitch(np.random.default_rng(index))
         for pitch, errors in ((PITCH, crowned_errors), (flat, flat_errors)):
-            estimate = calibrate(pitch, clicked, SIZE).estimate
+            estimate = calibrate_camera(pitch, clicked, SIZE).estimate
             errors.append(people.ground_errors(estimate.camera, camera, places))
     # A surface 0.2 m off seen at 20 degrees is decimetres off on the ground.
     assert np.median(np.concatenate(flat_errors)) > 5 * np.median(np.concatenate(crowned_errors))
@@ -211,7 +211,7 @@ def test_a_picture_without_lines_leaves_the_camera_to_the_clicks():
     camera, rng = people.seat(0)
     clicked = people.click(camera, rng).clicked
     meadow = np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8)
-    with_picture = calibrate(PITCH, clicked, SIZE, picture=meadow)
+    with_picture = calibrate_camera(PITCH, clicked, SIZE, picture=meadow)
     np.testing.assert_array_equal(
         with_picture.estimate.camera.focal, of(clicked).estimate.camera.focal
     )

@@ -12,7 +12,7 @@ from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 
 SPREAD_OUT = ClickSettings()
 FEW = ClickSettings(clustered=1.0, clustered_points=(5, 7))
@@ -51,7 +51,7 @@ def share_inside(
             ).markings
             surveyed = PitchTemplate.from_spec(survey(PitchSpec(), 0.006, rng))
             picture = render_pitch(camera, people.PITCH, None, seed) if lines else None
-            estimate = calibrate(
+            estimate = calibrate_camera(
                 surveyed, clicked, people.SIZE, picture=picture, settings=settings
             ).estimate
             squared, freedom = people.surprise_of(estimate, camera)

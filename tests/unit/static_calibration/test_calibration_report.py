@@ -6,7 +6,7 @@ from data_contracts.static_calibration import STATIC_CALIBRATION
 from tasks.bundle_adjustment import _clicks
 from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
 from worldpose.static_calibration import (
-    calibrate,
+    calibrate_camera,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
@@ -21,7 +21,7 @@ def test_a_calibration_keeps_its_layout():
     clicks = people.click(camera, rng, wrong=60.0)
     drawn = people.draw(camera, ["touch_line_far", "goal_line_left"], rng)
     clicked = clicks.clicked.model_copy(update={"drawn": drawn})
-    result = calibrate(people.PITCH, clicked, people.SIZE)
+    result = calibrate_camera(people.PITCH, clicked, people.SIZE)
     arrays = checked_arrays(
         STATIC_CALIBRATION, calibration_arrays(result), calibration_coordinates(result)
     )
@@ -53,7 +53,7 @@ def test_a_camera_that_is_left_out_keeps_the_layout_with_its_reason_alone():
 def test_clicks_come_back_from_a_stored_camera_where_they_were_made():
     camera, rng = people.seat(1)
     clicked = people.click(camera, rng, wrong=60.0).clicked
-    result = calibrate(people.PITCH, clicked, people.SIZE)
+    result = calibrate_camera(people.PITCH, clicked, people.SIZE)
     arrays = calibration_arrays(result)
     stored = xr.Dataset(
         {

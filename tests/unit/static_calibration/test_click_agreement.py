@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate, calibration
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera, calibration
 from worldpose.static_calibration.click_outliers import Explanation
 
 NAMES = tuple(f"point{number}" for number in range(10))
@@ -55,7 +55,7 @@ def test_a_bad_fit_of_right_clicks_alone_is_no_error(judge):
 
 def of(clicked, **settings):
     settings = StaticCalibrationSettings(**settings)
-    return calibrate(people.PITCH, clicked, people.SIZE, settings=settings)
+    return calibrate_camera(people.PITCH, clicked, people.SIZE, settings=settings)
 
 
 def test_a_camera_is_weak_where_its_expected_error_is_beyond_a_limit():

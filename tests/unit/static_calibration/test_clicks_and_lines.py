@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 
 PITCH, SIZE = people.PITCH, people.SIZE
 EXACT = StaticCalibrationSettings(survey_error_m=0.0)
@@ -26,8 +26,8 @@ def median_error(result, camera):
 def test_clicks_three_times_worse_than_stated_do_not_keep_the_lines_out(view, seed):
     camera, picture = view
     clicked = people.click(camera, np.random.default_rng(seed), count=6, noise=3.5).clicked
-    alone = calibrate(PITCH, clicked, SIZE, settings=EXACT)
-    both = calibrate(PITCH, clicked, SIZE, picture=picture, settings=EXACT)
+    alone = calibrate_camera(PITCH, clicked, SIZE, settings=EXACT)
+    both = calibrate_camera(PITCH, clicked, SIZE, picture=picture, settings=EXACT)
     assert both.report.stage == "lines"
     # Lines of an exact template leave millimetres; 3.5 px of few clicks, decimetres.
     assert median_error(both, camera) < 0.01
@@ -39,7 +39,7 @@ def test_lines_name_a_wrong_click_among_five(view):
     found = 0
     for seed in range(4):
         clicks = people.click(camera, np.random.default_rng(seed), count=5, wrong=25.0)
-        result = calibrate(PITCH, clicks.clicked, SIZE, picture=picture, settings=EXACT)
+        result = calibrate_camera(PITCH, clicks.clicked, SIZE, picture=picture, settings=EXACT)
         found += result.report.wrong == (clicks.first,)
     # Where it drags the five too far, the lines are not found, and the clicks stand.
     assert found >= 3
@@ -48,6 +48,6 @@ def test_lines_name_a_wrong_click_among_five(view):
 def test_lines_do_not_overrule_clicks_that_agree_with_them(view):
     camera, picture = view
     clicked = people.click(camera, np.random.default_rng(7), count=10).clicked
-    result = calibrate(PITCH, clicked, SIZE, picture=picture, settings=EXACT)
+    result = calibrate_camera(PITCH, clicked, SIZE, picture=picture, settings=EXACT)
     assert result.report.wrong == ()
     assert result.report.stage == "lines"

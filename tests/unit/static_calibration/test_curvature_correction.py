@@ -8,7 +8,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate
+from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, fit_with_curvature
 from worldpose.static_calibration.evidence import gather_evidence
@@ -124,11 +124,11 @@ def test_stills_without_lines_make_a_camera_weak():
     camera, rng = people.seat(0)
     clicked = people.click(camera, rng).clicked
     picture = np.full((1080, 1920), 90, np.uint8)
-    found = calibrate(people.PITCH, clicked, people.SIZE, picture=picture)
+    found = calibrate_camera(people.PITCH, clicked, people.SIZE, picture=picture)
     assert found.report.stage == "points"
     assert found.report.weak
     assert any("no painted lines" in reason for reason in found.report.reasons)
-    assert not calibrate(people.PITCH, clicked, people.SIZE).report.weak
+    assert not calibrate_camera(people.PITCH, clicked, people.SIZE).report.weak
 
 
 @pytest.mark.parametrize("index", [2, 4])
@@ -136,7 +136,7 @@ def test_lines_tell_which_of_few_clicks_is_wrong(index):
     camera, rng = people.seat(index)
     few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
     picture = render_pitch(camera, people.PITCH, None, 0)
-    found = calibrate(people.PITCH, few.clicked, people.SIZE, picture=picture)
+    found = calibrate_camera(people.PITCH, few.clicked, people.SIZE, picture=picture)
     assert found.report.stage == "lines"
     assert found.report.wrong == (few.first,)
 
@@ -145,7 +145,7 @@ def test_lines_find_the_wrong_one_of_five_clicks_of_three_times_the_noise():
     camera, rng = people.seat(0)
     few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
     picture = render_pitch(camera, people.PITCH, None, 0)
-    found = calibrate(people.PITCH, few.clicked, people.SIZE, picture=picture)
+    found = calibrate_camera(people.PITCH, few.clicked, people.SIZE, picture=picture)
     places = people.on_the_pitch(np.random.default_rng(0))
     assert found.report.stage == "lines"
     assert found.report.wrong == (few.first,)

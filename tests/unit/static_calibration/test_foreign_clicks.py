@@ -10,7 +10,7 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate
+from worldpose.static_calibration import calibrate_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
 from worldpose.static_calibration.click_outliers import (
     compute_residuals,
@@ -36,7 +36,7 @@ def cameras(count, clicks, noise, first=0, **lens):
 
 
 def calibrated(points, drawn=None, pitch=rig.PITCH):
-    return calibrate(pitch, rig.markings(points, drawn), rig.SIZE, where="cam07.json")
+    return calibrate_camera(pitch, rig.markings(points, drawn), rig.SIZE, where="cam07.json")
 
 
 def test_honest_clicks_of_three_pixels_stated_as_one_are_believed():

@@ -1,0 +1,103 @@
+"""The scripts in examples/ do what they say, with the match and the run that other tests share."""
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import TINY, succeed
+
+import worldpose
+from worldpose.formats import read_camera
+from worldpose.ingest import write_calibration_toml
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@pytest.fixture
+def script(monkeypatch, capsys):
+    """Runs an example in this process and returns its output."""
+
+    def run(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
+def bodies(tiny_run):
+    return worldpose.open_run(tiny_run, TINY)["body_fitting/clip"]
+
+
+def test_a_match_in_one_script_gives_the_bodies_of_the_factory(script, tiny, bodies, tmp_path):
+    out = tmp_path / "joints.npz"
+    assert "5 people" in script("whole_match.py", tiny, out)
+    joints = worldpose.read_joints(out)
+    np.testing.assert_array_equal(joints.frames, bodies.frame)
+    np.testing.assert_allclose(joints.joints, bodies.joints, atol=1e-5)  # stored as float32
+    np.testing.assert_allclose(joints.covariance, bodies.covariance, rtol=1e-3, atol=1e-9)
+
+
+def test_clicks_give_a_camera_and_every_residual(script, tiny):
+    out = script(
+        "calibrate_camera.py", tiny / "annotations/static_calibration/cam00.json", 1920, 1080
+    )
+    clicks = json.loads((tiny / "annotations/static_calibration/cam00.json").read_text())
+    assert out.count(" px  ") == len(clicks["points"])
+    stated = [float(number) for number in out.split("center [")[1].split("]")[0].split()]
+    truth = read_camera(tiny / "reference/cameras/cam00.npz")
+    assert np.linalg.norm(np.ravel(truth.center)[:3] - stated) < 1.5  # 76 m away, by clicks alone
+
+
+def test_keypoints_in_coco_form_become_joints(script, tiny, tiny_run, bodies, tmp_path):
+    succeed(
+        *("export", TINY, "--project", tiny_run, "--format", "coco"), "--out", tmp_path / "coco"
+    )
+    cameras = {file.stem: read_camera(file) for file in (tiny / "reference/cameras").glob("cam*")}
+    calibration = tmp_path / "calibration.toml"
+    write_calibration_toml(
+        calibration, {name: camera.to_calibration(name) for name, camera in cameras.items()}
+    )
+    out = tmp_path / "joints.npz"
+    script("triangulate_coco.py", calibration, tmp_path / "coco", 25, out)
+    found = worldpose.read_joints(out)
+    distance = np.linalg.norm(
+        found.joints[:, :, None] - bodies.joints.values[:, None], axis=-1
+    ).mean(axis=-1)
+    assert np.nanmax(np.nanmin(distance, axis=2)) < 0.02
+
+
+def test_joints_are_evaluated_against_the_truth(script, tiny):
+    truth = tiny / "reference/joints.npz"
+    metrics, _ = json.JSONDecoder().raw_decode(script("evaluate_result.py", truth, truth, 25))
+    assert metrics["g_mpjpe_mm"] < 1e-6
+    assert metrics["coverage"] == metrics["idf1"] == 1.0
+
+
+def test_a_stage_of_ones_own_is_computed_once_and_is_right(script, project_copy, bodies):
+    first = script("add_stage.py", project_copy, TINY)
+    assert script("add_stage.py", project_copy, TINY) == first
+    (result,) = (project_copy / "results" / TINY / "speeds/clip").iterdir()
+    assert (result / "manifest.json").exists()
+    hips = bodies.joints.values[:, 0, 11:13, :2].mean(axis=1)
+    assert "clip person 0:" in first
+    fastest = float(first.split("at most ")[1].split()[0])
+    steps = np.linalg.norm(hips[10:] - hips[:-10], axis=-1) * 25 / 10
+    assert abs(fastest - steps.max()) < 0.06
+
+
+def test_every_example_is_short():
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text().splitlines()) <= 80, file.name
+
+
+def test_the_library_lists_what_it_has():
+    for name in worldpose.__all__:
+        assert getattr(worldpose, name) is not None
+        assert name in dir(worldpose)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        worldpose.nothing  # noqa: B018
