@@ -3,6 +3,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
+# Where it is set, each of the hundreds of processes of the tests would compile all sources again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo demo-quick demo-match real-demo check format test test-all docs schemas pages clean
 

@@ -13,11 +13,12 @@ from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.reports.bodies import BodyTracks
 from worldpose.store import Run
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from worldpose.reports.bodies import BodyTracks
 
 BODY_STAGES = ("body_fitting", "refitting")
 """Stages that produce bodies, the best last."""
@@ -83,6 +84,8 @@ def bodies_unit(run: Run, clip: str) -> str:
 
 def body_tracks(run: Run, clip: str) -> BodyTracks | None:
     """Return the best fitted bodies of a clip; None if the run has none."""
+    from worldpose.reports.bodies import BodyTracks  # late: it imports matplotlib
+
     if bodies_unit(run, clip) not in run:
         return None
     fits = run[bodies_unit(run, clip)]

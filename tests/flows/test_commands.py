@@ -40,6 +40,15 @@ def test_the_list_of_commands_and_the_version_import_no_estimator():
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 
 
+def test_a_run_imports_nothing_that_only_draws():
+    script = (
+        "import sys\n"
+        "import flows.cli.run, flows.match, tasks.preload\n"
+        "assert 'matplotlib' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
 @pytest.mark.parametrize("option", ["--help", "--version"])
 def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option):
     script = (
