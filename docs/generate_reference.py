@@ -125,6 +125,17 @@ def package_page(name: str) -> Iterator[str]:
     yield ""
     yield "```{eval-rst}"
     yield f".. automodule:: {name}"
-    yield "   :members:"
-    yield "   :imported-members:"
+    if name != "worldpose":  # its functions stand on the pages of their packages
+        yield "   :members:"
+        yield "   :imported-members:"
     yield "```"
+    if name == "worldpose":
+        yield ""
+        yield "| name | package |"
+        yield "| --- | --- |"
+        for member in worldpose.__all__:
+            where = getattr(getattr(worldpose, member), "__module__", name)
+            packages = [each for each in public_packages() if where.startswith(each)]
+            package = max(packages, key=len, default=name)
+            link = f"[{package}]({package}.md)" if packages else f"`{where}`"
+            yield f"| `{member}` | {link} |"

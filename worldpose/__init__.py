@@ -2,15 +2,14 @@
 
 All take and return plain arrays and frozen records, and need neither Prefect, Dask nor a store:
 
-    read:        `read_match` a match folder, `read_unit` one camera's 2D poses of it,
-                 `read_cameras` a calibration file, `read_observations` a file of 2D poses,
-                 `read_still` an image, `open_video`
-    calibrate:   `calibrate_camera` from clicks on pitch markings, `calibrate_broadcast` a moving
-                 camera from clicks in key frames
-    people:      `detect_people` in images, `track_people` over all cameras
-    3D:          `triangulate_joints` per frame, `reconstruct_joints` also over time,
-                 `adjust_cameras` to people and markings, `fit_bodies`
-    results:     `open_run` of a project, `read_joints`, `write_joints`, `evaluate_joints`
+- read: `read_match` a match folder, `read_unit` one camera's 2D poses of it, `read_cameras` a
+  calibration file, `read_observations` a file of 2D poses, `read_still` an image, `open_video`;
+- calibrate: `calibrate_camera` from clicks on pitch markings, `calibrate_broadcast` a moving
+  camera from clicks in key frames;
+- people: `detect_people` in images, `track_people` over all cameras;
+- 3D: `triangulate_joints` per frame, `reconstruct_joints` also over time, `adjust_cameras` to
+  people and markings, `fit_bodies`;
+- results: `open_run` of a project, `read_joints`, `write_joints`, `evaluate_joints`.
 
 World: meters, origin at the center spot, x along the touch line, y across, z up. Cameras: OpenCV
 axes, `x_cam = R x_world + t`. Arrays: frame, camera, person, joint, coordinate; NaN = missing.

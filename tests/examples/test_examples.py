@@ -1,6 +1,7 @@
 """The scripts in examples/ do what they say, with the match and the run that other tests share."""
 
 import json
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -53,22 +54,38 @@ def test_clicks_give_a_camera_and_every_residual(script, tiny):
     assert np.linalg.norm(np.ravel(truth.center)[:3] - stated) < 1.5  # 76 m away, by clicks alone
 
 
-def test_keypoints_in_coco_form_become_joints(script, tiny, tiny_run, bodies, tmp_path):
-    succeed(
-        *("export", TINY, "--project", tiny_run, "--format", "coco"), "--out", tmp_path / "coco"
-    )
+@pytest.fixture
+def coco(tiny, tiny_run, tmp_path):
+    """A folder with a calibration, and the bodies' keypoints in the image of every camera."""
+    folder = tmp_path / "coco"
+    succeed("export", TINY, "--project", tiny_run, "--format", "coco", "--out", folder)
     cameras = {file.stem: read_camera(file) for file in (tiny / "reference/cameras").glob("cam*")}
-    calibration = tmp_path / "calibration.toml"
     write_calibration_toml(
-        calibration, {name: camera.to_calibration(name) for name, camera in cameras.items()}
+        folder / "calibration.toml",
+        {name: camera.to_calibration(name) for name, camera in cameras.items()},
     )
+    return folder
+
+
+def farthest(joints, bodies):
+    """Mean distance of the joints [m] of the person who is farthest from the nearest body."""
+    distance = np.linalg.norm(joints[:, :, None] - bodies.joints.values[:, None], axis=-1)
+    return np.nanmax(np.nanmin(distance.mean(axis=-1), axis=2))
+
+
+def test_keypoints_in_coco_form_become_joints(script, coco, bodies, tmp_path):
     out = tmp_path / "joints.npz"
-    script("triangulate_coco.py", calibration, tmp_path / "coco", 25, out)
-    found = worldpose.read_joints(out)
-    distance = np.linalg.norm(
-        found.joints[:, :, None] - bodies.joints.values[:, None], axis=-1
-    ).mean(axis=-1)
-    assert np.nanmax(np.nanmin(distance, axis=2)) < 0.02
+    script("triangulate_coco.py", coco / "calibration.toml", coco, 25, out)
+    assert farthest(worldpose.read_joints(out).joints, bodies) < 0.02
+
+
+def test_the_script_in_the_readme_triangulates(coco, bodies, monkeypatch):
+    readme = (EXAMPLES.parent / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    monkeypatch.chdir(coco)
+    names = {}
+    exec(example, names)
+    assert farthest(names["joints"].joints, bodies) < 0.02
 
 
 def test_joints_are_evaluated_against_the_truth(script, tiny):

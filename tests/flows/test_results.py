@@ -78,9 +78,9 @@ def test_exported_coco_lies_on_the_detections(tiny, tiny_run, tmp_path):
     assert np.median(distances) < 5
 
 
-def test_readme_example_gives_labelled_joints_with_units(tiny_run, tmp_path, capsys):
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+def test_the_example_in_the_docs_gives_labelled_joints_with_units(tiny_run, tmp_path, capsys):
+    page = (Path(__file__).parents[2] / "docs/how-to/library.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len([line for line in example.splitlines() if line.strip()]) <= 5
     exec(example.replace("worldpose-data", str(tiny_run)).replace('"lab"', f'"{TINY}"'), {})
     assert capsys.readouterr().out == "('frame', 'joint', 'coordinate') m\n"
