@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import FRAME
@@ -49,8 +51,49 @@ TRACKING = GroupLayout(
             about="the tracker's fast 3D joints, world; those of `triangulation` are accurate",
             chunk_dim="frame",
         ),
+        ArrayLayout(
+            name="ground",
+            dims=("frame", "person", "axis"),
+            dtype="float32",
+            unit="m",
+            missing="nan",
+            about="place of people of the kind `plane` on the pitch, from their feet, smoothed",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="ground_velocity",
+            dims=("frame", "person", "axis"),
+            dtype="float32",
+            unit="m/s",
+            missing="nan",
+            about="derivative of `ground`",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="ground_covariance",
+            dims=("frame", "person", "axis", "axis_"),
+            dtype="float32",
+            unit="m^2",
+            missing="nan",
+            about="covariance of `ground`: noise of the feet, and calibration",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
+            name="ground_height",
+            dims=("person",),
+            dtype="float32",
+            unit="m",
+            missing="nan",
+            about="height of people of the kind `plane`, by their boxes",
+        ),
     ),
-    labels={"joint": COCO17, "coordinate": ("x", "y", "z")},
+    labels={
+        "joint": COCO17,
+        "coordinate": ("x", "y", "z"),
+        "axis": ("x", "y"),
+        "axis_": ("x", "y"),
+    },
+    optional=("ground", "ground_velocity", "ground_covariance", "ground_height"),
     attributes={
         "camera": "camera ids in the order of the camera dimension",
         "tracks": "one `track` record per person",
@@ -72,6 +115,8 @@ class Track(Record):
     """Mean number of cameras in those frames."""
     name: Name | None = None
     """Roster id, where known."""
+    kind: Literal["triangulated", "plane"] = "triangulated"
+    """Whether views triangulate the person, or the feet alone give a place on the pitch."""
 
 
 class Join(Record):

@@ -179,6 +179,13 @@ def open_clip(
     return _make_inputs(store, work, frame, seen, rejected, shift, redetected=redetected)
 
 
+def open_boxes(store: Store, work: Work) -> ClipArray:
+    """Open the boxes (frames, cameras, detections, 4) [px] of the clip of `work`."""
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    return StoredDetections(_open_cameras(store, work, slice(first, first + count - 1)), "boxes")
+
+
 def load_dropped_boxes(store: Store, work: Work) -> NDArray[np.bool_] | None:
     """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
     before = f"filtering/{work.recipe.unit}"

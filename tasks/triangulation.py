@@ -74,7 +74,8 @@ def write_joints(
             attributes={"camera": list(clip.camera_ids)},
         )
     agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)
-    if agreement.joints == 0 and index.shape[2]:
+    on_plane = all(track.get("kind") == "plane" for track in tracks.attrs["tracks"])
+    if agreement.joints == 0 and index.shape[2] and not on_plane:
         most = int(np.count_nonzero(index >= 0, axis=1).max())
         reason = (
             f"no person is seen by more than {most} cameras at once and min_views asks for "

@@ -11,6 +11,7 @@ from data_contracts.run import RunRecord
 from worldpose.body import BodyParameters, find_body
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
+from worldpose.formats.positions_file import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.store import Run
@@ -24,6 +25,8 @@ BODY_STAGES = ("body_fitting", "refitting")
 """Stages that produce bodies, the best last."""
 JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
 """Stages that produce 3D joints, the best last."""
+MID_HIP = [11, 12]
+"""The hips in COCO-17."""
 ADJUSTED = "bundle_adjustment/cameras"
 """Result with all static cameras after adjustment."""
 
@@ -74,6 +77,26 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
         covariance=result["covariance"].values,
         views=seen["views"].values.astype(np.int64),
     )
+
+
+def clip_positions(run: Run, clip: str) -> Positions:
+    """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet."""
+    tracks, tracking = joint_tracks(run, clip), run[f"tracking/{clip}"]
+    known = {int(track["person"]): track for track in tracking.attrs["tracks"]}
+    xy = tracks.joints[:, :, MID_HIP, :2].mean(axis=2)
+    covariance = np.full((*xy.shape, 2), np.nan)
+    if tracks.covariance is not None:  # the errors of both hips are nearly the same
+        covariance = tracks.covariance[:, :, MID_HIP, :2, :2].mean(axis=2)
+    kinds = [str(known[int(person)].get("kind", "triangulated")) for person in tracks.person_ids]
+    height = np.full(len(kinds), np.nan)
+    if "ground" in tracking:
+        ground = tracking.sel(person=tracks.person_ids)
+        plane = np.array(kinds) == "plane"
+        xy[:, plane] = ground["ground"].values[:, plane]
+        covariance[:, plane] = ground["ground_covariance"].values[:, plane]
+        height[plane] = ground["ground_height"].values[plane]
+    names = [known[int(person)].get("name") or "" for person in tracks.person_ids]
+    return Positions(tracks.frames, tracks.person_ids, names, kinds, xy, covariance, height)
 
 
 def bodies_unit(run: Run, clip: str) -> str:

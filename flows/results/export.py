@@ -17,6 +17,7 @@ from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManife
 from flows.results.best_results import (
     bodies_unit,
     broadcast_unit,
+    clip_positions,
     clips_of,
     joint_tracks,
     placed_joints,
@@ -51,6 +52,7 @@ from worldpose.formats.challenge import (
 )
 from worldpose.formats.joints_file import write_poses
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
+from worldpose.formats.positions_file import write_positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import read_match
@@ -279,10 +281,20 @@ def export_recording(origin: Origin, out: Path) -> list[Path]:
     return written
 
 
+def export_positions(origin: Origin, out: Path) -> list[Path]:
+    """Write `positions/<clip>.csv`: everybody on the pitch, triangulated or by the feet alone."""
+    written = []
+    for clip in origin.clips:
+        written.append(out / "positions" / f"{clip}.csv")
+        write_positions(written[-1], clip_positions(origin.run, clip), origin.spec.fps)
+    return written
+
+
 EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
     "worldpose": export_worldpose,
+    "positions": export_positions,
     "trc": export_markers,
     "bvh": export_motion,
     "challenge": export_challenge,

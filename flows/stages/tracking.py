@@ -61,7 +61,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     return {
         **({"identities": said} if said else {}),
         **clip_sources(match, unit),
-        "pitch_size": None if pitch is None else [pitch.length, pitch.width],
+        "pitch": None if pitch is None else pitch.model_dump(include={"length", "width", "crown"}),
         "people": roster_limit(match.folder.spec.roster),
     }
 

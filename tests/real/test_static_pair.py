@@ -3,11 +3,13 @@
 WORLDPOSE_TEST_DATA names a folder with `static_pair` (videos and CVAT clicks).
 """
 
+import csv
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
-from command_line import worldpose
+from command_line import succeed, worldpose
 from static_pair import CROWN, read_clicks, write_static_pair
 
 from data_contracts.pitch import PitchSpec
@@ -66,11 +68,19 @@ def test_a_pitch_in_yards_is_told_by_hand_clicks_of_points_of_the_laws(side):
 
 
 @pytest.mark.usefixtures("server")
-def test_cameras_on_one_mast_end_partial_with_the_true_reason(tmp_path):
+def test_cameras_on_one_mast_place_people_on_the_pitch_and_say_why(tmp_path):
     write_static_pair(DATA, tmp_path / "pair", frame_count=4)
-    answer = worldpose("run", tmp_path / "pair", "--project", tmp_path / "worldpose-data")
+    project = ("--project", tmp_path / "worldpose-data")
+    answer = worldpose("run", tmp_path / "pair", *project)
     assert answer.code == 4, answer.err
     # 0.46 m between cameras, about 50 m from the people.
     assert "the rays of one person meet at 0." in answer.err
     assert "the cameras are 0.4" in answer.err
     assert "contradicts" not in answer.err
+    assert "people are placed on the pitch from their feet" in answer.err
+    succeed("export", "pair", *project, "--format", "positions", "--out", tmp_path / "out")
+    with (tmp_path / "out/positions/clip.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["frame"] == "10"]
+    assert 23 <= len(rows) <= 30  # 22 players and the referee are in the images
+    heights = [float(row["height_m"]) for row in rows]
+    assert 1.5 < np.median(heights) < 2.0

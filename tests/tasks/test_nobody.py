@@ -23,6 +23,9 @@ def empty(tiny, tmp_path):
     shutil.copy(folder / "reference" / "calibration.toml", folder)
     (folder / "detections" / "clip.npz").unlink(missing_ok=True)  # of a clip's own camera
     spec = yaml.safe_load((folder / "match.yaml").read_text())
+    (folder / "pitch.json").unlink()
+    shutil.rmtree(folder / "annotations")
+    spec["pitch"] = "none"  # on a pitch, feet would place everybody
     spec["roster"] = [{"id": "ann"}]
     spec["clips"] = [
         {"id": "first", "frame_count": 6, "people": {0: "ann"}},

@@ -59,6 +59,7 @@ class Identities:
                     frames_seen=len(present),
                     views=float(views[present].mean()),
                     name=self.names.get(person),
+                    kind="triangulated" if np.isfinite(self.joints[:, k]).any() else "plane",
                 )
             )
         return tuple(found)

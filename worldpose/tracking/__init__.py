@@ -6,17 +6,27 @@ and camera, quick joints [m], and a summary of each track.
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
 from worldpose.tracking.doubts import describe_doubts
+from worldpose.tracking.feet import GroundPositions, locate_feet
+from worldpose.tracking.ground_tracks import GroundTracks, locate_tracks, track_on_plane
 from worldpose.tracking.people_selection import roster_limit
+from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
 from worldpose.tracking.settings import TrackingSettings
 from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
 __all__ = [
+    "GroundPositions",
+    "GroundTracks",
     "NoPeople",
+    "PlaneClocks",
     "Tracking",
     "TrackingReport",
     "TrackingSettings",
     "describe_doubts",
     "diagnose_no_people",
+    "estimate_plane_clocks",
+    "locate_feet",
+    "locate_tracks",
     "roster_limit",
+    "track_on_plane",
     "track_people",
 ]

@@ -1,0 +1,230 @@
+"""People on the pitch plane: places of feet, tracks, clock offsets; known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_contracts.pitch import PitchSpec
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import stepped
+from worldpose.tracking import (
+    GroundPositions,
+    estimate_plane_clocks,
+    locate_feet,
+    locate_tracks,
+    track_on_plane,
+)
+from worldpose.tracking.feet import ANKLE_HEIGHT
+
+PITCH = PitchTemplate.from_spec(PitchSpec(crown=0.0))
+SIZE = (105.0, 68.0)
+FPS = 25.0
+
+
+def seen_feet(cameras, places, *, height=ANKLE_HEIGHT):
+    """Keypoints and confidence of people whose ankles are both at places (frames, people, 2)."""
+    frames, people = places.shape[:2]
+    ankles = np.concatenate([places, np.full((frames, people, 1), height)], axis=-1)
+    keypoints = np.full((frames, len(cameras.focal), people, 17, 2), np.nan)
+    confidence = np.full(keypoints.shape[:-1], np.nan)
+    for c in range(len(cameras.focal)):
+        pixels = cameras[c].project(ankles.reshape(-1, 3)).reshape(frames, people, 2)
+        keypoints[:, c, :, 15:17] = pixels[:, :, None]
+        confidence[:, c, :, 15:17] = np.isfinite(pixels[:, :, :1])
+    return keypoints, confidence
+
+
+def positions_at(places, std=0.1):
+    """Places (frames, cameras, detections, 2) with round errors."""
+    noise = np.broadcast_to(std**2 * np.eye(2), (*places.shape, 2)).copy()
+    return GroundPositions(places, noise, np.zeros_like(noise), np.full(places.shape[:-1], 1.8))
+
+
+def walkers(frames, starts, velocities):
+    time = np.arange(frames)[:, None, None] / FPS
+    return np.asarray(starts)[None] + time * np.asarray(velocities)[None]
+
+
+def test_feet_on_the_grass_are_found_where_they_are(ring):
+    places = np.array([[[0.0, 0.0], [5.0, -8.0], [-11.0, 3.0]]])
+    cameras = ring(3)
+    found = locate_feet(cameras, *seen_feet(cameras, places), PITCH)
+    known = np.isfinite(found.xy)
+    assert known[:, :, 0].all()
+    expected = np.broadcast_to(places[:, None], found.xy.shape)
+    np.testing.assert_allclose(found.xy[known], expected[known], atol=1e-6)
+
+
+def test_the_error_is_long_along_the_line_of_sight(ring):
+    camera = ring(3)
+    found = locate_feet(camera, *seen_feet(camera, np.zeros((1, 1, 2))), PITCH)
+    for c in range(3):
+        values, vectors = np.linalg.eigh(found.noise[0, c, 0])
+        sight = camera[c].center[:2] / np.linalg.norm(camera[c].center[:2])
+        assert abs(vectors[:, 1] @ sight) > 0.999
+        assert values[1] > 2.0 * values[0] > 0.0
+
+
+def test_a_pixel_above_the_horizon_is_nobody(ring):
+    camera = ring(1)
+    keypoints = np.full((1, 1, 1, 17, 2), np.nan)
+    keypoints[..., 15:17, :] = (960.0, 5.0)  # 20 degrees over the middle of the image
+    assert camera[0].unproject(keypoints[0, 0, 0, 15:16]).directions[0, 2] > 0.0
+    found = locate_feet(camera, keypoints, np.ones((1, 1, 1, 17)), PITCH)
+    assert np.isnan(found.xy).all()
+
+
+def test_a_box_tells_the_place_without_ankles_unless_it_ends_with_the_image(ring):
+    camera = ring(1)
+    foot = camera[0].project(np.zeros((1, 3)))[0]
+    boxes = np.array(
+        [[[[foot[0] - 20, foot[1] - 90, foot[0] + 20, foot[1]], [0, 900, 40, 1079.5]]]]
+    )
+    keypoints = np.full((1, 1, 2, 17, 2), np.nan)
+    found = locate_feet(camera, keypoints, np.zeros((1, 1, 2, 17)), PITCH, boxes=boxes)
+    assert np.linalg.norm(found.xy[0, 0, 0]) < 0.5
+    assert np.isnan(found.xy[0, 0, 1]).all()
+    assert np.isnan(locate_feet(camera, keypoints, np.zeros((1, 1, 2, 17)), PITCH).xy).all()
+
+
+def test_the_upper_edge_of_a_box_tells_the_height(ring):
+    camera = ring(2)
+    foot, head = (
+        np.stack([camera[c].project(np.array([[2.0, 1.0, z]]))[0] for c in (0, 1)])
+        for z in (0.0, 1.83)
+    )
+    boxes = np.concatenate([head - [20, 0], foot + [20, 0]], axis=1)[None, :, None]
+    keypoints = np.full((1, 2, 1, 17, 2), np.nan)
+    found = locate_feet(camera, keypoints, np.zeros((1, 2, 1, 17)), PITCH, boxes=boxes)
+    np.testing.assert_allclose(found.height, 1.83, atol=0.06)
+
+
+def test_calibration_errors_move_places_by_the_stated_covariance(ring):
+    camera = ring(1)
+    stated = np.zeros((1, 12, 12))
+    stated[0, :7, :7] = np.diag(np.array([2e-3, 1e-3, 1e-3, 0.05, 0.04, 0.03, 2e-3]) ** 2)
+    seen = seen_feet(camera, np.array([[[4.0, -6.0]]]))
+    found = locate_feet(camera, *seen, PITCH, camera_covariance=stated)
+    rng = np.random.default_rng(0)
+    moved = []
+    for _ in range(2000):
+        step = np.sqrt(np.diag(stated[0])) * rng.standard_normal(12)
+        other = Camera.stack([stepped(camera[0], step)])
+        moved.append(locate_feet(other, *seen, PITCH).xy[0, 0, 0])
+    np.testing.assert_allclose(found.calibration[0, 0, 0], np.cov(np.array(moved).T), rtol=0.15)
+
+
+def test_two_people_who_cross_keep_their_tracks():
+    truth = walkers(100, [[-6.0, 0.0], [6.0, 1.2]], [[3.0, 0.0], [-3.0, 0.0]])
+    noisy = truth[:, None] + 0.05 * np.random.default_rng(1).standard_normal((100, 1, 2, 2))
+    noisy[::2] = noisy[::2, :, ::-1]  # the order of the detections says nothing
+    tracks = track_on_plane(positions_at(noisy, 0.05), FPS, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == 2
+    errors = np.linalg.norm(tracks.xy[:, :, None] - truth[:, None], axis=-1)
+    assert (errors.max(axis=0).min(axis=1) < 0.2).all()
+    speeds = np.sort(tracks.velocity[50, :, 0])
+    np.testing.assert_allclose(speeds, [-3.0, 3.0], atol=0.3)
+
+
+def test_a_person_unseen_for_a_moment_keeps_the_track():
+    truth = walkers(80, [[0.0, 0.0]], [[4.0, 1.0]])
+    seen = truth[:, None].copy()
+    seen[30:45] = np.nan
+    tracks = track_on_plane(positions_at(seen), FPS, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == 1
+    assert (tracks.detection_index[30:45] == -1).all()
+    assert np.linalg.norm(tracks.xy[37, 0] - truth[37, 0]) < 0.3
+
+
+def test_one_person_before_two_cameras_is_one_track():
+    rng = np.random.default_rng(2)
+    truth = walkers(60, [[0.0, 0.0], [3.0, 0.0]], [[2.0, 0.0], [2.0, 0.0]])
+    seen = np.repeat(truth[:, None], 2, axis=1) + 0.1 * rng.standard_normal((60, 2, 2, 2))
+    tracks = track_on_plane(positions_at(seen), FPS, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == 2
+    assert (tracks.detection_index >= 0).all()
+
+
+def test_a_second_box_of_a_person_is_no_track_and_a_tackle_is_two_people():
+    truth = walkers(75, [[0.0, 0.0]], [[3.0, 0.0]])
+    double = np.full((75, 1, 2, 2), np.nan)
+    double[:, :, 0] = truth
+    double[20:45, :, 1] = truth[20:45] + [0.5, 0.2]
+    assert track_on_plane(positions_at(double), FPS, pitch_size=SIZE).xy.shape[1] == 1
+    tackle = walkers(75, [[0.0, 0.0], [0.0, 3.0]], [[3.0, 0.0], [3.0, -1.8]])[:, None]
+    assert track_on_plane(positions_at(tackle), FPS, pitch_size=SIZE).xy.shape[1] == 2
+
+
+def test_stated_regions_hold_the_truth():
+    rng = np.random.default_rng(3)
+    squared = []
+    for _ in range(20):
+        velocity = np.cumsum(rng.standard_normal((75, 2)) * 4.0 / np.sqrt(5 * FPS), axis=0)
+        truth = np.cumsum(velocity / FPS, axis=0)
+        error = np.zeros((75, 2))
+        for f in range(1, 75):  # correlated over half a step
+            error[f] = 0.78 * error[f - 1] + 0.63 * 0.15 * rng.standard_normal(2)
+        seen = (truth + error)[:, None, None]
+        tracks = track_on_plane(positions_at(seen, 0.15), FPS, pitch_size=SIZE)
+        off = tracks.xy[10:, 0] - truth[10:]
+        inverse = np.linalg.inv(tracks.covariance[10:, 0])
+        squared.append(np.einsum("fi,fij,fj->f", off, inverse, off))
+    assert 0.9 < np.mean(np.concatenate(squared) < 5.99) <= 1.0
+
+
+def test_people_beside_the_pitch_and_glimpses_are_no_tracks():
+    bench = walkers(60, [[0.0, 40.0]], [[0.0, 0.0]])[:, None]
+    assert track_on_plane(positions_at(bench), FPS, pitch_size=SIZE).xy.shape[1] == 0
+    glimpse = np.full((60, 1, 1, 2), np.nan)
+    glimpse[20:23] = 0.0
+    assert track_on_plane(positions_at(glimpse), FPS, pitch_size=SIZE).xy.shape[1] == 0
+    flag = walkers(60, [[52.4, -33.9]], [[0.0, 0.0]])[:, None]
+    assert track_on_plane(positions_at(flag), FPS, pitch_size=SIZE).xy.shape[1] == 0
+    mark = positions_at(walkers(60, [[41.5, 0.0]], [[0.0, 0.0]])[:, None])
+    mark.height[:] = 0.3
+    assert track_on_plane(mark, FPS, pitch_size=SIZE).xy.shape[1] == 0
+    nobody = np.full((60, 1, 0, 2), np.nan)
+    assert track_on_plane(positions_at(nobody), FPS, pitch_size=SIZE).xy.shape == (60, 0, 2)
+
+
+def test_known_detections_give_the_places_that_tracking_gave():
+    rng = np.random.default_rng(4)
+    truth = walkers(50, [[0.0, 0.0], [9.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]])
+    positions = positions_at(truth[:, None] + 0.1 * rng.standard_normal((50, 1, 2, 2)))
+    tracks = track_on_plane(positions, FPS, pitch_size=SIZE)
+    again = locate_tracks(positions, tracks.detection_index, FPS)
+    np.testing.assert_allclose(again.xy, tracks.xy)
+    np.testing.assert_allclose(again.covariance, tracks.covariance)
+
+
+@pytest.mark.parametrize("late", [-7.0, 0.0, 3.4])
+def test_runners_tell_the_clock_offset_of_two_cameras(late):
+    rng = np.random.default_rng(5)
+    starts = rng.uniform([-30, -20], [30, 20], (8, 2))
+    time = np.arange(100) / FPS
+    turn = rng.uniform(0, 6, 8)
+
+    def places(at):
+        phase = 0.8 * at[:, None] + turn
+        return starts + 5.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)
+
+    # Camera 1 shows the world `late` frames after camera 0, and its calibration is off.
+    seen = np.stack([places(time), 1.004 * places(time + late / FPS) + [0.2, -0.1]], axis=1)
+    seen += 0.1 * rng.standard_normal(seen.shape)
+    clocks = estimate_plane_clocks(positions_at(seen), FPS, pitch_size=SIZE)
+    found = (clocks.seconds[1] - clocks.seconds[0]) * FPS
+    assert clocks.people >= 6
+    assert abs(found - late) < max(0.3, 6.0 * clocks.std[0] * FPS)
+    assert clocks.std[0] * FPS < 0.3
+    tracks = track_on_plane(positions_at(seen), FPS, clocks.seconds, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == 8
+
+
+def test_people_of_one_camera_tell_no_clock():
+    truth = walkers(60, [[0.0, 0.0], [9.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]])[:, None]
+    assert np.isinf(estimate_plane_clocks(positions_at(truth), FPS, pitch_size=SIZE).std).all()
+    apart = np.concatenate([truth, truth + [30.0, 0.0]], axis=1)
+    apart = replace(positions_at(apart))
+    assert np.isinf(estimate_plane_clocks(apart, FPS, pitch_size=SIZE).std).all()

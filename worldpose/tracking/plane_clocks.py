@@ -1,0 +1,200 @@
+"""Clock offsets of cameras, from people who run in the view of two cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.tracking.feet import GroundPositions
+from worldpose.tracking.ground_tracks import track_on_plane
+
+PAIR_DISTANCE_M: Final = 2.0
+"""Largest distance of two cameras' positions of one person [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneClocks:
+    """Clock offsets of cameras, by the people that they see on the plane.
+
+    Attributes:
+        seconds: (cameras,) time of each camera's image minus the time of its frame [s], relative to
+            the mean of its group; 0 where not determined.
+        std: (cameras,) standard deviation [s]; infinite where not determined.
+        people: pairs of tracks that tell the offsets.
+    """
+
+    seconds: Floats
+    std: Floats
+    people: int
+
+
+def estimate_plane_clocks(
+    positions: GroundPositions,
+    fps: float,
+    *,
+    pitch_size: tuple[float, float],
+    max_offset_s: float = 1.0,
+) -> PlaneClocks:
+    """Return the cameras' clock offsets from people who run in the view of two cameras.
+
+    Each camera tracks its people alone. Two cameras' tracks of one person differ by the velocity
+    times the clock offset, and by the disagreement of the two calibrations, which is an affine map
+    here. The offset is searched in whole frames and refined below a frame; people, one at a time
+    left out (jackknife), give its standard deviation.
+
+    Args:
+        positions: feet of a clip.
+        fps: frames per second [1/s].
+        pitch_size: length and width of the pitch [m].
+        max_offset_s: largest offset between two cameras [s].
+    """
+    cameras = positions.xy.shape[1]
+    alone = [
+        track_on_plane(_one_camera(positions, c), fps, pitch_size=pitch_size)
+        for c in range(cameras)
+    ]
+    rows, values, weights, count = [], [], [], 0
+    for a, b in combinations(range(cameras), 2):
+        found = _compare_clocks(alone[a].xy, alone[b].xy, fps, max_offset_s)
+        if found is None:
+            continue
+        row = np.zeros(cameras)
+        row[a], row[b] = -1.0, 1.0
+        rows.append(row)
+        values.append(found[0])
+        weights.append(1.0 / found[1])
+        count += found[2]
+    seconds, std = np.zeros(cameras), np.full(cameras, np.inf)
+    if rows:
+        scale = np.array(weights)
+        matrix = np.stack(rows) * scale[:, None]
+        inverse = np.linalg.pinv(matrix.T @ matrix)
+        told = np.abs(matrix).sum(axis=0) > 0.0
+        seconds = inverse @ matrix.T @ (np.array(values) * scale)
+        std[told] = np.sqrt(np.diag(inverse))[told]
+    return PlaneClocks(seconds, std, count)
+
+
+MIN_RUNNERS: Final = 3
+"""Least pairs of tracks that determine a clock offset [1]."""
+STEPS: Final = 10
+"""Refinements of a clock offset [1]."""
+
+
+def _one_camera(positions: GroundPositions, camera: int) -> GroundPositions:
+    one = slice(camera, camera + 1)
+    return GroundPositions(
+        positions.xy[:, one],
+        positions.noise[:, one],
+        positions.calibration[:, one],
+        positions.height[:, one],
+    )
+
+
+def _compare_clocks(
+    a: Floats, b: Floats, fps: float, max_offset_s: float
+) -> tuple[float, float, int] | None:
+    """Return clock of b minus clock of a, its standard deviation [s], and the number of pairs.
+
+    Args:
+        a: (frames, persons, 2) [m], places by the first camera.
+        b: (frames, others, 2) [m], by the second.
+        fps: frames per second [1/s].
+        max_offset_s: largest offset [s].
+    """
+    most = min(round(max_offset_s * fps), len(a) // 2)
+    if not a.shape[1] or not b.shape[1]:
+        return None
+    costs = {late: _shifted_cost(a, b, late) for late in range(-most, most + 1)}
+    known = {late: cost for late, cost in costs.items() if np.isfinite(cost)}
+    if not known:
+        return None
+    late = float(min(known, key=lambda each: known[each]))
+    pairs = _pair_tracks(a, _shift(b, late))
+    if len(pairs) < MIN_RUNNERS:
+        return None
+    for _ in range(STEPS):
+        step = _refine(a, b, late, pairs)
+        late = float(np.clip(late + np.clip(step, -1.0, 1.0), -most, most))
+        if abs(step) < 1e-3:
+            break
+    left_out = [
+        late + _refine(a, b, late, [pair for pair in pairs if pair is not out]) for out in pairs
+    ]
+    n = len(pairs)
+    std = float(np.sqrt((n - 1) / n * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
+    return -late / fps, max(std, 0.01) / fps, n
+
+
+def _shift(b: Floats, late: float) -> Floats:
+    """Return tracks (frames, persons, 2) at `late` frames after each frame; NaN outside."""
+    at = np.arange(len(b)) + late
+    lower = np.floor(at).astype(np.int64)
+    part = (at - lower)[:, None, None]
+    inside = (lower >= 0) & (lower + 1 < len(b))
+    inside |= (lower >= 0) & (lower < len(b)) & (part[:, 0, 0] == 0.0)
+    first = b[np.clip(lower, 0, len(b) - 1)]
+    second = b[np.clip(lower + 1, 0, len(b) - 1)]
+    between = np.where(part > 0.0, (1.0 - part) * first + part * second, first)
+    return np.where(inside[:, None, None], between, np.nan)
+
+
+def _mutual(a: Floats, b: Floats) -> list[tuple[int, int, float]]:
+    """Return mutual nearest neighbours (i, j, distance) within `PAIR_DISTANCE_M` of one frame."""
+    distance = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
+    return [
+        (i, int(j), float(distance[i, j]))
+        for i, j in enumerate(nearest)
+        if back[j] == i and distance[i, j] <= PAIR_DISTANCE_M
+    ]
+
+
+def _shifted_cost(a: Floats, b: Floats, late: int) -> float:
+    """Return the mean squared distance of nearest people [m^2]; NaN if fewer than `MIN_RUNNERS`."""
+    shifted = _shift(b, float(late))
+    squared = [d**2 for f in range(0, len(a), 3) for _, _, d in _mutual(a[f], shifted[f])]
+    return float(np.mean(squared)) if len(squared) >= MIN_RUNNERS else np.nan
+
+
+def _pair_tracks(a: Floats, b: Floats) -> list[tuple[int, int]]:
+    """Return the tracks that are nearest to each other in most of their common frames."""
+    votes: dict[tuple[int, int], int] = {}
+    for f in range(len(a)):
+        for i, j, _ in _mutual(a[f], b[f]):
+            votes[i, j] = votes.get((i, j), 0) + 1
+    common = np.isfinite(a[..., 0]).T.astype(float) @ np.isfinite(b[..., 0]).astype(float)
+    return [pair for pair, n in votes.items() if n >= 5 and n > 0.5 * common[pair]]
+
+
+def _refine(a: Floats, b: Floats, late: float, pairs: list[tuple[int, int]]) -> float:
+    """Return the change of `late` [frames] that reduces the distances, beside an affine map."""
+    here, faster = _shift(b, late), _shift(b, late + 0.5) - _shift(b, late - 0.5)
+    rows, values = [], []
+    for i, j in pairs:
+        known = np.isfinite(a[:, i, 0]) & np.isfinite(here[:, j, 0])
+        known &= np.isfinite(faster[:, j, 0])
+        place, velocity, off = here[known, j], faster[known, j], a[known, i] - here[known, j]
+        for axis in range(2):
+            design = np.zeros((len(place), 7))
+            design[:, 0] = velocity[:, axis]
+            design[:, 1 + 3 * axis] = 1.0
+            design[:, 2 + 3 * axis : 4 + 3 * axis] = place / 30.0
+            rows.append(design)
+            values.append(off[:, axis])
+    matrix, value = np.concatenate(rows), np.concatenate(values)
+    weight = np.ones(len(value))
+    solution = np.zeros(7)
+    ridge = 1e-3 * np.eye(7)
+    for _ in range(5):
+        weighted = matrix * weight[:, None]
+        solution = np.linalg.solve(weighted.T @ matrix + ridge, weighted.T @ value)
+        residual = np.abs(value - matrix @ solution)
+        scale = 1.5 * 1.4826 * np.median(residual) + 1e-6
+        weight = np.minimum(1.0, scale / np.maximum(residual, 1e-9))
+    return float(solution[0])
