@@ -282,8 +282,14 @@ def test_a_bug_is_called_one_and_its_traceback_is_kept(monkeypatch, capsys, flag
 
 
 def test_a_run_without_people_is_partial_and_says_why(tiny, tmp_path):
+    folder = shutil.copytree(tiny, tmp_path / "match")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    (folder / "pitch.json").unlink()
+    shutil.rmtree(folder / "annotations")
+    spec = yaml.safe_load((folder / "match.yaml").read_text()) | {"pitch": "none"}
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec))  # on a pitch, feet place people
     asked = ("--until", "tracking", "--set", "tracking.min_angle_rad=1.57")
-    answer = worldpose("run", tiny, "--project", tmp_path / "new", *asked)
+    answer = worldpose("run", folder, "--project", tmp_path / "new", *asked)
     assert answer.code == 4
     assert "tracking/clip found no person" in answer.err
     assert "tracking.min_angle_rad asks for 90 (1.57 rad)" in answer.err
