@@ -33,7 +33,7 @@ MOMENTS = 6
 """Number of frames of a clip whose players count."""
 
 
-def calibrated(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticCalibration]:
+def calibrate_static(scene: Scene, scenario: Scenario, seed: int) -> dict[str, StaticCalibration]:
     """Return every static camera from clicks and the lines of one image."""
     surveyed = PitchTemplate.from_spec(scene.surveyed)
     painted = PitchTemplate.from_spec(scenario.pitch)
@@ -116,7 +116,7 @@ def main() -> None:
     after: list[tuple[Floats, Floats]] = []
     for seed in options.seeds:
         scene = simulate_scene(scenario, seed)
-        known = calibrated(scene, scenario, seed)
+        known = calibrate_static(scene, scenario, seed)
         clip = as_clip(scene, scenario.fps, known)
         begin = time.process_time()
         adjusted = adjust_cameras(clip)

@@ -122,7 +122,7 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     return figures
 
 
-def thinned(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> NDArray[np.bool_]:
+def thin_out(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> NDArray[np.bool_]:
     """Remove all but some cameras' detections for a while; return (frames, persons) when."""
     rng = np.random.default_rng(seed)
     frames, cameras, persons = index.shape
@@ -155,7 +155,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     who, away = nearest(full, scene.truth.joints)
     index = index[:, :, away < 0.5].copy()
     who = who[away < 0.5]
-    dark = thinned(scene, index, left, seed)
+    dark = thin_out(scene, index, left, seed)
     placed = reconstruct_joints(
         cameras, TrackedDetections(*arrays, index), fps, TRIANGULATION
     ).triangulation
@@ -164,11 +164,11 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     static = find_ray_constraints(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
-    def fitted(views: list, glimpses: object = None) -> BodyFit:
+    def fit(views: list, glimpses: object = None) -> BodyFit:
         evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, glimpses)
         return fit_bodies(BODY, evidence, SETTINGS, ground)
 
-    first = fitted([static])
+    first = fit([static])
     own = identify_people(scene.broadcast, scene.observations["clip"].keypoints, first.joints)
     moving = constrain_to_rays(scene.broadcast, own, first.joints)
     bodies = BodyParameters(
@@ -183,9 +183,9 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     glimpses = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
     fits = {
         "static cameras alone": first,
-        "+ estimates": fitted([static], glimpses),
-        "+ broadcast keypoints": fitted([static, moving]),
-        "+ both": fitted([static, moving], glimpses),
+        "+ estimates": fit([static], glimpses),
+        "+ broadcast keypoints": fit([static, moving]),
+        "+ both": fit([static, moving], glimpses),
     }
     counted = dark & np.isfinite(own[..., 0]).any(axis=-1) & np.isfinite(first.joints[..., 0, 0])
     truth = scene.truth.joints[:, who]

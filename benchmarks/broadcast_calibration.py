@@ -90,7 +90,7 @@ def start_of(true: MovingCamera, rng: np.random.Generator) -> MovingCamera:
     wave = 0.01 * np.sin(0.04 * np.arange(frames))
     step[:, 3] = wave + 0.002 * rng.standard_normal(frames)
     step[:, 4] = -0.1
-    return true.stepped(step, [0.4, -0.5, 0.3, 4.0, 4.0])
+    return true.take_step(step, [0.4, -0.5, 0.3, 4.0, 4.0])
 
 
 def figures(camera: MovingCamera, true: MovingCamera, points: PointEvidence) -> str:
@@ -115,7 +115,7 @@ def by_scipy(start: MovingCamera, problem: Problem, seconds: float) -> tuple[Mov
     best: list[tuple[float, Floats]] = []
 
     def camera_at(x: Floats) -> MovingCamera:
-        return start.stepped(x[:-CLIP_SIZE].reshape(frames, FRAME_SIZE), x[-CLIP_SIZE:])
+        return start.take_step(x[:-CLIP_SIZE].reshape(frames, FRAME_SIZE), x[-CLIP_SIZE:])
 
     def residuals(x: Floats) -> Floats:
         camera = camera_at(x)

@@ -89,7 +89,7 @@ def lines_of(
     return together(parts)
 
 
-def judged(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats]:
+def judge_clip(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats]:
     """Return an emulated clip's squared errors as quantiles of the regions' distribution."""
     settings = BroadcastCalibrationSettings()
     scenario = SCENARIOS[name]
@@ -132,7 +132,7 @@ def main() -> None:
     told: dict[str, list[float]] = {}
     for seed in options.seeds:
         for name in ("broadcast-pan", "broadcast-zoom"):
-            clip = judged(name, seed, options.seconds, options.fps)
+            clip = judge_clip(name, seed, options.seconds, options.fps)
             for kind, shares in clip.items():
                 held = [float((shares < share).mean()) for share in SHARES]
                 told.setdefault(kind, []).append(held)

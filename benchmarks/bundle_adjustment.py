@@ -33,7 +33,7 @@ from scipy.sparse import csr_matrix
 from worldpose.bundle_adjustment import Problem, SolverSettings, solve
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import PARAMETERS, stepped
+from worldpose.static_calibration import PARAMETERS, step_camera
 
 Solution = tuple[Camera, np.ndarray]
 Run = Callable[[], Solution]
@@ -75,7 +75,7 @@ def make_problem(cameras: int, frames: int, players: int) -> Problem:
     point_of, camera_of = np.nonzero(seen)
     image = pixels[camera_of, point_of] + 1.8 * rng.standard_normal((len(point_of), 2))
     step = np.array([3e-3] * 3 + [0.2] * 3 + [0.01] + [0.0] * 5)
-    base = stepped(true, step * rng.standard_normal((cameras, len(step))))
+    base = step_camera(true, step * rng.standard_normal((cameras, len(step))))
     base = replace(
         base,
         principal_point=np.tile([959.5, 539.5], (cameras, 1)),
@@ -225,7 +225,7 @@ def scipy_side(problem: Problem) -> Run:
         step[:, :FREE] = numbers[: count * FREE].reshape(count, FREE)
         points = problem.points.copy()
         points[free] = numbers[count * FREE :].reshape(-1, 3)
-        return stepped(problem.cameras, step), points
+        return step_camera(problem.cameras, step), points
 
     def residuals(numbers: np.ndarray) -> np.ndarray:
         cameras, points = solution_of(numbers)

@@ -193,7 +193,7 @@ def people(seconds: float, data: Path | None, rng: np.random.Generator) -> NDArr
 # --- cameras --------------------------------------------------------------------------------
 
 
-def looking(
+def look_at(
     center: NDArray,
     target: NDArray,
     focal: float,
@@ -241,10 +241,10 @@ def random_camera(middle: NDArray, rng: np.random.Generator) -> Camera:
             break
     else:
         lens = np.zeros(5)
-    return looking(center, target, focal, lens, size, rng.normal(0, 0.01))
+    return look_at(center, target, focal, lens, size, rng.normal(0, 0.01))
 
 
-def perturbed(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camera:
+def perturb(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camera:
     """Return the camera with a random calibration error of `sigma` (12,)."""
     step = rng.normal(0, sigma)
     pose = camera.cam_from_world
@@ -271,7 +271,7 @@ class Detector:
     false_people: float
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator) -> Detector:
+    def draw(cls, rng: np.random.Generator) -> Detector:
         """Draw a detector."""
         return cls(
             bias=rng.normal(0, 0.012, (17, 2)),
@@ -330,7 +330,7 @@ def detect(
     return found, visible
 
 
-def padded(found: list[list[list[NDArray]]]) -> NDArray:
+def pad(found: list[list[list[NDArray]]]) -> NDArray:
     """Return (frames, cameras, detections, 17, 2) from each camera's people of every frame."""
     frames = max(len(camera) for camera in found)
     most = max(1, *(len(frame) for camera in found for frame in camera))
@@ -448,7 +448,7 @@ def _attempt(rng: np.random.Generator, kind: str | None, data: Path | None) -> R
     count = int(rng.choice([4, 5, 6, 8, 10, 12, 15, 18]))
     middle = np.median(world[:, :, 0, :2], axis=(0, 1))
     true = [random_camera(middle, rng) for _ in range(count)]
-    detector = Detector.drawn(rng)
+    detector = Detector.draw(rng)
     moments = world[
         np.minimum(np.round(np.arange(frames) * 100.0 / fps).astype(int), len(world) - 1)
     ]
@@ -457,7 +457,7 @@ def _attempt(rng: np.random.Generator, kind: str | None, data: Path | None) -> R
         own, visible = detect(camera, moments, detector, rng)
         found.append(own)
         seen.append(visible)
-    keypoints = padded(found)
+    keypoints = pad(found)
     confidence = np.where(np.isfinite(keypoints[..., 0]), rng.uniform(0.3, 1.0), np.nan)
     confidence *= rng.uniform(0.7, 1.0, confidence.shape)
     clicked = rng.random() < 0.5 and kind not in ("focal", "lens")
@@ -469,7 +469,7 @@ def _attempt(rng: np.random.Generator, kind: str | None, data: Path | None) -> R
         sigma[:3] = 0.001 * scale
         sigma[3:6] = 0.0015 * distance * scale
         sigma[6] = 0.003 * scale
-        cameras.append(perturbed(camera, sigma, rng))
+        cameras.append(perturb(camera, sigma, rng))
         covariance.append(np.diag(sigma**2))
     rig = RandomRig(
         cameras,

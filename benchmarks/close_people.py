@@ -225,7 +225,7 @@ def _detect(
                 )
                 pose[lost | ~((pose > 0) & (pose < IMAGE)).all(-1)] = np.nan
                 given.append((pose, p))
-            given = _merged(rng, given)
+            given = _merge_close(rng, given)
             if has_coat[c] and rng.random() < 0.5:
                 pose = found[rng.integers(people)]
                 given.append((pose - pose.mean(axis=0) + coat[c], -1))
@@ -239,7 +239,7 @@ def _detect(
     return keypoints, confidence, owner
 
 
-def _merged(
+def _merge_close(
     rng: np.random.Generator, given: list[tuple[NDArray[np.float64], int]]
 ) -> list[tuple[NDArray[np.float64], int]]:
     """Return detections after random merges of two with large overlap."""

@@ -48,14 +48,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    rendering, pictures = rendered(asked.people, asked.frames)
-    decoding = decoded(pictures)
+    rendering, pictures = render_crowd(asked.people, asked.frames)
+    decoding = time_decoding(pictures)
     detector, estimator = load_bundled_detector(), load_bundled_pose()
     detector.detect(pictures[:1])
-    looking, found = timed(lambda: detector.detect(pictures))
+    looking, found = time_work(lambda: detector.detect(pictures))
     people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
     estimator.estimate(pictures[0], people[0].boxes)
-    posing, _ = timed(
+    posing, _ = time_work(
         lambda: [
             estimator.estimate(picture, each.boxes)
             for picture, each in zip(pictures, people, strict=True)
@@ -84,7 +84,7 @@ def main() -> None:
         )
 
 
-def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
+def render_crowd(people: int, frames: int) -> tuple[float, list[Image]]:
     """Return the images of a moving crowd from one camera, after the seconds that they took."""
     scenario = SCENARIOS["match"]
     pitch = PitchTemplate.from_spec(scenario.pitch)
@@ -109,20 +109,20 @@ def rendered(people: int, frames: int) -> tuple[float, list[Image]]:
         return render_frame(view, cast, *moment, frame=frame).image
 
     film(0)
-    return timed(lambda: [film(frame) for frame in range(frames)])
+    return time_work(lambda: [film(frame) for frame in range(frames)])
 
 
-def decoded(pictures: list[Image]) -> float:
+def time_decoding(pictures: list[Image]) -> float:
     """Return the seconds to decode as many images from a video."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pictures.mp4"
         write_video(path, pictures, FPS)
         with open_video(path) as video:
-            seconds, _ = timed(lambda: list(video.frames(0, len(pictures))))
+            seconds, _ = time_work(lambda: list(video.frames(0, len(pictures))))
     return seconds
 
 
-def timed(work: Callable[[], Result]) -> tuple[float, Result]:
+def time_work(work: Callable[[], Result]) -> tuple[float, Result]:
     """Return processor seconds of some work, and its result."""
     start = time.process_time()
     result = work()

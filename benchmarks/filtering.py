@@ -57,14 +57,14 @@ def main() -> None:
         for about, changes in (("planted alone", alone), ("all errors", {"displaced": share})):
             noise = base.noise.model_copy(update=changes)
             changed = {"duration": options.duration, "noise": noise, "broadcast": None}
-            found, rejected, planted, honest = filtered(base.model_copy(update=changed), seed)
+            found, rejected, planted, honest = count_rejected(base.model_copy(update=changed), seed)
             print(
                 f"{options.scenario} {seed}, {about}: {100 * found / planted:.1f} % of {planted} "
                 f"planted found, {100 * rejected / honest:.2f} % of {honest} others rejected"
             )
 
 
-def filtered(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
+def count_rejected(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     """Return planted keypoints found, others rejected, and totals of planted and others."""
     scene = simulate_scene(scenario, seed)
     seen = scene.static_views()

@@ -39,7 +39,7 @@ def main() -> None:
         "--set", action="append", default=[], metavar="NAME=VALUE", help="of training.*"
     )
     asked = parser.parse_args()
-    labels = rendered(asked.folder, asked.scenes)
+    labels = rendered_labels(asked.folder, asked.scenes)
     print(f"{'net':10}{'figure':>8}{'before':>8}{'after':>8}{'gain':>8}{'steps':>7}{'CPU min':>9}")
     project, files = asked.folder / "project", {}
     for net in asked.net or ("people", "keypoints"):
@@ -47,10 +47,10 @@ def main() -> None:
         files[net] = project / "detectors" / version["file"]
         row = _row(net, version["figure"], version["before"], version["after"])
         print(f"{row}{version['steps']:7}{seconds / 60:9.1f}", flush=True)
-    print(_row("both", "ap50", stored(labels, {}), stored(labels, files)))
+    print(_row("both", "ap50", stored_ap50(labels, {}), stored_ap50(labels, files)))
 
 
-def stored(labels: Path, files: dict[str, Path]) -> float:
+def stored_ap50(labels: Path, files: dict[str, Path]) -> float:
     """Return AP50 of the boxes that `detection` stores for held-out images with these nets."""
     held_out = split(read_labels(labels), FineTuningSettings())[2]
     detector, pose = (
@@ -66,7 +66,7 @@ def _row(net: str, figure: str, before: float, after: float) -> str:
     return f"{net:10}{figure:>8}{before:8.3f}{after:8.3f}{after - before:+8.3f}"
 
 
-def rendered(folder: Path, scenes: int) -> Path:
+def rendered_labels(folder: Path, scenes: int) -> Path:
     """Return the labels of all scenes; render missing ones."""
     sys.path.insert(0, str(RECIPE))
     from scenes import SHIFTED, SIZE, read_set, render_set

@@ -55,14 +55,14 @@ def main() -> None:
     finder = PeopleFinder([load_bundled_detector()], load_bundled_pose(), settings)
     for seed in asked.seeds:
         counts = np.zeros((5, 2), int)
-        for name, camera, frame, bystanders in filmed(scenario, pitch, seed):
+        for name, camera, frame, bystanders in film(scenario, pitch, seed):
             found = boxes_of(finder, frame.image, None)
             on_pitch = boxes_of(finder, frame.image, Place(camera, pitch))
             players = frame.boxes[frame.visible >= SEEN]
-            counts[0] += len(players), np.count_nonzero(shared(players, found))
-            kept = shared(found, on_pitch, 0.99)
-            is_player = shared(found, frame.boxes[frame.visible > 0.0])
-            is_bystander = ~is_player & shared(found, bystanders)
+            counts[0] += len(players), np.count_nonzero(overlaps_any(players, found))
+            kept = overlaps_any(found, on_pitch, 0.99)
+            is_player = overlaps_any(found, frame.boxes[frame.visible > 0.0])
+            is_bystander = ~is_player & overlaps_any(found, bystanders)
             is_other = ~(is_player | is_bystander)
             is_stand = is_other & in_stands(found, camera, pitch)
             kinds = (is_player, is_bystander, is_stand, is_other & ~is_stand)
@@ -81,7 +81,7 @@ def main() -> None:
         )
 
 
-def filmed(
+def film(
     scenario: Scenario, pitch: PitchTemplate, seed: int
 ) -> Iterator[tuple[str, Camera, RenderedFrame, Floats]]:
     """Yield every static camera, its first image and the boxes of bystanders (n, 4) [px]."""
@@ -120,7 +120,7 @@ def in_stands(boxes: Floats, camera: Camera, pitch: PitchTemplate) -> NDArray[np
     return ~(near & (along > 0.0))
 
 
-def shared(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.bool_]:
+def overlaps_any(boxes: Floats, others: Floats, share: float = SHARED) -> NDArray[np.bool_]:
     """Return whether each box overlaps any of the others by a share (n,)."""
     if not len(others):
         return np.zeros(len(boxes), bool)

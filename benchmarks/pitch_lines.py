@@ -126,7 +126,7 @@ def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, i
     return shares
 
 
-def scored(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
+def score_images(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
     """Return JaC of every image with a camera."""
     return {
         key: jaccards(scorer, lines[key], fitted.calibration.estimate.camera, size)
@@ -266,7 +266,7 @@ def main() -> None:
     for name, (_, size) in SETS.items():
         lines = load_lines(given.data, name, given.half, given.every)
         fits = {key: fit(drawn, size, BROADCAST) for key, drawn in lines.items()}
-        scores = scored(scorer, lines, fits, size)
+        scores = score_images(scorer, lines, fits, size)
         seconds = np.median([fitted.seconds for fitted in fits.values()])
         print(f"{name}: {len(lines)} pictures, {1e3 * seconds:.0f} ms each (median)")
         residual = {key: fitted.residual for key, fitted in fits.items()}

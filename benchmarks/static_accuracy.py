@@ -102,7 +102,7 @@ def region(estimate: CameraEstimate, true: Camera) -> float:
     return float(chi2.cdf(squared, free.sum()))
 
 
-def calibrated(
+def calibrate_both_ways(
     surveyed: PitchTemplate, clicked: ClickedMarkings, size: tuple[int, int], still: Image
 ) -> list[StaticCalibration]:
     """Return the calibration from clicks, and that with the image's lines."""
@@ -124,7 +124,7 @@ def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
             people = scene.truth.joints[0]
             still = cv2.cvtColor(render_pitch(true, painted, people, seed), cv2.COLOR_RGB2GRAY)
             try:
-                found = calibrated(surveyed, clicks.markings, size, still)
+                found = calibrate_both_ways(surveyed, clicks.markings, size, still)
             except InputError:
                 yield None
                 continue

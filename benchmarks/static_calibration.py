@@ -36,7 +36,7 @@ from worldpose.static_calibration.line_search import LineFit, LineSearch, Measur
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
     project_with_jacobian,
-    stepped,
+    step_camera,
 )
 from worldpose.static_calibration.settings import LineRefinementSettings
 
@@ -73,8 +73,8 @@ def some_pixels_off(true: Camera, rng: np.random.Generator) -> tuple[Camera, Flo
     """
     drawn, size = rng.standard_normal(12), 1.0
     for _ in range(4):
-        size *= START_ERROR / line_error(stepped(true, size * SPREAD * drawn), true)
-    return stepped(true, size * SPREAD * drawn), size * SPREAD
+        size *= START_ERROR / line_error(step_camera(true, size * SPREAD * drawn), true)
+    return step_camera(true, size * SPREAD * drawn), size * SPREAD
 
 
 def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float32]:
@@ -105,13 +105,13 @@ def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats, spread: F
         return step
 
     def residuals(scaled: Floats) -> Floats:
-        pixels = stepped(start, whole(scaled)).project(points)
+        pixels = step_camera(start, whole(scaled)).project(points)
         value = ROBUST * np.sqrt(np.log1p((looked_up(away, pixels) / ROBUST) ** 2))
         return np.concatenate([value, 3.0 * scaled])
 
     zero = np.zeros(int(FREE.sum()))
     found = least_squares(residuals, zero, method="lm", diff_step=1e-2, max_nfev=300)
-    return stepped(start, whole(found.x))
+    return step_camera(start, whole(found.x))
 
 
 def by_gauss_newton(
@@ -127,7 +127,7 @@ def by_gauss_newton(
     for _ in range(15):
         step = np.zeros(12)
         step[FREE] = trial
-        moved = stepped(start, step)
+        moved = step_camera(start, step)
         pixels, jacobian = project_with_jacobian(moved, points)
         value = looked_up(away, pixels)
         new = float(ROBUST**2 * np.log1p((value / ROBUST) ** 2).sum() + (prior * trial**2).sum())
@@ -169,17 +169,17 @@ def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Cam
     scale = np.array([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0, 1e-1, 0.0, 0.0, 0.05, 0.02, 0.0])
     used = scale > 0.0
 
-    def moved(scaled: Floats) -> Camera:
+    def move_camera(scaled: Floats) -> Camera:
         step = np.zeros(12)
         step[used] = scaled * scale[used]
-        return stepped(start, step)
+        return step_camera(start, step)
 
     def residuals(scaled: Floats) -> Floats:
-        off = np.nan_to_num(moved(scaled).project(world) - pixels, nan=1e4).ravel()
+        off = np.nan_to_num(move_camera(scaled).project(world) - pixels, nan=1e4).ravel()
         return np.concatenate([off, scaled[-2:]])
 
     found = least_squares(residuals, np.zeros(int(used.sum())), method="lm", max_nfev=2000)
-    return moved(found.x)
+    return move_camera(found.x)
 
 
 def _camera(
@@ -218,7 +218,7 @@ class TimedSearch(LineSearch):
         return found
 
 
-def measured(
+def measure_sides(
     sides: dict[str, Callable[[], Camera | None]], rounds: int
 ) -> dict[str, tuple[Camera | None, float]]:
     """Return each side's camera and best time [s], taken in turns after one unmeasured call."""
@@ -277,7 +277,7 @@ def main() -> None:
             refine_by_search(search, PITCH)
             alone.append(search.seconds)
         own.append(min(alone))
-        for name, (camera, seconds) in measured(sides, options.rounds).items():
+        for name, (camera, seconds) in measure_sides(sides, options.rounds).items():
             error = np.nan if camera is None else line_error(camera, true)
             table.setdefault(name, []).append((seconds, error))
         print(f"\r  camera {index + 1} of {options.cameras}", end="", file=sys.stderr, flush=True)

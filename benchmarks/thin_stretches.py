@@ -105,7 +105,7 @@ def thin(match: Path, seed: int, fps: float) -> tuple[NDArray[np.int64], NDArray
     return left, sees["clip"]
 
 
-def refitted(store: Store, match: Path, *, without: bool = False) -> Floats:
+def refitted_joints(store: Store, match: Path, *, without: bool = False) -> Floats:
     """Return the bodies' joints (frames, persons, 17, 3) [m] of the second iteration.
 
     Args:
@@ -154,10 +154,10 @@ def measure(folder: Path, seed: int, duration: float) -> dict[str, tuple[int, fl
         aside.rename(given)
     left, filmed = thin(match, seed, scenario.fps)
     store = Store.open_or_new(folder / "project")
-    helped = errors(refitted(store, match), match)
-    alone = errors(refitted(store, match, without=True), match)
+    helped = errors(refitted_joints(store, match), match)
+    alone = errors(refitted_joints(store, match, without=True), match)
     given.rename(aside)
-    apart = errors(refitted(store, match), match)
+    apart = errors(refitted_joints(store, match), match)
     rows = {}
     for about, other in (("", alone), ("whole runs, ", apart)):
         counted = filmed & np.isfinite(helped) & np.isfinite(other)

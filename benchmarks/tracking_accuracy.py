@@ -44,7 +44,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
     )
 
 
-def driven(file: Path) -> tuple[Scenario, Scene]:
+def read_recording(file: Path) -> tuple[Scenario, Scene]:
     """Return `match` with people on recorded paths."""
     paths, length = read_trajectories(file, LONGEST, max_people=MOST)
     base = SCENARIOS["match"]
@@ -62,7 +62,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.trajectories is not None:
         for file in sorted(options.trajectories.glob("*.npz")):
-            scenario, scene = driven(file)
+            scenario, scene = read_recording(file)
             tell(file.stem, scene, scenario.fps)
         return
     for clip in options.clips:

@@ -80,7 +80,7 @@ def main() -> None:
         )
         return result.joints.reshape(-1, 3)
 
-    def undistorted(count: int) -> np.ndarray:
+    def undistort_with(count: int) -> np.ndarray:
         k, focal = cameras.distortion, cameras.focal[:, None]
         start = (pixels[:, :count] - cameras.principal_point[:, None]) / focal
         plane = start
@@ -90,11 +90,11 @@ def main() -> None:
         return plane
 
     def rows(count: int) -> tuple[np.ndarray, np.ndarray]:
-        plane, weight = undistorted(count), sure[:, :count, None]
+        plane, weight = undistort_with(count), sure[:, :count, None]
         a = weight * (plane[..., :1] * poses[:, None, 2] - poses[:, None, 0])
         return a, weight * (plane[..., 1:] * poses[:, None, 2] - poses[:, None, 1])
 
-    def stacked(count: int) -> np.ndarray:
+    def stack(count: int) -> np.ndarray:
         return np.concatenate(rows(count)).transpose(1, 0, 2)
 
     def from_null(vectors: np.ndarray) -> np.ndarray:
@@ -111,21 +111,21 @@ def main() -> None:
         return -np.linalg.solve(matrix[:, :3, :3] + ridge, matrix[:, :3, 3:])[..., 0]
 
     def matmul_normal_equations() -> np.ndarray:
-        a = stacked(many)
+        a = stack(many)
         matrix = a.transpose(0, 2, 1) @ a
         ridge = 1e-12 * np.eye(3)
         return -np.linalg.solve(matrix[:, :3, :3] + ridge, matrix[:, :3, 3:])[..., 0]
 
     def batch_svd() -> np.ndarray:
-        return from_null(np.linalg.svd(stacked(many), full_matrices=False)[2][:, -1])
+        return from_null(np.linalg.svd(stack(many), full_matrices=False)[2][:, -1])
 
     def easymocap_style() -> np.ndarray:
-        a = stacked(PART)
+        a = stack(PART)
         parts = [np.linalg.svd(a[n : n + 17])[2][:, -1] for n in range(0, PART, 17)]
         return from_null(np.concatenate(parts))
 
     def opencv_pairs() -> np.ndarray:
-        plane = undistorted(many)
+        plane = undistort_with(many)
         pair = np.sort(np.argsort(-sure, axis=0)[:2], axis=0)
         out = np.empty((many, 3))
         for one, two in {tuple(column) for column in np.unique(pair, axis=1).T}:

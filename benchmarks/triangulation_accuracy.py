@@ -30,7 +30,7 @@ WANTED = 0.05
 """Misplacement of people by the cameras [m]."""
 
 
-def misplaced(given: Camera, true: Camera, joints: NDArray[np.float64]) -> float:
+def rms_ray_distance(given: Camera, true: Camera, joints: NDArray[np.float64]) -> float:
     """Return the root mean square over cameras of people's distances to their rays [m]."""
     points = joints[::10].reshape(-1, 3)
     pixels = true.project(points)
@@ -51,12 +51,12 @@ def some_way_off(scene: Scene, seed: int) -> Camera:
             }
         )
         given = add_calibration_errors(scene.cameras, errors, np.random.default_rng(seed))
-        off = misplaced(Camera.stack(list(given.values())), true, scene.truth.joints)
+        off = rms_ray_distance(Camera.stack(list(given.values())), true, scene.truth.joints)
         size *= WANTED / off
     return Camera.stack(list(given.values()))
 
 
-def scored(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]:
+def score_ways(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]:
     """Return MPJPE, G-MPJPE and PA-MPJPE (3, ways) [mm]."""
     seen, rows = scene.static_views(), []
     tracks = track_people(cameras, seen.keypoints, seen.confidence, fps, TrackingSettings())
@@ -83,8 +83,8 @@ def main() -> None:
     for seed in options.seeds:
         scene = simulate_scene(scenario, seed)
         exact = Camera.stack(list(scene.cameras.values()))
-        results["exact cameras"].append(scored(scene, exact, scenario.fps))
-        results["5 cm off"].append(scored(scene, some_way_off(scene, seed), scenario.fps))
+        results["exact cameras"].append(score_ways(scene, exact, scenario.fps))
+        results["5 cm off"].append(score_ways(scene, some_way_off(scene, seed), scenario.fps))
     for label, rows in results.items():
         print(f"{options.scenario}, {len(rows)} seeds, {label}: " + " / ".join(WAYS))
         for name, values in zip(

@@ -56,7 +56,7 @@ def _by_frame(
     )
 
 
-def _counted(name: str, about: str) -> ArrayLayout:
+def _count_array(name: str, about: str) -> ArrayLayout:
     return ArrayLayout(
         name=name, dims=("frame",), dtype="int32", unit="1", missing="0", about=about
     )
@@ -137,9 +137,9 @@ BROADCAST_CALIBRATION = GroupLayout(
             "rms distance of detected painted lines, across them",
         ),
         _by_frame("player_rms", (), "px", "rms residual of the keypoints of matched players"),
-        _counted("marking_count", "samples of painted lines used in the frame"),
-        _counted("player_count", "players matched with people from the static cameras"),
-        _counted("flow_count", "points tracked from this frame to the next"),
+        _count_array("marking_count", "samples of painted lines used in the frame"),
+        _count_array("player_count", "players matched with people from the static cameras"),
+        _count_array("flow_count", "points tracked from this frame to the next"),
     ),
     labels={
         **CAMERA_LABELS,

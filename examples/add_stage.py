@@ -54,7 +54,7 @@ def main() -> None:
         key = recipe_key(recipe)
         if not store.has(match, "speeds", unit, key):
             work = Work(project=project, folder="", recipe=recipe, key=key, run_id="0001")
-            with store.publishing(work) as result:
+            with store.publish(work) as result:
                 bodies = run[name]
                 speed, distance = measure_speeds(bodies.joints.values, fps)
                 coordinates = {"frame": bodies.frame.values, "person": bodies.person.values}

@@ -274,7 +274,7 @@ class Gatekeeper:
     match: Match
     policy: GatePolicy
 
-    def held(self, stage: str, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
+    def list_held_units(self, stage: str, results: Mapping[str, str]) -> tuple[WaitingUnit, ...]:
         """Return the units of `stage` in `results` that later stages must not use yet.
 
         A verdict applies to a result's bytes, and overrides metrics and policy: a rejected result
@@ -307,12 +307,12 @@ class Gatekeeper:
             self._request(unit, results[unit.unit], run_id) for unit in waiting if not unit.rejected
         ]
 
-        def unasked(journal: Journal) -> list[ReviewRequest]:
+        def new_requests(journal: Journal) -> list[ReviewRequest]:
             known = requests_by_id(journal.questions)
             return [request for request in requests if request.id not in known]
 
         if requests:
-            say(self.store, self.match.match_id, unasked)
+            say(self.store, self.match.match_id, new_requests)
 
     def _reasons(self, gate: Gate, manifest: ResultManifest) -> tuple[str, ...]:
         """Return why a result without a verdict needs review."""
@@ -356,6 +356,6 @@ def request_id(unit: str, key: str) -> str:
     return f"{stage[:24]}.{name[:24]}.{key[:12]}"
 
 
-def undecided(waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:
+def waiting_for_verdicts(waiting: Iterable[WaitingUnit]) -> list[WaitingUnit]:
     """Return the units without a verdict; the others wait for corrections."""
     return [unit for unit in waiting if not unit.rejected]

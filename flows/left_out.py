@@ -5,9 +5,9 @@ result, and every later stage is planned as if the match did not have this camer
 their camera lists, recipes and arrays. A stage does this in three steps:
 
 1. Its `Stage` record has `leaves_out=True`, and the stage stands before `tracking` in `METHOD`.
-2. Its task fills the result's `left_out` before it leaves `Store.publishing`::
+2. Its task fills the result's `left_out` before it leaves `Store.publish`::
 
-       with store.publishing(work) as result:
+       with store.publish(work) as result:
            result.write(...)
            result.left_out["cam03"] = "its people stand 40 m from those of cam01, cam02 and cam05"
            result.warnings.append("camera cam04 shows 2.7 frames earlier than the others")

@@ -22,7 +22,7 @@ from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Work
-from flows.gates import Gatekeeper, undecided
+from flows.gates import Gatekeeper, waiting_for_verdicts
 from flows.orchestration.cluster_errors import require_workers
 from flows.orchestration.suspension import is_deployed, take_verdict
 from flows.orchestration.time_limits import TimeLimits, seconds_of
@@ -92,14 +92,14 @@ def process_match(
             latest = latest_run(store, match_id)
             gatekeeper = Gatekeeper(store, match, policy)
             plan = plan_ahead(gatekeeper, stages, settings, latest, iteration)
-            open_questions = undecided(plan.waiting)
+            open_questions = waiting_for_verdicts(plan.waiting)
             if open_questions and plan.is_recorded_by(latest):
                 take_verdict(store, match_id, open_questions)
                 continue
         with _status_at_prefect(store, match_id) if is_deployed() else nullcontext():
             log = RunLog.begin(store, match, stages, settings, policy, iteration)
             record = _run_stages(log, time_limits or {})
-        if record.failed or not (is_deployed() and undecided(record.waiting)):
+        if record.failed or not (is_deployed() and waiting_for_verdicts(record.waiting)):
             break
     if record.state != "complete":
         raise IncompleteRunError(record)
@@ -135,7 +135,7 @@ def compute(
     Raises:
         LostWorkersError: the Prefect server or Dask scheduler is gone.
     """
-    with _placed(stage) if units else nullcontext():
+    with _place_tasks(stage) if units else nullcontext():
         if len(units) <= MOST_TASKS:
             yield from _each_alone(stage, units, work)
         else:
@@ -193,7 +193,7 @@ def task_of(stage: Stage) -> Task[..., Any]:
     return task
 
 
-def _placed(stage: Stage) -> AbstractContextManager[Any]:
+def _place_tasks(stage: Stage) -> AbstractContextManager[Any]:
     client = _client()
     return nullcontext() if client is None else on_workers_with(stage.worker_tag, client)
 

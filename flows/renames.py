@@ -176,7 +176,10 @@ def rename_settings(
     overrides: Mapping[str, Mapping[str, JsonValue]],
 ) -> dict[str, dict[str, JsonValue]]:
     """Return settings by stage under their present names."""
-    return {stage: _renamed(SETTINGS.get(stage, {}), values) for stage, values in overrides.items()}
+    return {
+        stage: _rename_settings(SETTINGS.get(stage, {}), values)
+        for stage, values in overrides.items()
+    }
 
 
 def former_names(stage: str, setting: str, value: JsonValue) -> list[tuple[str, str]]:
@@ -187,12 +190,14 @@ def former_names(stage: str, setting: str, value: JsonValue) -> list[tuple[str, 
     return [(name, names[name]) for name in given if name in names]
 
 
-def _renamed(
+def _rename_settings(
     names: Mapping[str, str], values: Mapping[str, JsonValue], group: str = ""
 ) -> dict[str, JsonValue]:
     return {
         names.get(f"{group}{name}", f"{group}{name}").removeprefix(group): (
-            _renamed(names, value, f"{name}.") if isinstance(value, dict) and not group else value
+            _rename_settings(names, value, f"{name}.")
+            if isinstance(value, dict) and not group
+            else value
         )
         for name, value in values.items()
     }

@@ -87,7 +87,7 @@ def _reprocess(
     except Exception as failure:  # any error, so that the other matches continue
         text = str(failure)
         if not isinstance(failure, WorldposeError | OSError):
-            text = str(InternalError.wrapping(match_id, failure))
+            text = str(InternalError.wrap(match_id, failure))
         reporter().say(f"{match_id} failed: {text}")
         return Reprocessed(match_id, "failed", status, problem=text)
     return Reprocessed(match_id, record.state, status, record)

@@ -223,7 +223,9 @@ class RunPlan:
             stage: a stage.
             results: `stage/unit` to key of existing results.
         """
-        held = () if self.gatekeeper is None else self.gatekeeper.held(stage.name, results)
+        held = (
+            () if self.gatekeeper is None else self.gatekeeper.list_held_units(stage.name, results)
+        )
         self.waiting += held
         return held
 

@@ -226,7 +226,7 @@ class RunLog:
             units = self.plan.plan_stage(stage)
             current = {unit.name: unit for unit in units if unit.published}
             keys = {name: unit.key for name, unit in current.items()}
-            passing = without_waiting(keys, self.gatekeeper.held(stage.name, keys))
+            passing = without_waiting(keys, self.gatekeeper.list_held_units(stage.name, keys))
             self.reuse(current[name] for name in passing)
 
     def _settings(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:

@@ -69,13 +69,13 @@ def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     """
 
     @wraps(table)
-    def kept(match: Match) -> T:
+    def once(match: Match) -> T:
         return match.once(table, lambda: table(match))
 
-    return kept
+    return once
 
 
-def _nothing(settings: Record) -> dict[str, JsonValue]:
+def _no_external_inputs(settings: Record) -> dict[str, JsonValue]:
     return {}
 
 
@@ -112,7 +112,7 @@ class Stage:
     previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
     late_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
     first_pass: Literal[1, 2] = 1
-    external_inputs: Callable[[Any], dict[str, JsonValue]] = _nothing
+    external_inputs: Callable[[Any], dict[str, JsonValue]] = _no_external_inputs
     worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0

@@ -39,7 +39,7 @@ from worldpose.triangulation import unswap
 def body_fitting(work: Work) -> str:
     """Publish bodies and their keypoints; return the key."""
     store = Store.open(work.project)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         people = open_people(store, work)
         publish_fit(result, BODY_FITTING, people, *fit_people(people, work.recipe))
     return work.key

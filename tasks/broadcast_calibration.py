@@ -42,7 +42,7 @@ def broadcast_calibration(work: Work) -> str:
         with open_video(path) as video:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         calibration = calibrate_broadcast(
             PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
             BroadcastClip(

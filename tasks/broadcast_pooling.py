@@ -32,7 +32,7 @@ def broadcast_pooling(work: Work) -> str:
     camera, uncertainty = moving_from_arrays(own)
     if everybody.agree:
         camera, uncertainty = drawn_to(camera, uncertainty, everybody)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         result.write(
             BROADCAST_POOLING,
             arrays=moving_arrays(camera, uncertainty),

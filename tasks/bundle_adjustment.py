@@ -33,7 +33,7 @@ def bundle_adjustment(work: Work) -> str:
     """Publish the adjusted cameras and their outliers; return the key."""
     store = Store.open(work.project)
     settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         people = _open_people(store, work, settings)
         adjusted = adjust_cameras(_open_clip(store, work, people), settings)
         arrays, attributes = adjustment_arrays(adjusted, settings, people.person)

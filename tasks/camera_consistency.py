@@ -27,7 +27,7 @@ def camera_consistency(work: Work) -> str:
     store = Store.open(work.project)
     sources: dict[str, Any] = work.recipe.sources
     settings = ConsistencySettings.model_validate(work.recipe.settings)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         clip = open_clip(store, work)
         names = clip.camera_ids
         found = check_consistency(

@@ -17,7 +17,7 @@ from data_contracts.detection import DETECTION
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
-from tasks.spool import Spool, spooling
+from tasks.spool import Spool, open_spool
 from tasks.unit import open_input, open_uncorrected, require_registered, unit_task
 from worldpose.detection import (
     DetectionSettings,
@@ -41,7 +41,7 @@ def detection(work: Work) -> str:
     """Publish boxes and keypoints; return the key."""
     store = Store.open(work.project)
     edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources.get("edits") or [])
-    with store.publishing(work) as result, spooling(store) as spool:
+    with store.publish(work) as result, open_spool(store) as spool:
         found = _open_uncorrected(store, work) if edits else None
         found = found or _detect_people(store, work, spool)
         result.figures |= found.figures

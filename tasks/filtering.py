@@ -12,7 +12,7 @@ from data_contracts.filtering import FILTERING
 from data_contracts.keypoints import TrackedDetections
 from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, load_dropped_boxes, open_clip
-from tasks.spool import spooling
+from tasks.spool import open_spool
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.filtering import (
@@ -42,7 +42,7 @@ def filtering(work: Work) -> str:
     """Publish the keypoints and boxes that the bodies reject; return the key."""
     store = Store.open(work.project)
     settings = FilteringSettings.model_validate(work.recipe.settings)
-    with store.publishing(work) as result, spooling(store) as spool:
+    with store.publish(work) as result, open_spool(store) as spool:
         case = _open(store, work)
         chosen = _evenly(len(case.clip.frame), settings.max_held_out_frames)
         views, motion, suspects = case.at(chosen)

@@ -23,7 +23,7 @@ from worldpose.store.writer import ResultWriter
 @unit_task
 def ingest(work: Work) -> str:
     """Publish the observations or the index; return the key."""
-    with Store.open(work.project).publishing(work) as result:
+    with Store.open(work.project).publish(work) as result:
         if "detections" in work.recipe.sources:
             _write_observations(result, work)
         else:

@@ -60,7 +60,7 @@ def redetection(work: Work) -> str:
     """Publish the camera's people, including redetected ones; return the key."""
     store = Store.open(work.project)
     settings = RedetectionSettings.model_validate(work.recipe.settings)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         case = _open(store, work)
         sought = case.select_missing_people(settings)
         found = _search(store, work, case, sought)

@@ -43,7 +43,7 @@ def refitting(work: Work) -> str:
     before = store.manifest(
         work.recipe.match_id, "body_fitting", unit, work.recipe.inputs[f"body_fitting/{unit}"]
     ).recipe
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         people = open_people(store, work)
         joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
         views: list[RayConstraints] = []
@@ -53,7 +53,7 @@ def refitting(work: Work) -> str:
             views = [_view(store, work, pictures, joints)]
             glimpses = _glimpses(work, pictures, joints)
         weight = BodyFittingSettings.model_validate(before.settings).shape_weight
-        known = _known(store, work, people.person, weight)
+        known = _known_shapes(store, work, people.person, weight)
         model, fit = fit_people(people, before, views=views, glimpses=glimpses, known=known)
         recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
         pooled = np.isin(np.arange(len(people.person)), list(known))
@@ -137,7 +137,7 @@ def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses
     return MonocularPoses(shift_frames(seen.orient, whole), shift_frames(seen.angles, whole))
 
 
-def _known(
+def _known_shapes(
     store: Store, work: Work, persons: NDArray[np.integer], weight: float
 ) -> dict[int, Shape]:
     """Return the body shapes from other clips, by person index.

@@ -13,7 +13,7 @@ from worldpose.store import Store
 def retriangulation(work: Work) -> str:
     """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         settings = load_triangulation_settings(store, work, work.recipe.unit)
         write_joints(store, work, settings, result, RETRIANGULATION)
     return work.key

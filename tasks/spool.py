@@ -40,9 +40,9 @@ class Spool:
 
 
 @contextmanager
-def spooling(store: Store) -> Iterator[Spool]:
+def open_spool(store: Store) -> Iterator[Spool]:
     """Yield a temporary spool next to the results in progress, where disk space is sufficient."""
-    folder = store.blobs.staging()
+    folder = store.blobs.create_staging()
     try:
         yield Spool(folder)
     finally:

@@ -49,7 +49,7 @@ def static_calibration(work: Work) -> str:
     A camera that its clicks do not determine is published as left out, with the reason.
     """
     sources: dict[str, Any] = work.recipe.sources
-    with Store.open(work.project).publishing(work) as result:
+    with Store.open(work.project).publish(work) as result:
         if sources["calibration"] is not None:
             given = CameraCalibration.model_validate(sources["calibration"])
             result.write(

@@ -39,7 +39,7 @@ from worldpose.tracking import (
 def tracking(work: Work) -> str:
     """Publish the person of each detection, with people's corrections; return the key."""
     store = Store.open(work.project)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         corrections = work.recipe.sources.get("identities") or []
         edits = TypeAdapter(list[IdentityEdit]).validate_python(corrections)
         found, figures, warnings = (_open_uncorrected if edits else _track_people)(store, work)

@@ -13,7 +13,7 @@ from data_contracts.arrays import GroupLayout
 from data_contracts.triangulation import TRIANGULATION
 from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
-from tasks.spool import spooling
+from tasks.spool import open_spool
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import (
@@ -31,7 +31,7 @@ from worldpose.triangulation import (
 def triangulation(work: Work) -> str:
     """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         settings = TriangulationSettings.model_validate(work.recipe.settings)
         write_joints(store, work, settings, result, TRIANGULATION)
     return work.key
@@ -59,7 +59,7 @@ def write_joints(
     covariance = camera_errors(work, clip)
     model, detections = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
-    with spooling(store) as spool:
+    with open_spool(store) as spool:
         chunks = reconstruct_chunks(clip.cameras, detections, model, clip.fps, settings, covariance)
         for part in chunks:
             spool.add(part_arrays(part.triangulation, part.smoothing))

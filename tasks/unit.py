@@ -53,7 +53,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
     """Turn a function of one `Work` that publishes its result under `work.key` into a task."""
 
     @functools.wraps(compute)
-    def checked(work: Work) -> str:
+    def run_checked(work: Work) -> str:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
         send_to_own_server()
@@ -68,7 +68,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
                 if isinstance(error, OSError):
                     raise
                 # A bug must not look like a fault of the match.
-                raise InternalError.wrapping(work.recipe.name, error) from error
+                raise InternalError.wrap(work.recipe.name, error) from error
 
     return task(
         task_run_name="{work.recipe.stage} {work.recipe.unit}",
@@ -76,7 +76,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
         retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=_may_be_retried,
         persist_result=False,
-    )(checked)
+    )(run_checked)
 
 
 def require_same_code(work: Work) -> None:

@@ -12,7 +12,7 @@ from worldpose.store.writer import content_digest, stored_files
 
 def publish_stand_in(store, match, unit, files=("zarr.json",)):
     """Publish a planned unit without computing it, of so many files as it is given names."""
-    folder = store.blobs.staging()
+    folder = store.blobs.create_staging()
     for name in files:
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ _IMPORT = re.compile(
 )
 
 
-def compiled(function: Function) -> Function:
+def compile_kernel(function: Function) -> Function:
     """Return `function`, compiled to machine code on its first call and cached on disk.
 
     No fast-math and no parallel loops: the same input gives the same bits on any number of

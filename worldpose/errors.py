@@ -72,7 +72,7 @@ class InternalError(WorldposeError):
         )
 
     @classmethod
-    def wrapping(cls, where: str, error: BaseException) -> InternalError:
+    def wrap(cls, where: str, error: BaseException) -> InternalError:
         """Return the error for an unforeseen exception; it names the line that raised it."""
         steps = traceback.extract_tb(error.__traceback__)
         place = ""

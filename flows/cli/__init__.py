@@ -37,7 +37,7 @@ def main() -> None:
         line(f"error: {message}", to=errors)
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except Exception as error:
-        message = f"{InternalError.wrapping('worldpose', error)} All of it: {_kept_trace()}"
+        message = f"{InternalError.wrap('worldpose', error)} All of it: {_kept_trace()}"
         if "--json" in sys.argv:
             print(json.dumps({"error": "InternalError", "message": message}))  # noqa: T201
         line(f"error: {message}", to=errors)

@@ -124,8 +124,8 @@ def check(
                 f"{figures.persons}",
                 f"{figures.cameras}",
                 f"{figures.compared}",
-                _shown(figures.reprojection_median_px),
-                _shown(figures.plausible_share),
+                _format_value(figures.reprojection_median_px),
+                _format_value(figures.plausible_share),
             )
             for name, figures in report.clips.items()
         ]
@@ -150,5 +150,5 @@ def tell_unstated_rate(folder: Path, fps: float | None) -> None:
         )
 
 
-def _shown(value: float | None) -> str:
+def _format_value(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"

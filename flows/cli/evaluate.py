@@ -251,13 +251,13 @@ def _row(
     def mean(figure: str, digits: int) -> str:
         return f"{np.mean(values(figure)):.{digits}f}" if scores else "-"
 
-    def told(figure: str, digits: int) -> str:
+    def format_figure(figure: str, digits: int) -> str:
         return f"{mean(figure, digits)} ± {np.std(values(figure)):.{digits}f}" if scores else "-"
 
     return (
         name,
-        told("g_mpjpe_mm", 1),
-        told("pa_mpjpe_mm", 1),
+        format_figure("g_mpjpe_mm", 1),
+        format_figure("pa_mpjpe_mm", 1),
         mean("ground_error_m", 3),
         mean("marking_error_px", 2),
         "-" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}",

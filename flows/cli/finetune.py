@@ -99,7 +99,9 @@ def finetune(
             todo="Train in a local project: settings name weights by file.",
         )
     kinds = tuple(_kind(name, "--net") for name in nets or get_args(NetKind))
-    begin = {_kind(name, "--start"): Path(file) for name, file in map(_parted, starts or [])}
+    begin = {
+        _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
+    }
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
@@ -156,7 +158,7 @@ def _kind(name: str, where: str) -> NetKind:
     )
 
 
-def _parted(assignment: str) -> tuple[str, str]:
+def _split_assignment(assignment: str) -> tuple[str, str]:
     name, equals, value = assignment.partition("=")
     if not equals:
         raise UsageError(
@@ -175,7 +177,7 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
 
     groups: dict[str, dict[str, JsonValue]] = {"": {}, "training": {}}
     for assignment in assignments:
-        name, text = _parted(assignment)
+        name, text = _split_assignment(assignment)
         try:
             value = json.loads(text)
         except ValueError:

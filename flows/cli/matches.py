@@ -122,7 +122,7 @@ def simulate(
         _report_match(spec.match_id, out, as_json)
         return
     _refuse_options(f"scenario {scenario}", {"--recordings": recordings is not None})
-    with _filming() as advance:
+    with _show_rendering() as advance:
         spec = simulate_match(
             SCENARIOS[scenario],
             seed,
@@ -165,7 +165,7 @@ def _report_match(match_id: str, out: Path, as_json: bool) -> None:
 
 
 @contextmanager
-def _filming() -> Iterator[Callable[[str, int, int], None]]:
+def _show_rendering() -> Iterator[Callable[[str, int, int], None]]:
     """Report rendering progress: a bar for each camera, or a line when one is done."""
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars:
         tasks: dict[str, TaskID] = {}

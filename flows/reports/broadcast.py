@@ -210,7 +210,7 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
             ("tracking missed the next key frame by [px]", _numbers(result.attrs["drift"])),
             ("frames of its video to click next", ", ".join(map(str, result.attrs["pick_next"]))),
             *(("chosen", decision) for decision in result.attrs["decisions"]),
-            *_pooled(run, clip),
+            *_pooling_rows(run, clip),
             *(("look at it", reason) for reason in result.attrs["reasons"]),
         ]
         tables.append(Table(clip_title(clip), ("", ""), tuple(rows)))
@@ -227,7 +227,7 @@ def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
     ]
 
 
-def _pooled(run: Run, clip: str) -> list[tuple[str, str]]:
+def _pooling_rows(run: Run, clip: str) -> list[tuple[str, str]]:
     """Return the agreement of the camera position with its other clips, if there are any."""
     unit = broadcast_unit(run, clip)
     if "distance" not in run[unit].attrs:

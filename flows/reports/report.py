@@ -188,7 +188,7 @@ def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[st
     found = extent_of(run, match)
     people = sum(clip.persons for clip in found.clips.values())
     tiles = [
-        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_counted(found)}"),
+        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_count_text(found)}"),
         (f"{people}", "people"),
         (f"{found.poses:,}", "3D poses"),
         (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
@@ -199,7 +199,7 @@ def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[st
     return tiles
 
 
-def _counted(found: DataSetStatistics) -> str:
+def _count_text(found: DataSetStatistics) -> str:
     return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
 
 

@@ -100,7 +100,7 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
     scenario = SCENARIOS[SCENARIO].model_copy(update={"clicks": clicks})
     scene = simulate_scene(scenario, seed)
     pitch = PitchTemplate.from_spec(scene.surveyed)
-    calibrations = _calibrated(scene, pitch)
+    calibrations = _calibrate_cameras(scene, pitch)
     clip = _clip(scene, calibrations, pitch)
     true = Camera.stack([scene.cameras[name] for name in calibrations])
     both = adjust_cameras(clip)
@@ -141,7 +141,7 @@ def ablation(
     return trials
 
 
-def _calibrated(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
+def _calibrate_cameras(scene: Scene, pitch: PitchTemplate) -> dict[str, StaticCalibration]:
     """Calibrate the cameras whose clicks determine them; skip the others."""
     found = {}
     for name, camera in scene.cameras.items():

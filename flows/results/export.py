@@ -90,7 +90,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     Raises:
         WorldposeError: the run has no fitted bodies.
     """
-    fits = run[_needed(run, bodies_unit(run, clip), "Run the match to the end first.")]
+    fits = run[_require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
     poses = BodyParameters(
         fits["betas"].values[:, None],
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
@@ -108,7 +108,7 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
-    _needed(run, f"broadcast_calibration/{clip}", todo)
+    _require_result(run, f"broadcast_calibration/{clip}", todo)
     return _camera_in(run, clip, run[bodies_unit(run, clip)]["frame"].values)
 
 
@@ -119,7 +119,7 @@ def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
     return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
 
-def _needed(run: Run, unit: str, todo: str) -> str:
+def _require_result(run: Run, unit: str, todo: str) -> str:
     if unit not in run:
         raise WorldposeError(
             f"run {run.record.run_id} of {run.record.match_id}: expected results of {unit}, "

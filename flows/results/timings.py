@@ -71,7 +71,7 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
             len(spans[stage.name]),
             sum(end - begin for begin, end in spans[stage.name]),
             max(end - begin for begin, end in spans[stage.name]),
-            _covered(spans[stage.name]),
+            _covered_length(spans[stage.name]),
         )
         for stage in METHOD
         if stage.name in spans
@@ -79,11 +79,11 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
     all_spans = [span for each in spans.values() for span in each]
     begun = record.started_at.timestamp()
     start = max(0.0, min((begin for begin, _ in all_spans), default=begun) - begun)
-    between = max(0.0, record.seconds - start - _covered(all_spans))
+    between = max(0.0, record.seconds - start - _covered_length(all_spans))
     return RunTime(record.run_id, record.seconds, stages, start, between)
 
 
-def _covered(spans: Iterable[tuple[float, float]]) -> float:
+def _covered_length(spans: Iterable[tuple[float, float]]) -> float:
     """Return the length of the union of intervals."""
     total, reached = 0.0, float("-inf")
     for begin, end in sorted(spans):

@@ -84,7 +84,7 @@ def export_people(
     for camera, frame in places:
         found = detections_now(store, match, camera, frame)
         name = f"{PICTURES}/{image_name(camera, frame)}"
-        exported.append(_annotated(match, camera, found, name))
+        exported.append(_annotate_image(match, camera, found, name))
         unseen += not _write_picture(store, match, camera, frame, folder / name)
     annotations = folder / f"labels{format_suffix(form)}"
     write_annotations(annotations, exported, form)
@@ -128,7 +128,9 @@ def import_people(
     return changes, keep_edits(store, open_match, edits, who=who, note=note) if edits else []
 
 
-def _annotated(match: Match, camera: str, found: KeypointDetections, name: str) -> AnnotatedImage:
+def _annotate_image(
+    match: Match, camera: str, found: KeypointDetections, name: str
+) -> AnnotatedImage:
     broadcast = {clip.id: clip.broadcast for clip in match.folder.spec.clips}
     spec = match.folder.spec.camera(broadcast.get(camera) or camera)
     corrected = {

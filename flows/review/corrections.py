@@ -32,7 +32,7 @@ from worldpose.store import Store
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:
     """Return the match with its corrections applied; no file of its folder changes."""
     journal = read_journal(store, registration.spec.match_id)
-    replay = _replayed(store, folder, tuple(journal.standing.values()))
+    replay = _replay_corrections(store, folder, tuple(journal.standing.values()))
     return Match(replay.folder, registration, journal, replay.applied, replay.stale)
 
 
@@ -42,7 +42,9 @@ _REPLAYED: WeakKeyDictionary[
 """Match to its folder as it was read, the corrections in force, and the replay result."""
 
 
-def _replayed(store: Store, folder: MatchFolder, standing: tuple[Correction, ...]) -> Replay:
+def _replay_corrections(
+    store: Store, folder: MatchFolder, standing: tuple[Correction, ...]
+) -> Replay:
     """Replay all corrections; corrections already replayed on the same folder are not repeated."""
     known = _REPLAYED.setdefault(store, {})
     before, done, replay = known.get(folder.spec.match_id, (folder, (), Replay(folder)))

@@ -44,7 +44,7 @@ def detections_now(store: Store, match: Match, camera: str, frame: int) -> Keypo
         InputError: the latest run has no detections of this camera in this frame, or only with a
             correction that was withdrawn since.
     """
-    stored, taken_in = _stored(store, match, camera, frame)
+    stored, taken_in = _open_stored(store, match, camera, frame)
     row = stored.sel(frame=slice(frame, frame))
     found = KeypointDetections.from_arrays(row)
     said = [edit for edit in edits_by_camera(match).get(camera, ()) if edit.frame == frame]
@@ -128,7 +128,7 @@ def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, st
     return stored.result, stored.plain
 
 
-def _stored(
+def _open_stored(
     store: Store, match: Match, camera: str, frame: int
 ) -> tuple[xr.Dataset, list[JsonValue]]:
     """Return the result with a frame of a camera, and the edits of that frame that it contains."""

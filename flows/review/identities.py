@@ -33,7 +33,7 @@ def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:
         for correction in match.corrections
         if isinstance(correction.edit, IDENTITY_EDITS) and correction.edit.clip == clip
     ]
-    found, taken_in = _found(store, match, clip)
+    found, taken_in = _open_tracker_output(store, match, clip)
     later = edits_since(said, taken_in, f"clip {clip}", match.match_id)
     return replay_identities(found, later)
 
@@ -63,7 +63,9 @@ def require_fitting(store: Store, match: Match, edits: Sequence[Edit]) -> None:
         found[edit.clip] = replay_identities(found[edit.clip], [edit]).identities
 
 
-def _found(store: Store, match: Match, clip: str) -> tuple[Identities, list[JsonValue]]:
+def _open_tracker_output(
+    store: Store, match: Match, clip: str
+) -> tuple[Identities, list[JsonValue]]:
     """Return the tracker's output of the latest run, and the corrections that it contains."""
     runs = store.runs(match.match_id)
     key = store.run(match.match_id).results.get(f"tracking/{clip}") if runs else None

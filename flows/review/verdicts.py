@@ -189,11 +189,11 @@ def correct(
     results = {} if latest is None else latest.results
     corrections: list[Correction] = []
 
-    def corrected(journal: Journal) -> list[Correction]:
+    def list_corrections(journal: Journal) -> list[Correction]:
         corrections[:] = new_corrections(match, journal, edits, who=who, note=why, results=results)
         return corrections
 
-    say(store, match.match_id, corrected)
+    say(store, match.match_id, list_corrections)
     return corrections
 
 

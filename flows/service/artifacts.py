@@ -60,7 +60,7 @@ class ArtifactReporter(Reporter):
         if artifact is not None:
             within = 1.0 - self.left / self._missing if self._missing else 0.0
             percent = 100.0 * (self._at + min(within, 1.0)) / len(METHOD)
-            _shown(lambda: update_progress_artifact(artifact, percent, description=text))
+            _show_artifact(lambda: update_progress_artifact(artifact, percent, description=text))
 
 
 @contextmanager
@@ -74,20 +74,22 @@ def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
         match_id: the match.
     """
     key = re.sub(r"[^a-z0-9]+", "-", match_id.lower()).strip("-")
-    artifact = _shown(lambda: create_progress_artifact(0.0, key=f"progress-{key}"))
+    artifact = _show_artifact(lambda: create_progress_artifact(0.0, key=f"progress-{key}"))
     reporter = ArtifactReporter(artifact)
     with reporting_to(reporter):
         yield
     if artifact is not None:
-        _shown(lambda: update_progress_artifact(artifact, 100.0, description="recorded"))
-    _shown(lambda: create_table_artifact(table_of(store, match_id), key=f"units-{key}"))
+        _show_artifact(lambda: update_progress_artifact(artifact, 100.0, description="recorded"))
+    _show_artifact(lambda: create_table_artifact(table_of(store, match_id), key=f"units-{key}"))
     serving = served_state(store.url).read_serving()
     pages = None if serving is None else serving.services.get("pages")
     if pages is not None and pages.address is not None:
         review = f"{pages.address}/#/match/{quote(match_id, safe='')}"
-        _shown(lambda: create_link_artifact(review, f"Review {match_id}", key=f"review-{key}"))
+        _show_artifact(
+            lambda: create_link_artifact(review, f"Review {match_id}", key=f"review-{key}")
+        )
         status = f"{pages.address}/status"
-        _shown(lambda: create_link_artifact(status, "Status of all matches", key="status"))
+        _show_artifact(lambda: create_link_artifact(status, "Status of all matches", key="status"))
 
 
 def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:
@@ -106,7 +108,7 @@ def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:
     ]
 
 
-def _shown(show: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever Prefect gives
+def _show_artifact(show: Callable[[], Any]) -> Any:  # noqa: ANN401 - whatever Prefect gives
     try:
         return show()
     except Exception as error:

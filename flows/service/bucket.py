@@ -57,7 +57,7 @@ class BucketInbox:
             quiet: required time without changes [s].
         """
         fetched = []
-        for name, objects in self._listed().items():
+        for name, objects in self._list_objects().items():
             fingerprint = _fingerprint(objects)
             seen, since = self._since.get(name, ("", now))
             if seen != fingerprint:
@@ -72,7 +72,7 @@ class BucketInbox:
                 draft.write_text(json.dumps(self._copied, indent=2) + "\n")
         return fetched
 
-    def _listed(self) -> dict[str, list[Entry]]:
+    def _list_objects(self) -> dict[str, list[Entry]]:
         """Return objects by match name, for all matches with a match.yaml."""
         found: dict[str, list[Entry]] = defaultdict(list)
         for each in self._objects.all_entries():

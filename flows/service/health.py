@@ -54,7 +54,7 @@ def check(state: StateFolder) -> list[Finding]:
     pid = serving.services["serve"].pid
     found = [Finding("serve", True, f"process {pid}, since {serving.started_at:%Y-%m-%d %H:%M}Z")]
     found += _processes(state, serving)
-    found += _answering(state, serving)
+    found += _check_answer(state, serving)
     found += at_prefect(serving, _login(state, serving))
     found += _inbox(state, serving)
     found.append(_disk(state.folder))
@@ -69,7 +69,7 @@ def _processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, "its process has ended", mend)
 
 
-def _answering(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+def _check_answer(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     addresses = {"prefect": f"{serving.prefect}/health"}
     for name, path in (("pages", "/api/health"), ("watch", "/health")):
         service = serving.services.get(name)

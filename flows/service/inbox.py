@@ -88,11 +88,11 @@ def look(
         try:
             fingerprint = fingerprint_of(entry.path)
         except RefusalError as refusal:
-            found.append((entry, _changed(entry, before, "refused", str(refusal)), False))
+            found.append((entry, _change_arrival(entry, before, "refused", str(refusal)), False))
             continue
         except OSError as error:  # it changes during the scan, or is not readable
             reason = f"cannot be read: {error.strerror}"
-            found.append((entry, _changed(entry, before, "incomplete", reason), False))
+            found.append((entry, _change_arrival(entry, before, "incomplete", reason), False))
             continue
         is_same = before is not None and before.fingerprint == fingerprint
         # We hold the lock, so a process that began an intake is dead.
@@ -103,11 +103,11 @@ def look(
         if is_same and before is not None and before.state in ("refused", "incomplete"):
             found.append((entry, before, False))
             continue
-        arrival = _changed(
+        arrival = _change_arrival(
             entry,
             before,
             "arriving",
-            f"taken in when nothing of it has changed for {quiet:g} s{_died(deaths)}",
+            f"taken in when nothing of it has changed for {quiet:g} s{_describe_deaths(deaths)}",
             fingerprint=fingerprint,
             unchanged_since=since,
             deaths=deaths,
@@ -173,7 +173,7 @@ def missing_of(path: Path) -> str:
     return ""
 
 
-def changed(
+def change_state(
     arrival: Arrival, state: ArrivalState, reason: str, **more: str | bool | None
 ) -> Arrival:
     """Return the arrival in another state."""
@@ -205,14 +205,14 @@ def _sums(file: Path) -> Iterator[tuple[str, str]]:
 def _entries(folder: Path, prefix: str, priority: Priority) -> Iterator[Entry]:
     for path in sorted(folder.iterdir()):
         if not path.name.startswith("."):
-            yield Entry(path, prefix + _shown(path.name), priority)
+            yield Entry(path, prefix + _shorten_name(path.name), priority)
 
 
 def _is_match(folder: Path) -> bool:
     return (folder / "match.yaml").is_file()
 
 
-def _shown(name: str) -> str:
+def _shorten_name(name: str) -> str:
     return ascii(name)[1:-1]
 
 
@@ -221,13 +221,13 @@ def _require_plain(name: str) -> None:
         raise RefusalError(f"the name {name!a} has characters that names here may not have")
 
 
-def _died(deaths: int) -> str:
+def _describe_deaths(deaths: int) -> str:
     if deaths == 0:
         return ""
     return f"; the process that took it in died {deaths} time{'s' if deaths > 1 else ''}"
 
 
-def _changed(
+def _change_arrival(
     entry: Entry,
     before: Arrival | None,
     state: ArrivalState,
@@ -269,7 +269,7 @@ def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
         quiet: time without changes after which an arrival is complete [s].
     """
     with state.only_one("arrivals", wait=False) as is_held:
-        ready = _looked(state, inbox, quiet) if is_held else []
+        ready = _look_at_entries(state, inbox, quiet) if is_held else []
     return [f"{each.name} {each.fingerprint} {each.deaths}" for _, each in ready]
 
 
@@ -291,7 +291,7 @@ def take_in(
     """
     decided = []
     with state.only_one("arrivals", wait=True):
-        ready = _looked(state, inbox, quiet)
+        ready = _look_at_entries(state, inbox, quiet)
         for entry, arrival in sorted(ready, key=lambda each: each[1].deaths):
             result = _take(store, state, entry, arrival, begin)
             state.write_arrival(result)
@@ -304,7 +304,7 @@ def _take(
 ) -> Arrival:
     """Register one arrival; a note written first tells the next process if this one dies."""
     if arrival.deaths >= MAX_DEATHS:
-        return changed(
+        return change_state(
             arrival,
             "refused",
             f"the process that took it in died {arrival.deaths} times, killed or by a crash: the "
@@ -312,7 +312,7 @@ def _take(
         )
     number = arrival.deaths + 1
     state.write_arrival(
-        changed(arrival, "arriving", f"being taken in, try {number}", is_begun=True)
+        change_state(arrival, "arriving", f"being taken in, try {number}", is_begun=True)
     )
     try:
         return _decide(store, entry, arrival, begin)
@@ -321,7 +321,7 @@ def _take(
         raise
 
 
-def _looked(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Arrival]]:
+def _look_at_entries(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Arrival]]:
     known = state.arrivals()
     seen = look(inbox, known, now=time.monotonic(), quiet=quiet)
     names = {arrival.name for _, arrival, _ in seen}
@@ -339,20 +339,20 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
     try:
         missing = missing_of(entry.path)
         if missing:
-            return changed(arrival, "incomplete", missing)
+            return change_state(arrival, "incomplete", missing)
         match, _ = register(store, entry.path.resolve(), unfinished=True)
     except StoreError:
         raise  # the project is at fault, not the arrival
     except (RefusalError, WorldposeError) as refusal:
-        return changed(arrival, "refused", str(refusal))
+        return change_state(arrival, "refused", str(refusal))
     except OSError as error:
-        return changed(arrival, "incomplete", f"{error.filename}: {error.strerror}")
+        return change_state(arrival, "incomplete", f"{error.filename}: {error.strerror}")
     except Exception as error:  # an unforeseen error; nothing was registered
-        return changed(arrival, "refused", str(InternalError.wrapping(arrival.name, error)))
+        return change_state(arrival, "refused", str(InternalError.wrap(arrival.name, error)))
     known = {**match.folder.calibrations, **match.folder.clicked}
     unclicked = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
     if unclicked:
         reason = f"to be clicked on the review pages first: {', '.join(unclicked)}"
-        return changed(arrival, "taken", reason, match_id=match.match_id)
+        return change_state(arrival, "taken", reason, match_id=match.match_id)
     run = begin(match, arrival)
-    return changed(arrival, "taken", "", match_id=match.match_id, flow_run=run)
+    return change_state(arrival, "taken", "", match_id=match.match_id, flow_run=run)

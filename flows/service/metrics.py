@@ -214,13 +214,13 @@ def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
         for name, limit in gate.limits:
             limits.add_metric([gate.stage, name], limit)
             for match in matches:
-                found = _judged(match.stages.get(gate.stage, ()), gate.judged, name)
+                found = _judged_values(match.stages.get(gate.stage, ()), gate.judged, name)
                 if found:
                     worst.add_metric([match.match_id, gate.stage, name], max(found))
     yield from (worst, limits)
 
 
-def _judged(
+def _judged_values(
     units: tuple[UnitSummary, ...], judged: Callable[[Figures], Figures], name: str
 ) -> list[float]:
     figures = [judged(unit.figures) for unit in units if unit.figures]

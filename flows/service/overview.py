@@ -123,7 +123,7 @@ class Overview:
         units: dict[str, list[UnitSummary]] = {}
         for name, glance in (
             *((name, self._result(run, name, records, asked)) for name in sorted(run.results)),
-            *((each.unit, _failed(each.unit, each.message)) for each in run.failed),
+            *((each.unit, _failed_unit(each.unit, each.message)) for each in run.failed),
             *((name, UnitSummary(_unit(name), "blocked")) for name in run.blocked),
         ):
             units.setdefault(name.partition("/")[0], []).append(glance)
@@ -169,7 +169,7 @@ def age(since: datetime | None) -> float:
     return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
 
 
-def _failed(name: str, message: str) -> UnitSummary:
+def _failed_unit(name: str, message: str) -> UnitSummary:
     return UnitSummary(_unit(name), "failed", why=message)
 
 

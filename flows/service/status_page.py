@@ -151,7 +151,7 @@ def _details(match: MatchStatus) -> str:
         f"<tr><td>{escape(stage.replace('_', ' '))}</td><td>{escape(unit.unit)}</td>"
         f'<td class="{unit.state}">{unit.state}</td>'
         f'<td class="n">{"" if unit.seconds is None else _time(unit.seconds)}</td>'
-        f"<td><small>{escape(_said(unit))}</small></td></tr>"
+        f"<td><small>{escape(_describe_unit(unit))}</small></td></tr>"
         for stage, unit in match.units
     )
     if not rows:
@@ -163,7 +163,7 @@ def _details(match: MatchStatus) -> str:
     )
 
 
-def _said(unit: UnitSummary) -> str:
+def _describe_unit(unit: UnitSummary) -> str:
     return "; ".join(filter(None, [unit.why, *unit.objections, in_short(unit.figures)]))
 
 

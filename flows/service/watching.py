@@ -87,7 +87,7 @@ class Trouble:
         self._at = 0.0
 
     @contextmanager
-    def told(self) -> Iterator[None]:
+    def log_failure(self) -> Iterator[None]:
         """Log a failure of the block on one line, and suppress it."""
         try:
             yield
@@ -112,7 +112,7 @@ async def _watch_bucket(plan: ServePlan) -> None:
     bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
     trouble = Trouble("looking at the bucket")
     while True:
-        with trouble.told():
+        with trouble.log_failure():
             await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.settle_seconds)
         await asyncio.sleep(BUCKET_SECONDS)
 
@@ -121,7 +121,7 @@ async def _watch_inbox(plan: ServePlan) -> None:
     trouble = Trouble("looking at the inbox")
     while True:
         began = time.monotonic()
-        with trouble.told():
+        with trouble.log_failure():
             ready = await asyncio.to_thread(
                 watch_once, plan.state_folder, plan.inbox, plan.settle_seconds
             )
@@ -143,7 +143,7 @@ async def _begin_lost_runs_again(plan: ServePlan) -> None:
     trouble = Trouble("looking for lost runs")
     while True:
         await asyncio.sleep(ALERT_SECONDS)
-        with trouble.told():
+        with trouble.log_failure():
             await begin_again(plan)
 
 
@@ -154,9 +154,9 @@ async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) 
     failed: list[FailedRun] = []
     while True:
         await asyncio.sleep(ALERT_SECONDS)
-        with at_prefect.told():
+        with at_prefect.log_failure():
             failed = await failed_runs(plan)
-        with trouble.told():
+        with trouble.log_failure():
             matches = await asyncio.to_thread(overview.look)
             arrivals = plan.state_folder.arrivals().values()
             await asyncio.to_thread(teller.hold, alerts_now(plan, matches, arrivals, failed))
@@ -180,11 +180,11 @@ async def failed_runs(plan: ServePlan) -> list[FailedRun]:
             deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[plan.name])),
         )
     return [
-        FailedRun(str(run.id), run.name, str(run.state_name).lower(), _said(run.state))
+        FailedRun(str(run.id), run.name, str(run.state_name).lower(), _describe_state(run.state))
         for run in runs
         if not may_begin_again(run)
     ]
 
 
-def _said(state: State[Any] | None) -> str:
+def _describe_state(state: State[Any] | None) -> str:
     return "" if state is None else str(state.message or "")

@@ -39,7 +39,7 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=tracking.filtered,
+    previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
     external_inputs=outside,
 )

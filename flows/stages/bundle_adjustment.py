@@ -24,7 +24,9 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 def again(match: Match, unit: str) -> tuple[str, ...]:
     """Return the filtering results of every clip: keypoints that the bodies rejected."""
-    return tuple(name for clip in tracking.units(match) for name in tracking.filtered(match, clip))
+    return tuple(
+        name for clip in tracking.units(match) for name in tracking.filtering_inputs(match, clip)
+    )
 
 
 def later(match: Match, unit: str) -> tuple[str, ...]:

@@ -22,6 +22,6 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=tracking.clip_sources,
-    previous_pass_inputs=tracking.filtered,
+    previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
 )

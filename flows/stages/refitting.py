@@ -77,6 +77,6 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=tracking.filtered,
+    previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
 )

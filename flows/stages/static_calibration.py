@@ -49,11 +49,11 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "image_size": [camera.width, camera.height],
         "still": path,
         "still_sha256": None if path is None else match.registration.digest_of(path),
-        "filmed": _filmed(match, unit) if still is None else None,
+        "filmed": _video_for_still(match, unit) if still is None else None,
     }
 
 
-def _filmed(match: Match, unit: str) -> dict[str, JsonValue] | None:
+def _video_for_still(match: Match, unit: str) -> dict[str, JsonValue] | None:
     """Return the camera's video, for a still without people if none is given."""
     if unit not in match.folder.videos:
         return None

@@ -27,10 +27,10 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 def again(match: Match, unit: str) -> tuple[str, ...]:
     """Return cameras adjusted to people (C6), and the filtering results (R2)."""
-    return ("bundle_adjustment/cameras", *filtered(match, unit))
+    return ("bundle_adjustment/cameras", *filtering_inputs(match, unit))
 
 
-def filtered(match: Match, unit: str) -> tuple[str, ...]:
+def filtering_inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the filtering results of the clip's detections."""
     return (f"filtering/{unit}",)
 

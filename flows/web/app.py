@@ -197,7 +197,7 @@ def add_answers(app: FastAPI) -> None:
         return JSONResponse({"error": str(error), **parts}, status_code=422)
 
     @app.exception_handler(RequestValidationError)
-    def malformed(request: Request, error: RequestValidationError) -> JSONResponse:
+    def answer_malformed(request: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         said = f"{place}: {first['msg']}"
@@ -210,7 +210,7 @@ def add_answers(app: FastAPI) -> None:
         return JSONResponse({"error": f"{place}{error.strerror or error}"}, status_code=500)
 
     @app.exception_handler(WorldposeError)
-    def failed(request: Request, error: WorldposeError) -> JSONResponse:
+    def answer_failed(request: Request, error: WorldposeError) -> JSONResponse:
         said = " ".join(str(error).split())
         LOG.warning("%s %r failed: %s", request.method, request.url.path, said)
         cause = error.__cause__
@@ -221,7 +221,7 @@ def add_answers(app: FastAPI) -> None:
     def unforeseen(request: Request, error: Exception) -> JSONResponse:
         """Report an internal error: traceback in the log, no blame of the user on the page."""
         where = f"{request.method} {request.url.path}"
-        return JSONResponse({"error": str(InternalError.wrapping(where, error))}, status_code=500)
+        return JSONResponse({"error": str(InternalError.wrap(where, error))}, status_code=500)
 
 
 OPEN: Final = frozenset(
@@ -268,13 +268,13 @@ class Guard:
 
         is_gone = False
 
-        async def heard() -> Message:
+        async def receive_noted() -> Message:
             nonlocal is_gone
             message = await receive()
             is_gone = is_gone or message["type"] == "http.disconnect"
             return message
 
-        async def sealed(message: Message) -> None:
+        async def send_sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _seal(MutableHeaders(scope=message), scope["path"])
                 asked = scope["path"].endswith(ASKING) and message["status"] < 400
@@ -287,9 +287,9 @@ class Guard:
 
         refusal = self._refusal(scope, headers, who, session)
         if refusal is not None:
-            await refusal(scope, heard, sealed)
+            await refusal(scope, receive_noted, send_sealed)
             return
-        await self.app(scope, heard, sealed)
+        await self.app(scope, receive_noted, send_sealed)
 
     def _refusal(
         self, scope: Scope, headers: Headers, who: str | None, session: str | None

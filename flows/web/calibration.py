@@ -61,10 +61,10 @@ class Pictures:
             return Path(still).read_bytes()
         import cv2  # imported here: few pages decode an image
 
-        picture = cv2.cvtColor(self.decoded(match, owner, frame), cv2.COLOR_RGB2BGR)
+        picture = cv2.cvtColor(self.decode_image(match, owner, frame), cv2.COLOR_RGB2BGR)
         return bytes(cv2.imencode(".png", picture)[1])
 
-    def decoded(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
+    def decode_image(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
         """Return one image (height, width, 3), RGB.
 
         Raises:
@@ -86,7 +86,7 @@ def routes(context: PageContext) -> APIRouter:
     pictures = Pictures()
     drawings: dict[str, tuple[PitchDrawing, dict[str, tuple[int, int]]]] = {}
 
-    def prepared(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
+    def load_pitch(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
         """Return a match's pitch and image sizes; both are fixed per match."""
         if match_id not in drawings:
             folder = context.match(match_id).folder
@@ -105,7 +105,7 @@ def routes(context: PageContext) -> APIRouter:
         return drawings[match_id]
 
     def size_of(match_id: str, owner: str) -> tuple[int, int]:
-        sizes = prepared(match_id)[1]
+        sizes = load_pitch(match_id)[1]
         if owner not in sizes:
             raise HTTPException(404, "no such camera")
         return sizes[owner]
@@ -114,7 +114,7 @@ def routes(context: PageContext) -> APIRouter:
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
         match = context.match(match_id)
         size = size_of(match_id, owner)
-        clicked = _clicked(match, owner, frame)
+        clicked = _read_clicks(match, owner, frame)
         latest = latest_run(context.store, match_id)
         stage = "static_calibration" if frame is None else "broadcast_calibration"
         unit = f"{stage}/{owner}"
@@ -128,7 +128,7 @@ def routes(context: PageContext) -> APIRouter:
             "has_picture": owner in match.folder.stills or owner in match.folder.videos,
             "points": {point.name: point.xy for point in clicked.points},
             "drawn": {marking.name: marking.xy for marking in clicked.drawn},
-            "pitch": _pitch(prepared(match_id)[0]),
+            "pitch": _pitch(load_pitch(match_id)[0]),
             "figures": {} if latest is None else latest.figures.get(unit, {}),
             "reviews": [
                 {"id": each.request.id, "state": each.state, "reasons": each.request.reasons}
@@ -156,10 +156,12 @@ def routes(context: PageContext) -> APIRouter:
                 DrawnMarking(name=n, xy=xy) for n, xy in sorted(clicked.drawn.items()) if xy
             ),
         )
-        seen = pictures.decoded(context.match(match_id), owner, frame) if clicked.refine else None
+        seen = (
+            pictures.decode_image(context.match(match_id), owner, frame) if clicked.refine else None
+        )
         try:
             found = preview(
-                prepared(match_id)[0],
+                load_pitch(match_id)[0],
                 markings,
                 size,
                 picture=seen,
@@ -209,7 +211,7 @@ def _read(match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
         return video.frame(frame or 0)
 
 
-def _clicked(match: Match, owner: str, frame: int | None) -> ClickedMarkings:
+def _read_clicks(match: Match, owner: str, frame: int | None) -> ClickedMarkings:
     if frame is None:
         return match.folder.clicked.get(owner, ClickedMarkings())
     picked = match.folder.key_frames.get(owner)
@@ -228,8 +230,8 @@ def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
     return {
         "length": template.length,
         "width": template.width,
-        "points": {name: _rounded(place, 3) for name, place in template.points.items()},
-        "markings": {name: _rounded(line, 2) for name, line in drawing.markings.items()},
+        "points": {name: _round_numbers(place, 3) for name, place in template.points.items()},
+        "markings": {name: _round_numbers(line, 2) for name, line in drawing.markings.items()},
     }
 
 
@@ -238,18 +240,18 @@ def _answer(found: Preview) -> dict[str, Any]:
     ground = report.ground_error
     return {
         "camera": {
-            "center": _rounded(camera.center, 3),
+            "center": _round_numbers(camera.center, 3),
             "focal": round(float(camera.focal[0]), 1),
         },
         "markings": {
-            name: [_rounded(piece, 1) for piece in pieces]
+            name: [_round_numbers(piece, 1) for piece in pieces]
             for name, pieces in found.markings.items()
         },
-        "points": {name: _rounded(place, 2) for name, place in found.points.items()},
+        "points": {name: _round_numbers(place, 2) for name, place in found.points.items()},
         "residuals": [
             {
                 "name": each.name,
-                "residual": _rounded(each.residual, 3)
+                "residual": _round_numbers(each.residual, 3)
                 if np.isfinite(each.residual).all()
                 else None,
                 "surprise": _number(each.mahalanobis),
@@ -276,14 +278,14 @@ def _answer(found: Preview) -> dict[str, Any]:
         "median": _number(ground.median),
         "p95": _number(ground.p95),
         "ground": {
-            "x": _rounded(ground.x, 2),
-            "y": _rounded(ground.y, 2),
+            "x": _round_numbers(ground.x, 2),
+            "y": _round_numbers(ground.y, 2),
             "expected": [[_number(value) for value in row] for row in ground.expected],
         },
     }
 
 
-def _rounded(values: NDArray[np.float64], digits: int) -> Any:  # noqa: ANN401 - nested lists
+def _round_numbers(values: NDArray[np.float64], digits: int) -> Any:  # noqa: ANN401 - nested lists
     return np.round(values, digits).tolist()
 
 

@@ -58,7 +58,7 @@ def routes(context: PageContext) -> APIRouter:
             "has_picture": owner in match.folder.videos,
             "joints": COCO17,
             "bones": COCO17_BONES,
-            **_seen(detections_now(context.store, match, owner, frame)),
+            **_describe_detections(detections_now(context.store, match, owner, frame)),
             "cameras": [camera.id for camera in spec.static_cameras],
         }
 
@@ -116,7 +116,7 @@ def _size(match: Match, owner: str) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-def _seen(found: KeypointDetections) -> dict[str, Any]:
+def _describe_detections(found: KeypointDetections) -> dict[str, Any]:
     """Return all detections of the first row, and the index for an added person."""
     there = np.isfinite(found.score[:1]).any(axis=0)
     occupied = np.flatnonzero(there)

@@ -118,7 +118,7 @@ def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidenc
     """Draw the evidence for a review request, from the run that created it."""
     run = open_run(store.url, match.match_id, request.run_id, complete=True)
     (unit,) = request.keys
-    return _DRAWN.get(request.gate, _nothing)(store, run, match, unit.partition("/")[2])
+    return _DRAWN.get(request.gate, _no_evidence)(store, run, match, unit.partition("/")[2])
 
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
@@ -188,7 +188,7 @@ def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run, match)))
 
 
-def _nothing(store: Store, run: Run, match: Match, unit: str) -> Evidence:
+def _no_evidence(store: Store, run: Run, match: Match, unit: str) -> Evidence:
     return Evidence()
 
 

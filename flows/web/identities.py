@@ -30,7 +30,7 @@ def routes(context: PageContext) -> APIRouter:
     """Create the routes of the identities in one clip."""
     router = APIRouter(prefix="/api/matches/{match_id}/identities/{clip}")
 
-    def opened(match_id: str, clip: str) -> tuple[Match, Identities]:
+    def open_identities(match_id: str, clip: str) -> tuple[Match, Identities]:
         match = context.match(match_id)
         if clip not in {each.id for each in match.folder.spec.clips}:
             raise HTTPException(404, "no such clip")
@@ -38,7 +38,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("")
     def identities(match_id: str, clip: str) -> dict[str, Any]:
-        match, found = opened(match_id, clip)
+        match, found = open_identities(match_id, clip)
         spec = match.folder.spec
         first = int(found.frame[0])
         step = max(1, len(found.frame) // WAYS)
@@ -65,7 +65,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/crop")
     def crop(match_id: str, clip: str, person: int, frame: int) -> Response:
-        match, found = opened(match_id, clip)
+        match, found = open_identities(match_id, clip)
         if person not in found.person or frame not in found.frame:
             raise HTTPException(404, "the person is not present")
         return Response(_crop(context.store, match, found, person, frame), media_type="image/png")

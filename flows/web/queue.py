@@ -35,7 +35,7 @@ def routes(context: PageContext) -> APIRouter:
         folder = opened.folder
         return {
             **_glance(context, opened),
-            "reviews": [shown(each) for each in reviews_of(opened, latest)],
+            "reviews": [describe_review(each) for each in reviews_of(opened, latest)],
             **_corrections(opened),
             "cameras": [
                 {
@@ -85,7 +85,7 @@ def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
     }
 
 
-def shown(review: Review) -> dict[str, Any]:
+def describe_review(review: Review) -> dict[str, Any]:
     """Return one review request as JSON for the pages."""
     (unit,) = review.request.keys
     return {**review_json(review), "unit": unit, "excess": _excess(review.request)}

@@ -74,7 +74,7 @@ def routes(context: PageContext) -> APIRouter:
         at = None if x is None or y is None or joint is None else (x, y)
         if owner not in group.names or (joint is not None and not 0 <= joint < len(COCO17)):
             return {"person": None, "views": [], "here": None}
-        return _shown(match, group, owner, joint, at)
+        return _describe_view(match, group, owner, joint, at)
 
     return router
 
@@ -118,7 +118,7 @@ def _group(context: PageContext, match: Match, owner: str, frame: int, detection
     return Group(person, names, list(cameras.values()), detections, keypoints)
 
 
-def _shown(
+def _describe_view(
     match: Match,
     group: Group,
     owner: str,

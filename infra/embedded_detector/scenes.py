@@ -109,7 +109,7 @@ def _scene(
     pitch = PitchTemplate.from_spec(scenario.pitch)
     crowd = gather(scenario, pitch, np.random.SeedSequence(seed))
     times = np.sort(rng.uniform(0.2, scenario.duration - 0.2, frames))
-    settings = _rendering(kind, rng)
+    settings = _draw_rendering(kind, rng)
     poses, later = crowd.poses(times), crowd.poses(times + settings.exposure_s)
     joints = crowd.joints(times)
     roles = assign_roles(scenario.crowd, len(crowd.paths))
@@ -138,7 +138,7 @@ def label(
     sides = boxes[:, 2:] - boxes[:, :2]
     there = np.isfinite(boxes).all(axis=1) & (np.nan_to_num(sides) > 1.0).all(axis=1)
     pixels = camera.project(joints.reshape(-1, 3)).reshape(-1, 17, 2)
-    visible = np.where(_shown(rendered.person_ids, pixels), 2, 1)
+    visible = np.where(_find_visible(rendered.person_ids, pixels), 2, 1)
     visible[~np.isfinite(pixels).all(axis=-1)] = 0
     return LabelledPicture(
         path=path,
@@ -149,7 +149,7 @@ def label(
     )
 
 
-def _shown(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _find_visible(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether a person fills a pixel near each of the person's joints (persons, 17)."""
     height, width = person_ids.shape
     shown = np.zeros(pixels.shape[:2], dtype=bool)
@@ -186,7 +186,7 @@ def _scenario(kind: SceneKind, rng: np.random.Generator) -> Scenario:
     return Scenario(name="scene", about="To learn from.", duration=4.0, crowd=crowd)
 
 
-def _rendering(kind: SceneKind, rng: np.random.Generator) -> RenderingSettings:
+def _draw_rendering(kind: SceneKind, rng: np.random.Generator) -> RenderingSettings:
     return RenderingSettings(
         stripes=float(rng.uniform(0.0, 0.3)),
         paint=float(rng.uniform(0.7, 1.0)),

@@ -180,7 +180,7 @@ def reduce_mesh(bodies: Bodies) -> tuple[scipy.sparse.csr_matrix, NDArray[np.int
         any body, and triangles (n, 3).
     """
     mean = bodies.vertices.mean(0)
-    vertices, faces = _decimated(mean, bodies.faces)
+    vertices, faces = _decimate(mean, bodies.faces)
     while len(vertices) < VERTICES:
         vertices, faces = _longest_edge_split(vertices, faces)
     surface = trimesh.Trimesh(mean, bodies.faces, process=False)
@@ -195,7 +195,7 @@ def reduce_mesh(bodies: Bodies) -> tuple[scipy.sparse.csr_matrix, NDArray[np.int
     return coarse, faces
 
 
-def _decimated(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def _decimate(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Return the mesh after quadric decimation to just under 6890 vertices."""
     low, high = VERTICES, len(faces)
     while high - low >= 8:
@@ -287,7 +287,7 @@ def _t_pose_bones(joints: Array) -> tuple[Array, Array]:
         posed[:, joint] = posed[:, parent] + np.einsum("nab,nb->na", rotations[:, parent], bone)
         if joint in targets:
             child, direction = targets[joint]
-            rotations[:, joint] = _turning(_unit(joints[:, child] - joints[:, joint]), direction)
+            rotations[:, joint] = _turn_onto(_unit(joints[:, child] - joints[:, joint]), direction)
         elif joint not in (7, 8):  # the ankles keep the soles flat
             rotations[:, joint] = rotations[:, parent]
     return rotations, posed
@@ -307,7 +307,7 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _turning(start: Array, end: Array) -> Array:
+def _turn_onto(start: Array, end: Array) -> Array:
     """Return the shortest rotations (n, 3, 3) of unit vectors (n, 3) to one unit vector."""
     axis = np.cross(start, end)
     skew = np.zeros((len(start), 3, 3))

@@ -89,19 +89,19 @@ def fit_correctives(
         share = weights[:, _below(joint)].sum(1)
         pivot = joints[joint]
 
-        def bent(turn: Array, share: Array = share, pivot: Array = pivot) -> Array:
+        def bend(turn: Array, share: Array = share, pivot: Array = pivot) -> Array:
             away = template - pivot
             return template + share[:, None] * (away @ turn.T - away)
 
-        own = bent(sculpted[joint])
-        targets = np.stack([_mushed(own, bent(turn), neighbours, rounds) for turn in rotations])
-        lacking = targets - np.stack([bent(turn) for turn in rotations])
+        own = bend(sculpted[joint])
+        targets = np.stack([_delta_mush(own, bend(turn), neighbours, rounds) for turn in rotations])
+        lacking = targets - np.stack([bend(turn) for turn in rotations])
         moved = np.flatnonzero(np.linalg.norm(lacking, axis=-1).max(0) > STILL)
         blended = np.eye(3) + share[moved, None, None] * (rotations[:, None] - np.eye(3))
         feature = np.concatenate(
             [np.ones((len(rotations), 1)), (rotations - np.eye(3)).reshape(-1, 9)], axis=1
         )
-        found = _solved(blended, feature, lacking[:, moved])
+        found = _solve_offsets(blended, feature, lacking[:, moved])
         offsets[moved] += found[..., 0]
         directions[moved, :, 9 * (joint - 1) : 9 * joint] += found[..., 1:]
     directions = np.round(directions / GRAIN) * GRAIN
@@ -121,7 +121,7 @@ def _below(joint: int) -> list[int]:
     return list(range(joint, 24, 2))
 
 
-def _solved(blended: Array, feature: Array, lacking: Array) -> Array:
+def _solve_offsets(blended: Array, feature: Array, lacking: Array) -> Array:
     """Return offsets (n, 3, 10) by the feature that make skinning reach the target.
 
     Args:
@@ -147,16 +147,18 @@ def _neighbours(faces: NDArray[np.int64], count: int) -> scipy.sparse.coo_matrix
     return joined.tocoo()
 
 
-def _smoothed(points: Array, neighbours: scipy.sparse.coo_matrix, rounds: int) -> Array:
+def _smooth(points: Array, neighbours: scipy.sparse.coo_matrix, rounds: int) -> Array:
     mean = scipy.sparse.diags(1.0 / np.asarray(neighbours.sum(1)).ravel()) @ neighbours
     for _ in range(rounds):
         points = 0.5 * (points + mean @ points)
     return points
 
 
-def _mushed(own: Array, posed: Array, neighbours: scipy.sparse.coo_matrix, rounds: int) -> Array:
+def _delta_mush(
+    own: Array, posed: Array, neighbours: scipy.sparse.coo_matrix, rounds: int
+) -> Array:
     """Return the delta mush (n, 3) of a posed surface with the details of `own`."""
-    start, end = (_smoothed(points, neighbours, rounds) for points in (own, posed))
+    start, end = (_smooth(points, neighbours, rounds) for points in (own, posed))
     row, column = neighbours.row, neighbours.col
     products = (end[column] - end[row])[:, :, None] * (start[column] - start[row])[:, None, :]
     moments = np.stack(

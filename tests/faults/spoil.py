@@ -17,14 +17,14 @@ from worldpose.store.writer import ResultWriter
 
 
 def strike_at(name, strike):
-    publishing = Store.publishing
+    publish = Store.publish
 
     def spoiled(self, work):
         if work.recipe.name == name:
             strike()
-        return publishing(self, work)
+        return publish(self, work)
 
-    Store.publishing = spoiled
+    Store.publish = spoiled
 
 
 def publish_half(self, folder, prefix, manifest_name, manifest):

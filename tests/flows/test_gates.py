@@ -138,10 +138,10 @@ def test_a_verdict_holds_for_the_bytes_whatever_key_gives_them(store):
             return manifest
 
     gatekeeper = Gatekeeper(Twin(), match, "auto")
-    assert gatekeeper.held("static_calibration", {WRONG: "f" * 32}) == ()
+    assert gatekeeper.list_held_units("static_calibration", {WRONG: "f" * 32}) == ()
     changed = manifest.model_copy(update={"content": "0" * 64})
     Twin.manifest = lambda self, *place: changed
-    assert units(gatekeeper.held("static_calibration", {WRONG: "f" * 32})) == [WRONG]
+    assert units(gatekeeper.list_held_units("static_calibration", {WRONG: "f" * 32})) == [WRONG]
 
 
 def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(store):
@@ -169,7 +169,7 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
     # No policy uses a rejected result.
     refused = Gatekeeper(store, match, "never")
     latest = latest_run(store, TINY).results
-    assert units(refused.held("static_calibration", latest)) == [WRONG]
+    assert units(refused.list_held_units("static_calibration", latest)) == [WRONG]
     # After the withdrawal the state is the former one; the rejection stands until an approval.
     withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
     again = open_match(store, TINY)

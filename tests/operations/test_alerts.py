@@ -159,9 +159,9 @@ def test_damaged_notes_of_what_was_told_are_begun_anew(webhook, tmp_path):
 def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
     trouble = Trouble("looking at the inbox")
     for _ in range(100):
-        with trouble.told():
+        with trouble.log_failure():
             raise OSError(28, "No space left on device")
-    with trouble.told():
+    with trouble.log_failure():
         pass
     assert [record.message for record in caplog.records] == [
         "looking at the inbox failed: OSError: [Errno 28] No space left on device; "

@@ -56,7 +56,7 @@ def test_clips_that_say_nothing_of_somebody_leave_him_anybody(monkeypatch, weigh
     named = {"here": {"3": "ann"}, "second": {"7": "ann"}, "third": {"7": "ann"}}
     recipe = SimpleNamespace(unit="here", sources={"people": named})
     monkeypatch.setattr(refitting, "open_input", lambda *_: silent)
-    known = refitting._known(None, SimpleNamespace(recipe=recipe), np.array([2, 3]), weight)
+    known = refitting._known_shapes(None, SimpleNamespace(recipe=recipe), np.array([2, 3]), weight)
     assert list(known) == [1]
     np.testing.assert_allclose(known[1].covariance, np.eye(10) / weight)
 

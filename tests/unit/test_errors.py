@@ -14,14 +14,14 @@ def broken():
 def test_an_unforeseen_exception_is_called_a_bug_and_names_its_line():
     with pytest.raises(KeyError) as caught:
         broken()
-    error = InternalError.wrapping("tracking/clip", caught.value)
+    error = InternalError.wrap("tracking/clip", caught.value)
     assert str(error).startswith("tracking/clip: internal error KeyError at ")
     assert "test_errors.py:11 in broken: 'click'" in str(error)
     assert "This is a bug in worldpose, not in your data" in str(error)
 
 
 def test_an_exception_that_was_never_raised_is_named_all_the_same():
-    assert "internal error ValueError: odd" in str(InternalError.wrapping("x", ValueError("odd")))
+    assert "internal error ValueError: odd" in str(InternalError.wrap("x", ValueError("odd")))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.body.keypoints import FoldedKeypoints
 from worldpose.body.model import JOINTS, BodyModel, BodyParameters
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class ChainedKeypoints:
         """Return the keypoints and their Jacobian; NaN where a parameter is."""
         flat, batch, count = parameters.flat(), parameters.batch_shape, len(self.vectors)
         angles = np.concatenate([flat.global_orient, flat.body_pose], axis=-1)
-        local, turns, axes = _turned(angles.reshape(-1, JOINTS, 3), self.model.parents)
+        local, turns, axes = _turn_joints(angles.reshape(-1, JOINTS, 3), self.model.parents)
         feature = np.concatenate([np.ones((len(angles), 1)), flat.betas], axis=-1)
         linear = feature.shape[-1]
         corrected = self.vectors.shape[-1] > linear
@@ -89,7 +89,7 @@ class ChainedKeypoints:
         terms = (feature @ constants.reshape(-1, feature.shape[-1]).T).reshape(
             len(angles), len(joint), 3
         )
-        keypoints, by_pose = _levered(
+        keypoints, by_pose = _sum_levers(
             turns, axes, terms, keypoint, joint, moves, self.model.parents
         )
         keypoints += (feature[:, :linear] @ self.pelvis.T + flat.transl)[:, None]
@@ -144,8 +144,8 @@ def _own_change(local: Floats, turns: Floats, axes: Floats, parents: NDArray[np.
     return changed.reshape(*inward.shape[:2], 9, 3)
 
 
-@compiled
-def _turned(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+@compile_kernel
+def _turn_joints(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
     """Return rotations of joints relative to parent and world, and axes of their angles.
 
     Args:
@@ -205,8 +205,8 @@ def _turned(angles: Floats, parents: NDArray[np.int64]) -> tuple[Floats, Floats,
     return local, turns, axes
 
 
-@compiled
-def _levered(
+@compile_kernel
+def _sum_levers(
     turns: Floats,
     axes: Floats,
     terms: Floats,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.errors import InputError
-from worldpose.geometry.rigid import Index, Rigid, checked, common_batch, leading
+from worldpose.geometry.rigid import Index, Rigid, check_shape, common_batch, index_leading
 
 BODY_POSE = 69
 """Length of `body_pose`: three angles for each of the 23 joints below the pelvis."""
@@ -45,7 +45,7 @@ class BodyParameters:
     def __post_init__(self) -> None:
         lengths = {"betas": -1, "global_orient": 3, "body_pose": BODY_POSE, "transl": 3}
         arrays = {
-            name: checked(f"BodyParameters.{name}", getattr(self, name), (length,))
+            name: check_shape(f"BodyParameters.{name}", getattr(self, name), (length,))
             for name, length in lengths.items()
         }
         batch = common_batch("BodyParameters", *(array.shape[:-1] for array in arrays.values()))
@@ -63,7 +63,7 @@ class BodyParameters:
         return self.transl.shape[:-1]
 
     def __getitem__(self, index: Index) -> BodyParameters:
-        return BodyParameters(*(array[leading(index, 1)] for array in self._arrays()))
+        return BodyParameters(*(array[index_leading(index, 1)] for array in self._arrays()))
 
     def flat(self) -> BodyParameters:
         """Return the same bodies in one batch dimension."""

@@ -165,10 +165,10 @@ def shift_frames(values: Floats, late: float) -> Floats:
     before = np.arange(len(values)) + int(np.floor(late))
     share = late - np.floor(late)
 
-    def taken(places: NDArray[np.int64]) -> Floats:
+    def take(places: NDArray[np.int64]) -> Floats:
         out = np.full(values.shape, np.nan)
         inside = (places >= 0) & (places < len(values))
         out[inside] = values[places[inside]]
         return out
 
-    return (1.0 - share) * taken(before) + share * taken(before + 1) if share else taken(before)
+    return (1.0 - share) * take(before) + share * take(before + 1) if share else take(before)

@@ -262,13 +262,13 @@ def _select_flow(
     seen = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
     return FlowEvidence(
         frame=np.repeat(np.arange(len(followed)), counts),
-        start=_stacked([p.start[mine] for p, mine in zip(followed, kept, strict=True)]),
-        end=_stacked([p.end[mine] for p, mine in zip(followed, kept, strict=True)]),
+        start=_stack_arrays([p.start[mine] for p, mine in zip(followed, kept, strict=True)]),
+        end=_stack_arrays([p.end[mine] for p, mine in zip(followed, kept, strict=True)]),
         deviation=np.full(sum(counts), max(seen, settings.flow_noise_px)),
     )
 
 
-def _stacked(parts: Sequence[Floats]) -> Floats:
+def _stack_arrays(parts: Sequence[Floats]) -> Floats:
     return np.concatenate([np.empty((0, 2)), *parts])
 
 

@@ -104,7 +104,7 @@ class PointEvidence:
         """
         whitening = np.zeros((len(observed.frame), 2, 2))
         whitening[:, 0] = normals / deviation[:, None]
-        return cls._whitened(observed, whitening, 1.0, loss)
+        return cls._whiten(observed, whitening, 1.0, loss)
 
     @classmethod
     def at_points(
@@ -118,10 +118,10 @@ class PointEvidence:
             weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
         """
-        return cls._whitened(observed, np.eye(2) / deviation[:, None, None], weight, loss)
+        return cls._whiten(observed, np.eye(2) / deviation[:, None, None], weight, loss)
 
     @classmethod
-    def _whitened(
+    def _whiten(
         cls, observed: ObservedPoints, whitening: Floats, weight: float, loss: float
     ) -> PointEvidence:
         count = len(observed.frame)

@@ -18,7 +18,7 @@ from worldpose.broadcast_calibration.evidence import (
     together,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
-from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solver import Problem, solve
@@ -138,7 +138,7 @@ def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
         batch = type(camera).stack([camera])
         single = MovingCamera.of(batch, shared[:3], shared[3:])
         parts.append(_kept_aim(single, camera.center, camera.principal_point))
-    return joined(parts)
+    return join_cameras(parts)
 
 
 def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
@@ -224,7 +224,7 @@ def _clicks(
             normal,
         )
         known = np.isfinite(place).all(axis=-1)
-        names, shares = _hung(pitch, marking.name, place[known])
+        names, shares = _locate_on_marking(pitch, marking.name, place[known])
         parts.append(
             PointEvidence.across_lines(
                 ObservedPoints(
@@ -244,7 +244,9 @@ def _clicks(
     return together(parts)
 
 
-def _hung(pitch: PitchTemplate, marking: str, places: Floats) -> tuple[tuple[str, str], Floats]:
+def _locate_on_marking(
+    pitch: PitchTemplate, marking: str, places: Floats
+) -> tuple[tuple[str, str], Floats]:
     """Return the two points that define a marking, and their shares (n, 2) of places on it."""
     if marking in pitch.arcs:
         center = pitch.arcs[marking].center

@@ -17,7 +17,7 @@ from worldpose.broadcast_calibration.evidence import (
     bounds,
     together,
 )
-from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
@@ -87,7 +87,7 @@ def find_lines(
     first = _look(camera, samples, picture, people, settings, settings.line_search_px)
     if len(first) < _FEW:
         return PointEvidence.none(), camera
-    corrected = _corrected(camera, first)
+    corrected = _correct_camera(camera, first)
     return _look(corrected, samples, picture, people, settings, _FINE), corrected
 
 
@@ -104,7 +104,7 @@ def _look(
     seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, 0.0, 0.0)
     index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
-        index = index[~_hidden(seen.places[index], people, reach)]
+        index = index[~_find_hidden(seen.places[index], people, reach)]
     room = 0.5 * seen.widths[index] + CLEARANCE
     index = index[
         clear(
@@ -169,7 +169,7 @@ def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
     return lines[ahead & (np.abs(place + off) < half).all(axis=-1)]
 
 
-def _hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
+def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
     """Return a mask of the places (n,) in or near a person's box."""
     x, y = places[:, 0, None], places[:, 1, None]
     x0, y0, x1, y1 = people.T
@@ -178,7 +178,7 @@ def _hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
         return np.asarray((across & (y > y0 - reach) & (y < y1 + reach)).any(axis=1))
 
 
-def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
+def _correct_camera(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
     """Return a single frame with rotation and focal length fitted to its lines."""
     begin, edges = camera, bounds(lines.frame, 1)
     gone = np.zeros(4)
@@ -190,11 +190,13 @@ def _corrected(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
         add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
         normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
         gone = gone - np.linalg.solve(normal, equations.right[0, :4] + gone / _HOLD**2)
-        camera = begin.stepped(np.append(gone, np.zeros(3))[None], np.zeros(5))
+        camera = begin.take_step(np.append(gone, np.zeros(3))[None], np.zeros(5))
     return camera
 
 
-def carried(camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera) -> MovingCamera:
+def carry_correction(
+    camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera
+) -> MovingCamera:
     """Return a frame's camera with the correction of another frame applied.
 
     Args:
@@ -243,10 +245,10 @@ def follow_lines(
     before = after = camera.frames(slice(0, 1))
     for frame, picture in enumerate(pictures):
         single = camera.frames(slice(frame, frame + 1))
-        begin = carried(single, before, after)
+        begin = carry_correction(single, before, after)
         people = None if boxes is None else boxes[frame]
         found, corrected = find_lines(begin, samples, picture, people, settings)
         parts.append(found.in_frame(frame))
         cameras.append(corrected)
         before, after = single, corrected
-    return FollowedLines(together(parts), joined(cameras))
+    return FollowedLines(together(parts), join_cameras(cameras))

@@ -96,7 +96,7 @@ class MovingCamera:
             distortion=np.ascontiguousarray(self.distortion[index]),
         )
 
-    def stepped(self, frame_step: ArrayLike, clip_step: ArrayLike) -> MovingCamera:
+    def take_step(self, frame_step: ArrayLike, clip_step: ArrayLike) -> MovingCamera:
         """Return the camera after a step.
 
         Args:
@@ -136,7 +136,7 @@ class MovingCamera:
         )
 
 
-def joined(parts: list[MovingCamera]) -> MovingCamera:
+def join_cameras(parts: list[MovingCamera]) -> MovingCamera:
     """Return the concatenated frames, with center and principal point of the first part."""
     return replace(
         parts[0],

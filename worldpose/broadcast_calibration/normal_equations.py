@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
 _NEAR = 0.5
 """Minimum depth of a point [m]: a camera in the stands sees none nearer."""
@@ -109,7 +109,7 @@ def empty_equations(frames: int, shared: int) -> NormalEquations:
     )
 
 
-@compiled
+@compile_kernel
 def point_row(
     r: Floats, center: Floats, lens: Lens, world: Floats, image: Floats, jacobian: Floats
 ) -> bool:
@@ -132,7 +132,7 @@ def point_row(
     return direction_row(x, y, z, r, lens, image, jacobian)
 
 
-@compiled
+@compile_kernel
 def direction_row(
     x: float, y: float, z: float, r: Floats, lens: Lens, image: Floats, jacobian: Floats
 ) -> bool:
@@ -164,7 +164,7 @@ def direction_row(
     return True
 
 
-@compiled
+@compile_kernel
 def add_points(
     cameras: Cameras, bounds: Integers, points: Points, beside: Floats, equations: NormalEquations
 ) -> float:
@@ -266,8 +266,8 @@ _UNDISTORT: Final = 30
 """Maximum Newton steps; a lens that displaces the corner by a twentieth takes three or four."""
 
 
-@compiled
-def undistorted(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
+@compile_kernel
+def undistort_point(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
     """Return the undistorted point on the plane z = 1 of (xd, yd), and whether it exists."""
     far = math.sqrt(xd * xd + yd * yd)
     radius = far
@@ -285,7 +285,7 @@ def undistorted(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
     return xd * scale, yd * scale, True
 
 
-@compiled
+@compile_kernel
 def flow_row(
     principal: Floats,
     focal: Floats,
@@ -310,7 +310,7 @@ def flow_row(
     """
     xd, yd = (start[0] - principal[0]) / focal[0], (start[1] - principal[1]) / focal[0]
     k = distortion[0]
-    a, b, known = undistorted(xd, yd, k)
+    a, b, known = undistort_point(xd, yd, k)
     if not known:
         return False
     # Rotation from the first camera's axes to the second's.
@@ -350,7 +350,7 @@ def flow_row(
     return True
 
 
-@compiled
+@compile_kernel
 def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEquations) -> float:
     """Add followed points to the normal equations and return their cost; see `add_points`.
 

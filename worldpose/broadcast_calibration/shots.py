@@ -132,7 +132,7 @@ def find_shots(
     for number, picture in pictures:
         if number % stride:
             continue
-        same, moved = (False, 0.0) if before is None else _moved(before, picture, settings)
+        same, moved = (False, 0.0) if before is None else _measure_motion(before, picture, settings)
         if course is not None and not same:
             if course.last - course.first >= _SETTLED * fps:
                 if waiting is not None:
@@ -184,7 +184,9 @@ def grass_and_people(picture: Image) -> tuple[float, float]:
     return share, tallest / len(picture)
 
 
-def _moved(before: Image, picture: Image | None, settings: ProgrammeSettings) -> tuple[bool, float]:
+def _measure_motion(
+    before: Image, picture: Image | None, settings: ProgrammeSettings
+) -> tuple[bool, float]:
     """Return whether a frame continues a shot, and its motion to the right [widths]."""
     if picture is None:
         return False, 0.0

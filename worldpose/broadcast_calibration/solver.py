@@ -58,7 +58,7 @@ class Problem:
     free_clip: NDArray[np.bool_] = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
     known: NDArray[np.bool_] | None = None
 
-    def held(self, frames: int) -> NDArray[np.bool_]:
+    def fixed_mask(self, frames: int) -> NDArray[np.bool_]:
         """Return the mask of every frame's fixed parameters (frames, 7)."""
         held = np.broadcast_to(~self.free_frame, (frames, FRAME_SIZE))
         return held if self.known is None else held | self.known
@@ -152,7 +152,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
 
     def step(state: _State, damping: float) -> _State:
         frame, shared = _solve_step(state.equations.system, damping)
-        camera = state.camera.stepped(frame, shared[:CLIP_SIZE])
+        camera = state.camera.take_step(frame, shared[:CLIP_SIZE])
         beside = state.beside + shared[CLIP_SIZE:].reshape(state.beside.shape)
         return _State(camera, beside, equations_at(camera, beside, problem))
 
@@ -230,7 +230,7 @@ def _remove_fixed(problem: Problem, system: NormalEquations) -> None:
     """Remove fixed parameters from the system, in place."""
     blocks, border, corner = system.blocks, system.border, system.corner
     right, right_corner = system.right, system.right_corner
-    fixed = problem.held(len(right))
+    fixed = problem.fixed_mask(len(right))
     if fixed.any():
         for below in range(3):
             rows = np.concatenate([fixed[below:], np.zeros((below, FRAME_SIZE), np.bool_)])
@@ -279,7 +279,7 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         second = square / (1.0 - _DECAY[1] ** iteration)
         step = -RATE * unit * first / (np.sqrt(second) + _SMALL)
         shared = step[frames:]
-        camera = camera.stepped(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
+        camera = camera.take_step(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
         beside = beside + shared[CLIP_SIZE:].reshape(beside.shape)
         here = equations_at(camera, beside, problem)
         costs.append(here.cost)

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
-from worldpose.broadcast_calibration.moving_camera import MovingCamera, joined
+from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import (
     Flow,
     add_flow,
     empty_equations,
     flow_row,
 )
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Rigid
 
 
@@ -86,7 +86,7 @@ def chain(
             cameras[frame] = _toward(_there(cameras[frame]), reached, key, share)
     for frame in range(key_frames[-1], frames - 1):
         cameras[frame + 1] = advance(_there(cameras[frame]), frame, False)
-    whole = joined([_there(camera) for camera in cameras])
+    whole = join_cameras([_there(camera) for camera in cameras])
     return Chain(whole, kept, residual, determined, np.array(drift))
 
 
@@ -104,7 +104,7 @@ def _toward(
         [way, np.log(key.focal / reached.focal)[:, None], key.distortion - reached.distortion],
         axis=1,
     )
-    return camera.stepped(share * step, np.zeros(5))
+    return camera.take_step(share * step, np.zeros(5))
 
 
 def _apart(one: MovingCamera, other: MovingCamera) -> float:
@@ -154,7 +154,7 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
         focal=np.repeat(camera.focal, 2),
         distortion=np.repeat(camera.distortion, 2, axis=0),
     )
-    return _fitted(both, followed, 4)
+    return _fit_turn(both, followed, 4)
 
 
 def turn_only(both: MovingCamera, followed: Followed) -> Turned:
@@ -165,7 +165,7 @@ def turn_only(both: MovingCamera, followed: Followed) -> Turned:
         followed: points of the first in the second.
     """
     both = replace(both, rotation=np.repeat(both.rotation[:1], 2, axis=0))
-    return _fitted(both, followed, 3)
+    return _fit_turn(both, followed, 3)
 
 
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
@@ -199,7 +199,7 @@ def modified_z_scores(residual: Floats) -> Floats:
     return np.asarray((0.6745 * off / spread).max(axis=-1))
 
 
-def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
+def _fit_turn(both: MovingCamera, followed: Followed, count: int) -> Turned:
     """Return the second of two frames with fitted rotation and, if `count` is 4, zoom."""
     if len(followed.start) < _FEW:
         return Turned(both, np.full((len(followed.start), 2), np.nan), False)
@@ -207,7 +207,7 @@ def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
     ones = np.ones(len(followed.start))
     # The median motion is a robust start.
     x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
-    both = _moved(both, np.array([-y, x, 0.0, 0.0])[:count])
+    both = _move_second(both, np.array([-y, x, 0.0, 0.0])[:count])
     for scale in _SCALES:
         equations = empty_equations(2, 5)
         flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
@@ -216,15 +216,15 @@ def _fitted(both: MovingCamera, followed: Followed, count: int) -> Turned:
         normal = normal + 1e-9 * np.diag(np.diag(normal))
         if not np.linalg.cond(normal) < 1e12:
             return Turned(both, flow_residuals(both, followed), False)
-        both = _moved(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :count])))
+        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :count])))
     return Turned(both, flow_residuals(both, followed), True)
 
 
-def _moved(both: MovingCamera, step: Floats) -> MovingCamera:
+def _move_second(both: MovingCamera, step: Floats) -> MovingCamera:
     """Return both frames after a step of the second: rotation (3,), or with log focal (4,)."""
     whole = np.zeros((2, 7))
     whole[1, : len(step)] = step
-    moved = both.stepped(whole, np.zeros(5))
+    moved = both.take_step(whole, np.zeros(5))
     if len(step) == 3:
         return moved
     growth = (moved.focal[1] / moved.focal[0]) ** _LENS
@@ -232,7 +232,7 @@ def _moved(both: MovingCamera, step: Floats) -> MovingCamera:
     return replace(moved, distortion=lens)
 
 
-@compiled
+@compile_kernel
 def _residuals(
     principal: Floats,
     focal: Floats,

@@ -14,7 +14,7 @@ from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.normal_equations import Cameras, Lens, Points, point_row
 from worldpose.broadcast_calibration.solver import Problem, Solution
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
 
@@ -102,7 +102,7 @@ def compute_uncertainty(
     whole += moved @ np.swapaxes(moved, -1, -2)
     # The system has ones for fixed parameters, to stay regular; their covariance is zero.
     clip = np.broadcast_to(~problem.free_clip, (len(whole), CLIP_SIZE))
-    held = np.concatenate([problem.held(len(whole)), clip], axis=1)
+    held = np.concatenate([problem.fixed_mask(len(whole)), clip], axis=1)
     whole[held[:, :, None] | held[:, None, :]] = 0.0
     return Uncertainty(0.5 * (whole + np.swapaxes(whole, -1, -2)))
 
@@ -139,7 +139,7 @@ def _lasting_gradients(
         np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
         for each in (by_frame, by_shared)
     )
-    by_frame[problem.held(len(camera))] = 0.0
+    by_frame[problem.fixed_mask(len(camera))] = 0.0
     by_shared[:CLIP_SIZE][~problem.free_clip] = 0.0
     return by_frame, by_shared
 
@@ -182,7 +182,7 @@ class _Clusters(NamedTuple):
     """(n,) column of a shift along x; the next is along y."""
 
 
-@compiled
+@compile_kernel
 def _add_gradients(
     cameras: Cameras,
     points: Points,
@@ -287,7 +287,7 @@ def drawn_to(
     place = slice(FRAME_SIZE, FRAME_SIZE + 3)
     along = known[:, :, place] @ np.linalg.inv(known[:, place, place])
     step = along @ (pooled.center - camera.center)
-    moved = camera.stepped(step[:, :FRAME_SIZE], step[0, FRAME_SIZE:])
+    moved = camera.take_step(step[:, :FRAME_SIZE], step[0, FRAME_SIZE:])
     gained = known[:, place, place] - pooled.covariance
     left = known - along @ gained @ np.swapaxes(along, -1, -2)
     return moved, Uncertainty(0.5 * (left + np.swapaxes(left, -1, -2)))

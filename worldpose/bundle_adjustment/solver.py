@@ -23,7 +23,7 @@ from worldpose.geometry.optimize.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
@@ -127,7 +127,7 @@ def solve(
     system = _System(problem)
     points = problem.points
     offset = np.zeros(problem.free.shape) if offset is None else np.where(problem.free, offset, 0.0)
-    cameras = stepped(problem.cameras, offset) if offset.any() else problem.cameras
+    cameras = step_camera(problem.cameras, offset) if offset.any() else problem.cameras
     start = _State(cameras, points, offset, system.cost(cameras, points, offset))
     if np.isnan(start.cost):
         raise InternalError("bundle adjustment: start", "a cost that is no number")
@@ -214,7 +214,7 @@ class _System:
     def step(self, state: _State, damping: float) -> _State:
         """Return the state after a damped step."""
         step, points = self.solve_step(state.cameras, state.points, damping, state.offset)
-        cameras, offset = stepped(state.cameras, step), state.offset + step
+        cameras, offset = step_camera(state.cameras, step), state.offset + step
         return _State(cameras, points, offset, self.cost(cameras, points, offset))
 
     def solve_step(

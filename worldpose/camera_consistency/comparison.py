@@ -14,7 +14,7 @@ from pydantic import Field
 from data_contracts.arrays import Floats
 from data_contracts.records import Record
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
@@ -413,7 +413,7 @@ def _pack(keypoints: Floats) -> Floats:
     return np.ascontiguousarray(np.where(there[..., None, None], packed, np.nan))
 
 
-@compiled
+@compile_kernel
 def pair_scores(
     view: View,
     frames: Ints,
@@ -458,7 +458,7 @@ def pair_scores(
     return scores
 
 
-@compiled
+@compile_kernel
 def _one_to_one(weights: Floats) -> float:
     """Return the sum of the best pairs, each row and column used once; clears `weights`."""
     total = 0.0
@@ -476,7 +476,7 @@ def _one_to_one(weights: Floats) -> float:
         weights[:, column] = 0.0
 
 
-@compiled
+@compile_kernel
 def _weights(
     rays_a: Floats,
     center_a: Floats,
@@ -532,7 +532,7 @@ def _weights(
     return weights
 
 
-@compiled
+@compile_kernel
 def _is_person(points: Floats, heights: tuple[float, float]) -> bool:
     """Return whether joints (n, 3) [m] have a person's size and height above the ground."""
     n = len(points)

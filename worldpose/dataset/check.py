@@ -226,7 +226,7 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         if fault is not None and fault.points is not None:
             findings.append(_world_finding(source, fault, before, after))
             points = fault.points(repaired)
-            repaired = repaired if points is None else repaired.moved(points)
+            repaired = repaired if points is None else repaired.with_points(points)
         if repaired is source and source.name not in {one.source for one in agreements}:
             findings += ground_findings(source, settings)
         findings += body_findings(repaired, clip.fps, settings)
@@ -276,7 +276,7 @@ def _repair_source(source: PointSource, agreements: Iterable[Agreement]) -> Poin
         return source
     fault = max(faults, key=faults.count)
     points = None if fault.points is None else fault.points(source)
-    return source if points is None else source.moved(points)
+    return source if points is None else source.with_points(points)
 
 
 def _repair_view(view: View, fault: Fault) -> View:

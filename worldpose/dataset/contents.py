@@ -46,7 +46,7 @@ class PointSource:
     in_degrees: Floats | None = None
     """The points if the file's angles were degrees; None if they cannot be."""
 
-    def moved(self, points: Floats) -> PointSource:
+    def with_points(self, points: Floats) -> PointSource:
         """Return the same source with other points."""
         return PointSource(self.name, self.skeleton, points)
 
@@ -245,7 +245,7 @@ def _sources(
     ids: tuple[int, ...] = ()
     poses = folder / "poses" / f"{clip}.npz"
     if poses.is_file():
-        source, more = _posed(poses, f"poses/{clip}.npz", body)
+        source, more = _read_poses(poses, f"poses/{clip}.npz", body)
         sources.append(source)
         findings += more
         ids = tuple(range(source.points.shape[1]))
@@ -267,7 +267,7 @@ def _sources(
     return sources, findings, ids
 
 
-def _posed(
+def _read_poses(
     path: Path, name: str, body: Callable[[str | None], BodyModel]
 ) -> tuple[PointSource, list[Finding]]:
     """Return the points of a pose file's bodies, and their values under other conventions."""
@@ -331,7 +331,7 @@ def _rows_of_boxes(
         if not swapped:
             kept.append(source)
             continue
-        kept.append(source.moved(source.points.swapaxes(0, 1)))
+        kept.append(source.with_points(source.points.swapaxes(0, 1)))
         findings.append(
             Finding(
                 fault="frames_before_persons",

@@ -60,29 +60,29 @@ def camera_faults() -> Iterator[Fault]:
     yield Fault(
         "transposed_rotation",
         "R is world_from_cam, the transpose of what x_cam = R x_world + t has",
-        camera=lambda c: _posed(c, _transpose(c.rotation), c.translation),
+        camera=lambda c: _pose_rows(c, _transpose(c.rotation), c.translation),
     )
     yield Fault(
         "translation_is_center",
         "t is the camera's centre C and not -R C",
-        camera=lambda c: _posed(c, c.rotation, -_turn_vectors(c.rotation, c.translation)),
+        camera=lambda c: _pose_rows(c, c.rotation, -_turn_vectors(c.rotation, c.translation)),
     )
     yield Fault(
         "camera_to_world",
         "R and t are world_from_cam: the transpose of R, and the centre for t",
-        camera=lambda c: _posed(
+        camera=lambda c: _pose_rows(
             c, _transpose(c.rotation), -_turn_vectors(_transpose(c.rotation), c.translation)
         ),
     )
     yield Fault(
         "negated_translation",
         "t has the wrong sign",
-        camera=lambda c: _posed(c, c.rotation, -c.translation),
+        camera=lambda c: _pose_rows(c, c.rotation, -c.translation),
     )
     yield Fault(
         "camera_in_millimetres",
         "t is in millimetres and not in metres",
-        camera=lambda c: _posed(c, c.rotation, c.translation / 1000.0),
+        camera=lambda c: _pose_rows(c, c.rotation, c.translation / 1000.0),
     )
     for order in ("k1 k2 k3 p1 p2", "p1 p2 k1 k2 k3", "k1 k2 p2 p1 k3"):
         yield Fault(
@@ -120,12 +120,12 @@ def axis_orders() -> Iterator[tuple[str, Floats]]:
 
 
 def _shrink(size: float) -> Callable[[PointSource], Floats]:
-    def repaired(source: PointSource) -> Floats:
+    def repair(source: PointSource) -> Floats:
         if source.place is None:
             return source.points / size
         return source.points + (source.place / size - source.place)[:, :, None]
 
-    return repaired
+    return repair
 
 
 def _axis_faults() -> Iterator[Fault]:
@@ -139,7 +139,7 @@ def _axis_faults() -> Iterator[Fault]:
 
 
 def _turn(shipped_from_world: Floats, whole: bool) -> Callable[[PointSource], Floats | None]:
-    def repaired(source: PointSource) -> Floats | None:
+    def repair(source: PointSource) -> Floats | None:
         if whole:
             return source.points @ shipped_from_world
         if source.place is None:
@@ -147,7 +147,7 @@ def _turn(shipped_from_world: Floats, whole: bool) -> Callable[[PointSource], Fl
         moved = source.place @ shipped_from_world - source.place
         return source.points + moved[:, :, None]
 
-    return repaired
+    return repair
 
 
 def _axis_name(shipped_from_world: Floats) -> tuple[str, str]:
@@ -176,14 +176,14 @@ def _lens_in(order: str) -> Callable[[CameraRows], CameraRows]:
     """Return a repair for a camera whose coefficients were written in another order."""
     place = [order.split().index(name) for name in _LENS.split()]
 
-    def repaired(camera: CameraRows) -> CameraRows:
+    def repair(camera: CameraRows) -> CameraRows:
         lens = camera.distortion[:, place]
         return CameraRows(camera.intrinsics, lens, camera.rotation, camera.translation)
 
-    return repaired
+    return repair
 
 
-def _posed(camera: CameraRows, rotation: Floats, translation: Floats) -> CameraRows:
+def _pose_rows(camera: CameraRows, rotation: Floats, translation: Floats) -> CameraRows:
     return CameraRows(camera.intrinsics, camera.distortion, rotation, translation)
 
 

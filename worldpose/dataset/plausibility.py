@@ -57,7 +57,7 @@ def world_fault(source: PointSource, settings: CheckSettings) -> tuple[Fault | N
         points = None if fault.points is None else fault.points(source)
         if points is None:
             continue
-        moved = source.moved(points)
+        moved = source.with_points(points)
         share = plausible_share(moved, settings)
         height = abs(foot_height(moved))
         if share > most + 0.01 or (share >= most - 0.01 and height < nearest - 0.02):
@@ -79,7 +79,7 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
     fault, left = "feet_off_the_ground", height
     if source.pivot is not None:
-        moved = source.moved(source.points + source.pivot[:, :, None])
+        moved = source.with_points(source.points + source.pivot[:, :, None])
         left = foot_height(moved)
         if settings.min_ground_m <= left <= settings.max_ground_m and abs(left) < 0.5 * abs(height):
             fault = "root_about_origin"
@@ -328,12 +328,12 @@ def visibility_findings(
         if not explained.any():
             break
         left &= ~explained
-        yield _finding(views, explained, faults[best], share[best]), faults[best]
+        yield _make_finding(views, explained, faults[best], share[best]), faults[best]
     if left.any():
-        yield _finding(views, left, None, share.max(0, initial=0.0)), None
+        yield _make_finding(views, left, None, share.max(0, initial=0.0)), None
 
 
-def _finding(
+def _make_finding(
     views: Sequence[View], which: NDArray[np.bool_], fault: Fault | None, share: Floats
 ) -> Finding:
     named = [view.name for view, ours in zip(views, which, strict=True) if ours]

@@ -255,7 +255,7 @@ def detect_strided(
     chosen: list[int] = []
     due: int | None = None
 
-    def found() -> Iterator[tuple[int, Image | None, People | None]]:
+    def iterate_found() -> Iterator[tuple[int, Image | None, People | None]]:
         images = [image for at in chosen if (image := waiting[at][1]) is not None]
         people = dict(zip(chosen, detect(images) if images else [], strict=True))
         for at, (number, image) in enumerate(waiting):
@@ -269,8 +269,8 @@ def detect_strided(
             chosen.append(len(waiting) - 1)
             due = number + stride
         if len(chosen) == batch:
-            yield from found()
+            yield from iterate_found()
     last = next((at for at in reversed(range(len(waiting))) if waiting[at][1] is not None), None)
     if last is not None and last not in chosen:
         chosen.append(last)  # so that boxes reach the last frame
-    yield from found()
+    yield from iterate_found()

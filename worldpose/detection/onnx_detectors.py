@@ -272,7 +272,9 @@ def _best(scores: Floats, people: Sequence[int]) -> Floats:
     return np.asarray(scores[:, list(people)].max(axis=1))
 
 
-def _labelled(boxes: Floats, scores: Floats, labels: Floats, people: Sequence[int]) -> People:
+def _select_labelled(
+    boxes: Floats, scores: Floats, labels: Floats, people: Sequence[int]
+) -> People:
     shown = np.isin(labels.round(), people)
     return _above_min_score(boxes[shown], scores[shown])
 
@@ -303,12 +305,12 @@ def _decode_columns(outputs: Outputs, _: tuple[int, int], people: Sequence[int])
 
 def _decode_nms(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
     found = outputs[0]
-    return _labelled(found[:, :4], found[:, 4], found[:, 5], people)
+    return _select_labelled(found[:, :4], found[:, 4], found[:, 5], people)
 
 
 def _decode_dets(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
     found, labels = outputs
-    return _labelled(found[:, :4], found[:, 4], labels, people)
+    return _select_labelled(found[:, :4], found[:, 4], labels, people)
 
 
 def _decode_boxes(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -> People:
@@ -316,7 +318,7 @@ def _decode_boxes(outputs: Outputs, _: tuple[int, int], people: Sequence[int]) -
     flat = [output for output in outputs if output.ndim == 1]
     whole = [bool((output == output.round()).all()) for output in flat]
     labels, scores = flat if whole[0] and not whole[1] else flat[::-1]
-    return _labelled(boxes, scores, labels, people)
+    return _select_labelled(boxes, scores, labels, people)
 
 
 def _decode_movenet(outputs: Outputs, size: tuple[int, int], _: Sequence[int]) -> People:

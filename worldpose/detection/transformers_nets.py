@@ -52,9 +52,9 @@ class _TransformersDetector:
         kind = _kind(folder, library, DETECTORS)
         # The processors without a suffix need torchvision.
         named = library.DetrImageProcessorPil if kind == "detr" else library.RTDetrImageProcessorPil
-        self._processor = _loaded(folder, named)
-        net = _loaded(folder, library.AutoModelForObjectDetection, use_safetensors=True)
-        self._net = _placed(net, self._torch, folder, device, half)
+        self._processor = _load_net(folder, named)
+        net = _load_net(folder, library.AutoModelForObjectDetection, use_safetensors=True)
+        self._net = _place_net(net, self._torch, folder, device, half)
         self._device, self._half = device, half
         self._person = next(
             (number for number, name in net.config.id2label.items() if name.lower() == "person"),
@@ -92,9 +92,9 @@ class _TransformersPose:
     def __init__(self, folder: Path, device: str, half: bool) -> None:
         self._torch, library = _libraries(folder)
         _kind(folder, library, POSES)
-        self._processor = _loaded(folder, library.VitPoseImageProcessorPil)
-        net = _loaded(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
-        self._net = _placed(net, self._torch, folder, device, half)
+        self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
+        net = _load_net(folder, library.VitPoseForPoseEstimation, use_safetensors=True)
+        self._net = _place_net(net, self._torch, folder, device, half)
         self._device, self._half = device, half
         experts = getattr(net.config.backbone_config, "num_experts", 1)
         self._expert = 0 if experts > 1 else None  # of ViTPose+, the one for COCO
@@ -141,7 +141,7 @@ def _libraries(folder: Path) -> tuple[ModuleType, ModuleType]:
 
 
 def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
-    kind = str(_loaded(folder, library.AutoConfig).model_type)
+    kind = str(_load_net(folder, library.AutoConfig).model_type)
     if kind not in known:
         raise InputError(
             str(folder),
@@ -152,7 +152,7 @@ def _kind(folder: Path, library: ModuleType, known: tuple[str, ...]) -> str:
     return kind
 
 
-def _loaded(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
+def _load_net(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
     try:
         return named.from_pretrained(str(folder), local_files_only=True, **further)
     except (OSError, ValueError, KeyError) as error:
@@ -164,7 +164,7 @@ def _loaded(folder: Path, named: Any, **further: bool) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _placed(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) -> Any:  # noqa: ANN401
+def _place_net(net: Any, torch: ModuleType, folder: Path, device: str, half: bool) -> Any:  # noqa: ANN401
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError(
             str(folder),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldpose.geometry.rigid import checked
+from worldpose.geometry.rigid import check_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Similarity:
             points: (..., n, 3) [m] in frame a; the batch broadcasts against the dimensions
                 before n.
         """
-        source = checked("Similarity.apply: points", points, (-1, 3))
+        source = check_shape("Similarity.apply: points", points, (-1, 3))
         scaled = self.scale[..., None, None] * np.swapaxes(self.rotation, -1, -2)
         moved: NDArray[np.float64] = source @ scaled + self.translation[..., None, :]
         return moved
@@ -54,7 +54,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
         Umeyama, IEEE PAMI 13(4), 1991; E1.
     """
     a, b = np.broadcast_arrays(
-        checked("align: source", source, (-1, 3)), checked("align: target", target, (-1, 3))
+        check_shape("align: source", source, (-1, 3)), check_shape("align: target", target, (-1, 3))
     )
     common = np.isfinite(a).all(-1) & np.isfinite(b).all(-1)
     count = common.sum(-1)

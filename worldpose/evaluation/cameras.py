@@ -178,7 +178,7 @@ def _ground_errors(
 
     If the estimated camera's ray misses the pitch surface, the error is `reach`.
     """
-    seen, pixels = _seen(true, surface)
+    seen, pixels = _select_visible(true, surface)
     found = surface_points(estimated.unproject(pixels), pitch)
     distance = np.linalg.norm(found - seen, axis=-1)
     return np.minimum(np.where(np.isnan(distance), reach, distance), reach)
@@ -188,13 +188,13 @@ def _reprojection_errors(
     estimated: Camera, true: Camera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return pixel distances; the image diagonal if the estimated camera cannot see a point."""
-    seen, pixels = _seen(true, points)
+    seen, pixels = _select_visible(true, points)
     diagonal = float(np.linalg.norm(true.image_size))
     distance = np.linalg.norm(estimated.project(seen) - pixels, axis=-1)
     return np.minimum(np.where(np.isnan(distance), diagonal, distance), diagonal)
 
 
-def _seen(
+def _select_visible(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the points inside the camera's image, and their pixels."""

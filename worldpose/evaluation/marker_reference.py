@@ -60,7 +60,7 @@ def read_markers(path: Path) -> Markers:
     # A truncated file lacks lines, cells or keys; text may be no number or no UTF-8.
     except (OSError, LookupError, ValueError) as error:
         raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
-    return _checked(path, rate, names, points, unit)
+    return _check_markers(path, rate, names, points, unit)
 
 
 def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
@@ -146,7 +146,7 @@ def _read_c3d(path: Path) -> Markers:
         raise _wrong(path, "a complete C3D or TRC file", f"{error!r}") from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), -1, 4)
     points = np.where(values[..., 3:] < 0.0, np.nan, values[..., :3])
-    return _checked(path, rate, names[: points.shape[1]], points, unit)
+    return _check_markers(path, rate, names[: points.shape[1]], points, unit)
 
 
 def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], str]:
@@ -167,7 +167,7 @@ def _read_trc(path: Path) -> tuple[float, tuple[str, ...], NDArray[np.float64], 
     return float(about["DataRate"]), names, points, about["Units"].strip().lower()
 
 
-def _checked(
+def _check_markers(
     path: Path, rate: float, names: tuple[str, ...], points: NDArray[np.float64], unit: str
 ) -> Markers:
     if unit not in METRES or not rate > 0.0 or len(names) != points.shape[1]:

@@ -197,7 +197,7 @@ def read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Hea
     where = f"{path}: {info.filename}"
     try:
         with file.open(info) as member:
-            shape, fortran, dtype = _declared(member)
+            shape, fortran, dtype = _declared_header(member)
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
         raise npz_error(where, "an npy array", _brief(error)) from error
@@ -254,7 +254,7 @@ def npz_error(where: str, expected: str, found: str) -> InputError:
     return InputError(where, expected=expected, found=found, todo="Write or export it again.")
 
 
-def _declared(member: IO[bytes]) -> Header:
+def _declared_header(member: IO[bytes]) -> Header:
     if npy.read_magic(member) != (1, 0):
         raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
     return npy.read_array_header_1_0(member)

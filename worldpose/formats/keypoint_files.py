@@ -237,17 +237,17 @@ def _by_frame(
             todo="Check image_id.",
         )
 
-    def padded(values: NDArray[Any]) -> NDArray[np.float32]:
+    def pad(values: NDArray[Any]) -> NDArray[np.float32]:
         dense = np.full((len(frame), most, *values.shape[1:]), np.nan, dtype=np.float32)
         dense[row, slot] = values[order]
         return dense
 
     return KeypointDetections(
         frame=frame,
-        keypoints=padded(keypoints),
-        confidence=padded(confidence),
-        boxes=padded(corners),
-        score=padded(scores),
+        keypoints=pad(keypoints),
+        confidence=pad(confidence),
+        boxes=pad(corners),
+        score=pad(scores),
     )
 
 

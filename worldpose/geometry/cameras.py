@@ -17,9 +17,9 @@ from worldpose.geometry.rays import Rays
 from worldpose.geometry.rigid import (
     Index,
     Rigid,
-    checked,
+    check_shape,
     common_batch,
-    leading,
+    index_leading,
     nearest_rotation,
 )
 
@@ -38,7 +38,7 @@ class Projection:
     d_points: NDArray[np.float64]
     """(..., n, 2, 3) [px/m], by the world point."""
     d_pose: NDArray[np.float64]
-    """(..., n, 2, 6) [px/rad, px/m], by the delta of `cam_from_world.updated(delta)`: rotation
+    """(..., n, 2, 6) [px/rad, px/m], by the delta of `cam_from_world.retract(delta)`: rotation
     vector, then translation, both acting in the camera frame."""
     d_intrinsics: NDArray[np.float64]
     """(..., n, 2, 4), by fx fy cx cy."""
@@ -76,7 +76,7 @@ class Camera:
     def __post_init__(self) -> None:
         pose = self.cam_from_world
         parts = {
-            name: checked(f"Camera.{name}", getattr(self, name), (length,))
+            name: check_shape(f"Camera.{name}", getattr(self, name), (length,))
             for name, length in _PARTS.items()
         }
         batch = common_batch(
@@ -192,7 +192,7 @@ class Camera:
 
     def __getitem__(self, index: Index) -> Camera:
         return Camera(
-            **{name: getattr(self, name)[leading(index, 1)] for name in _PARTS},
+            **{name: getattr(self, name)[index_leading(index, 1)] for name in _PARTS},
             cam_from_world=self.cam_from_world[index],
         )
 
@@ -282,7 +282,7 @@ class Camera:
         self, where: str, points: ArrayLike, width: int
     ) -> tuple[tuple[int, ...], NDArray[np.float64], NDArray[np.float64]]:
         """Return the common batch shape, cameras (batch, 22) and points (batch, n, width)."""
-        values = checked(where, points, (-1, width))
+        values = check_shape(where, points, (-1, width))
         batch = common_batch(where, self.batch_shape, values.shape[:-2])
         size = int(np.prod(batch))
         cameras = np.broadcast_to(self.numbers, (*batch, 22)).reshape(size, 22)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldpose.compiled import compiled
-from worldpose.geometry.rigid import checked
+from worldpose.compiled import compile_kernel
+from worldpose.geometry.rigid import check_shape
 
 # Radii beyond this belong to rays within a millionth of a radian of the camera's own plane.
 _MAX_RADIUS = 1e6
@@ -29,13 +29,13 @@ def fold_radius(distortion: ArrayLike) -> NDArray[np.float64]:
     Raises:
         InputError: the last dimension is not 5.
     """
-    coefficients = checked("fold_radius: distortion", distortion, (5,))
+    coefficients = check_shape("fold_radius: distortion", distortion, (5,))
     squared = np.empty(coefficients.shape[:-1])
     _fold_squared(coefficients.reshape(-1, 5), squared.reshape(-1))
     return np.sqrt(squared)
 
 
-@compiled
+@compile_kernel
 def distort(
     x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float
 ) -> tuple[float, float, float, float, float]:
@@ -51,7 +51,7 @@ def distort(
     return xd, yd, dxx, dxy, dyy
 
 
-@compiled
+@compile_kernel
 def _fold_squared(coefficients: NDArray[np.float64], squared: NDArray[np.float64]) -> None:
     """Write the squared radii of the folds of lenses (batch, 5); see `fold_squared`."""
     for row in range(len(coefficients)):
@@ -59,7 +59,7 @@ def _fold_squared(coefficients: NDArray[np.float64], squared: NDArray[np.float64
         squared[row] = fold_squared(k[0], k[1], k[4])
 
 
-@compiled
+@compile_kernel
 def fold_squared(k1: float, k2: float, k3: float) -> float:
     """Return the first positive root of 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, or infinity."""
     a, b, c = 3.0 * k1, 5.0 * k2, 7.0 * k3
@@ -88,7 +88,7 @@ def fold_squared(k1: float, k2: float, k3: float) -> float:
     return np.inf
 
 
-@compiled
+@compile_kernel
 def _turning_points(a: float, b: float, c: float) -> tuple[float, float]:
     """Return the positive roots of a + 2 b s + 3 c s^2 in rising order, infinity if missing."""
     discriminant = b * b - 3.0 * a * c

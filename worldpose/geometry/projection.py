@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry.distortion import distort
 from worldpose.geometry.rays import RayStatus
 
@@ -30,7 +30,7 @@ _MISFIT = 1e-13
 _ROUNDING = 4.5e-16
 
 
-@compiled
+@compile_kernel
 def project(cameras: Floats, points: Floats, image: Floats) -> None:
     """Write pixels of world points; NaN where a point has no image.
 
@@ -47,7 +47,7 @@ def project(cameras: Floats, points: Floats, image: Floats) -> None:
             image[row, i, 1] = c[1] * at[2] + c[3] if at[0] == _OK else np.nan
 
 
-@compiled
+@compile_kernel
 def project_with_jacobians(
     cameras: Floats, points: Floats, image: Floats, jacobian: Floats, status: Bytes
 ) -> None:
@@ -100,7 +100,7 @@ def project_with_jacobians(
                 d[17] = here * s * s * s
 
 
-@compiled
+@compile_kernel
 def normalize(cameras: Floats, image: Floats, plane: Floats, status: Bytes) -> None:
     """Write undistorted coordinates on the plane z = 1; NaN where there are none.
 
@@ -121,7 +121,7 @@ def normalize(cameras: Floats, image: Floats, plane: Floats, status: Bytes) -> N
             plane[row, i, 1] = y if code == _OK else np.nan
 
 
-@compiled
+@compile_kernel
 def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
     """Write unit directions in the world frame through points on the plane z = 1.
 
@@ -139,7 +139,7 @@ def point_rays(cameras: Floats, plane: Floats, directions: Floats) -> None:
                 directions[row, i, j] = scale * (c[9 + j] * x + c[12 + j] * y + c[15 + j])
 
 
-@compiled
+@compile_kernel
 def is_finite(c: Floats) -> bool:
     """Return whether the camera has all parameters; its fold radius may be infinite."""
     total = 0.0
@@ -148,7 +148,7 @@ def is_finite(c: Floats) -> bool:
     return total < np.inf
 
 
-@compiled
+@compile_kernel
 def project_point(
     c: Floats, px: float, py: float, pz: float
 ) -> tuple[int, float, float, float, float, float, float, float, float]:
@@ -173,7 +173,7 @@ def project_point(
     return status, xd, yd, a, b, z, dxx, dxy, dyy
 
 
-@compiled
+@compile_kernel
 def _undistort(c: Floats, xd: float, yd: float) -> tuple[float, float, int]:
     """Return the point whose distorted image is (xd, yd), and a RayStatus."""
     radius_d = np.sqrt(xd * xd + yd * yd)
@@ -190,7 +190,7 @@ def _undistort(c: Floats, xd: float, yd: float) -> tuple[float, float, int]:
     return x, y, _BEYOND_FOLD if at_fold or status == _BEYOND_FOLD else _NOT_CONVERGED
 
 
-@compiled
+@compile_kernel
 def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
     """Return the radius below the fold that the radial part moves to `radius_d`, and a RayStatus.
 
@@ -223,7 +223,7 @@ def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
     return radius, _OK if abs(misfit) <= _MISFIT * (1.0 + radius_d) else _NOT_CONVERGED
 
 
-@compiled
+@compile_kernel
 def _polish(
     c: Floats, x: float, y: float, xd: float, yd: float
 ) -> tuple[float, float, float, bool]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.projection import project_point
 from worldpose.geometry.rays import RayStatus
@@ -89,7 +89,7 @@ class Surface(NamedTuple):
     light: Singles
 
 
-@compiled
+@compile_kernel
 def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples) -> int:
     """Draw one object into the z-buffer, and return the number of samples it would cover alone.
 
@@ -153,7 +153,7 @@ def draw_triangles(surface: Surface, haze: Singles, which: int, samples: Samples
     return count
 
 
-@compiled
+@compile_kernel
 def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: Image) -> None:
     """Set a bit in the pixels whose centres lie within triangles of either orientation.
 
@@ -183,7 +183,7 @@ def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: I
                     mask[v, u] |= bit
 
 
-@compiled
+@compile_kernel
 def resolve(
     who: NDArray[np.int16],
     color: Image,
@@ -264,7 +264,7 @@ def outline_surfaces(camera: Camera, vertices: Singles) -> Outlines:
     return Outlines(pixels, boxes)
 
 
-@compiled
+@compile_kernel
 def _project(camera: Floats, vertices: Singles, pixels: Singles, boxes: Floats) -> None:
     """Write pixels and depth (surfaces, vertices, 3), and the box (4,) around each surface."""
     for p in range(vertices.shape[0]):

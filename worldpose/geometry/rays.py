@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from worldpose.errors import InputError
-from worldpose.geometry.rigid import Index, checked, common_batch, leading
+from worldpose.geometry.rigid import Index, check_shape, common_batch, index_leading
 
 
 class RayStatus(IntEnum):
@@ -42,8 +42,8 @@ class Rays:
     """(...) RayStatus."""
 
     def __post_init__(self) -> None:
-        directions = checked("Rays.directions", self.directions, (3,))
-        origins = checked("Rays.origins", self.origins, (3,))
+        directions = check_shape("Rays.directions", self.directions, (3,))
+        origins = check_shape("Rays.origins", self.origins, (3,))
         status = np.asarray(self.status, dtype=np.uint8)
         batch = common_batch("Rays", directions.shape[:-1], origins.shape[:-1], status.shape)
         object.__setattr__(self, "origins", np.broadcast_to(origins, (*batch, 3)))
@@ -57,9 +57,9 @@ class Rays:
 
     def __getitem__(self, index: Index) -> Rays:
         return Rays(
-            self.origins[leading(index, 1)],
-            self.directions[leading(index, 1)],
-            self.status[leading(index, 0)],
+            self.origins[index_leading(index, 1)],
+            self.directions[index_leading(index, 1)],
+            self.status[index_leading(index, 0)],
         )
 
 
@@ -78,7 +78,7 @@ def distance_to_rays(points: ArrayLike, rays: Rays) -> NDArray[np.float64]:
     Note:
         T1.
     """
-    offset = checked("distance_to_rays: points", points, (3,)) - rays.origins
+    offset = check_shape("distance_to_rays: points", points, (3,)) - rays.origins
     along = np.maximum(np.einsum("...i,...i->...", offset, rays.directions), 0.0)
     distance: NDArray[np.float64] = np.linalg.norm(
         offset - along[..., None] * rays.directions, axis=-1

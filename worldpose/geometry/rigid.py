@@ -45,8 +45,8 @@ class Rigid:
     """(..., 3) [m]."""
 
     def __post_init__(self) -> None:
-        rotation = checked("Rigid.rotation", self.rotation, (3, 3))
-        translation = checked("Rigid.translation", self.translation, (3,))
+        rotation = check_shape("Rigid.rotation", self.rotation, (3, 3))
+        translation = check_shape("Rigid.translation", self.translation, (3,))
         batch = common_batch("Rigid", rotation.shape[:-2], translation.shape[:-1])
         object.__setattr__(self, "rotation", np.broadcast_to(rotation, (*batch, 3, 3)))
         object.__setattr__(self, "translation", np.broadcast_to(translation, (*batch, 3)))
@@ -64,7 +64,7 @@ class Rigid:
             rotvec: (..., 3) [rad], the axis times the angle.
             translation: (..., 3) [m].
         """
-        vector = checked("Rigid.from_rotvec: rotvec", rotvec, (3,))
+        vector = check_shape("Rigid.from_rotvec: rotvec", rotvec, (3,))
         angle = np.linalg.norm(vector, axis=-1)[..., None, None]
         # np.sinc keeps sin(a) / a and (1 - cos(a)) / a^2 exact at and near zero.
         rotation = (
@@ -127,13 +127,13 @@ class Rigid:
         Raises:
             InputError: the last dimension is not 3 or there is no n.
         """
-        points_a = checked("Rigid.apply: points", points, (-1, 3))
+        points_a = check_shape("Rigid.apply: points", points, (-1, 3))
         moved: NDArray[np.float64] = (
             points_a @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
         )
         return moved
 
-    def updated(self, delta: ArrayLike) -> Rigid:
+    def retract(self, delta: ArrayLike) -> Rigid:
         """Return the transform after a small motion in frame b, the tangent update of solvers.
 
         The motion acts from the left, rotation first: `x_b' = exp(delta[:3]) x_b + delta[3:]`,
@@ -145,11 +145,13 @@ class Rigid:
         Raises:
             InputError: the last dimension is not 6.
         """
-        motion = checked("Rigid.updated: delta", delta, (6,))
+        motion = check_shape("Rigid.updated: delta", delta, (6,))
         return Rigid.from_rotvec(motion[..., :3], motion[..., 3:]) @ self
 
     def __getitem__(self, index: Index) -> Rigid:
-        return Rigid(self.rotation[leading(index, 2)], self.translation[leading(index, 1)])
+        return Rigid(
+            self.rotation[index_leading(index, 2)], self.translation[index_leading(index, 1)]
+        )
 
 
 def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
@@ -162,7 +164,7 @@ def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
     Raises:
         InputError: the matrix is not orthonormal with determinant 1 within six decimals.
     """
-    rotation = checked(where, matrix, (3, 3))
+    rotation = check_shape(where, matrix, (3, 3))
     excess = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     determinant = float(np.dot(rotation[0], np.cross(rotation[1], rotation[2])))
     if not excess <= _ORTHONORMAL or determinant < 0.0:
@@ -179,12 +181,12 @@ def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
     return nearest
 
 
-def leading(index: Index, trailing: int) -> tuple[Any, ...]:
+def index_leading(index: Index, trailing: int) -> tuple[Any, ...]:
     """Return `index` extended so that it cannot reach the last `trailing` dimensions."""
     return (*(index if isinstance(index, tuple) else (index,)), *(slice(None),) * trailing)
 
 
-def checked(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float64]:
+def check_shape(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float64]:
     """Return `array` as float64 after a check of its last dimensions; -1 stands for any length.
 
     Raises:

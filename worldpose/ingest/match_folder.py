@@ -134,7 +134,7 @@ def require_calibrated(match: MatchFolder) -> None:
         raise InputError(
             str(match.folder),
             expected="a given calibration or clicked markings of every static camera",
-            found=f"missing camera {', '.join(missing)}; there: {_listed(known)}",
+            found=f"missing camera {', '.join(missing)}; there: {_list_names(known)}",
             todo=f"{needed}, or take it out of match.yaml.",
         )
 
@@ -149,7 +149,7 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
     if extra:
         raise InputError(
             str(file),
-            expected=f"static cameras of match.yaml: {_listed(static)}",
+            expected=f"static cameras of match.yaml: {_list_names(static)}",
             found=f"also {', '.join(extra)}",
             todo="Remove the further cameras, or correct their names.",
         )
@@ -248,7 +248,7 @@ def _require_footage(
             raise InputError(
                 str(folder),
                 expected=f"footage of every static camera of match.yaml, also of {camera.id}",
-                found=f"missing camera {camera.id}; there: {_listed({**videos, **detections})}",
+                found=f"missing camera {camera.id}; there: {_list_names({**videos, **detections})}",
                 todo=f"Add videos/{camera.id}.mp4 or detections/{camera.id}.json (or .npz)"
                 f"{_another_video(folder, camera.id)}.",
             )
@@ -270,5 +270,5 @@ def _another_video(folder: Path, camera_id: str) -> str:
     return f", or name it in match.yaml: `video: videos/{found[0]}`" if found else ""
 
 
-def _listed(names: Mapping[str, object]) -> str:
+def _list_names(names: Mapping[str, object]) -> str:
     return ", ".join(names) or "none"

@@ -97,7 +97,7 @@ class Expected:
         with np.errstate(invalid="ignore"):
             return np.asarray(np.median(np.sqrt(self.variance) / self.scale, axis=-1))
 
-    def hidden(self, frame: int) -> NDArray[np.bool_]:
+    def hidden_joints(self, frame: int) -> NDArray[np.bool_]:
         """Return which joints (persons, 17) of a frame another person's body occludes."""
         image, scale, depth = self.image[frame], self.scale[frame], self.depth[frame]
         begin, end = image[:, _ENDS[:, 0]], image[:, _ENDS[:, 1]]
@@ -168,7 +168,7 @@ def select_missing_people(
     bare = np.ones(len(frame), dtype=np.bool_)
     for each in np.unique(frame):
         rows = np.flatnonzero(frame == each)
-        there = shown[each, person[rows]] & ~expected.hidden(int(each))[person[rows]]
+        there = shown[each, person[rows]] & ~expected.hidden_joints(int(each))[person[rows]]
         bare[rows] = there.mean(axis=-1) >= settings.min_visible_share
     frame, person = frame[bare], person[bare]
     return MissingPeople(frame, person, boxes[frame, person], int(np.count_nonzero(~bare)))

@@ -107,7 +107,9 @@ def _content(scene: Scene) -> dict[str, object]:
             {"name": name, "center": _round_values(camera.center)}
             for name, camera in scene.cameras.items()
         ],
-        "broadcast": None if scene.broadcast is None else _text(_moving(scene.broadcast, every)),
+        "broadcast": None
+        if scene.broadcast is None
+        else _text(_moving_camera_rows(scene.broadcast, every)),
     }
 
 
@@ -119,7 +121,7 @@ def _whole(joints: NDArray[np.float64]) -> NDArray[np.int16]:
     return whole.astype("<i2")
 
 
-def _moving(camera: Camera, every: int) -> NDArray[np.float32]:
+def _moving_camera_rows(camera: Camera, every: int) -> NDArray[np.float32]:
     """Return rotation, translation, focal length, width and height of every shown frame."""
     pose = camera.cam_from_world
     count = len(pose.translation)

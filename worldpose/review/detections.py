@@ -191,11 +191,11 @@ def find_changes(
                 edits.append(DeletedDetection.model_validate(at))
                 continue
             now = there[detection]
-            edits += _moved(at, person.keypoints, now.keypoints)
+            edits += _list_moved(at, person.keypoints, now.keypoints)
             boxes += bool(np.abs(now.box - person.box).max() > SAME)
         for person in picture.people:
             if person.detection is None:
-                edits.append(_added(camera, int(number), free, person))
+                edits.append(_describe_added(camera, int(number), free, person))
                 free += 1
     return Changes(tuple(edits), len(edited), boxes)
 
@@ -206,7 +206,7 @@ def _exported_name(given: str, known: dict[str, AnnotatedImage]) -> str | None:
     return next((each for each in known if name == each or name.endswith(f"-{each}")), None)
 
 
-def _moved(at: dict[str, object], before: Floats, now: Floats) -> list[MovedKeypoint]:
+def _list_moved(at: dict[str, object], before: Floats, now: Floats) -> list[MovedKeypoint]:
     edits = []
     for joint, was, xy in zip(COCO17, before, now, strict=True):
         old, new = _pixel(was), _pixel(xy)
@@ -216,7 +216,9 @@ def _moved(at: dict[str, object], before: Floats, now: Floats) -> list[MovedKeyp
     return edits
 
 
-def _added(camera: str, frame: int, detection: int, person: AnnotatedPerson) -> AddedDetection:
+def _describe_added(
+    camera: str, frame: int, detection: int, person: AnnotatedPerson
+) -> AddedDetection:
     x0, y0, x1, y1 = person.box.tolist()
     return AddedDetection(
         camera=camera,

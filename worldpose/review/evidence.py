@@ -296,7 +296,7 @@ class PitchDrawing:
         """The named points (n, 3) [m], world."""
         return self.template.positions(tuple(self.template.points))
 
-    def drawn(self, camera: Camera) -> dict[str, list[NDArray[np.float64]]]:
+    def project_markings(self, camera: Camera) -> dict[str, list[NDArray[np.float64]]]:
         """Return polylines (n, 2) [px] of every marking in or near the image, by name."""
         stacked = camera.project(np.concatenate(list(self.markings.values())))
         found, begin = {}, 0
@@ -308,7 +308,7 @@ class PitchDrawing:
                 found[name] = pieces
         return found
 
-    def placed(self, camera: Camera) -> dict[str, NDArray[np.float64]]:
+    def project_points(self, camera: Camera) -> dict[str, NDArray[np.float64]]:
         """Return the projections of the named points inside the image (2,) [px], by name."""
         pixels = camera.project(self.points)
         inside = _is_in_or_near(pixels, camera.image_size, 0.0)
@@ -358,7 +358,9 @@ def preview(
         drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
     )
     camera = found.estimate.camera
-    return Preview(camera, found.report, drawing.drawn(camera), drawing.placed(camera))
+    return Preview(
+        camera, found.report, drawing.project_markings(camera), drawing.project_points(camera)
+    )
 
 
 def _pieces(

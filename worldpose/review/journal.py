@@ -67,7 +67,7 @@ class Journal:
         for entry in self.entries:
             yield from entry.records
 
-    def extended(
+    def extend(
         self, entries: Sequence[JournalEntry], last: int, damage: Sequence[str], tip: str | None
     ) -> Journal:
         """Return the journal with further entries, without processing earlier entries again.
@@ -197,7 +197,7 @@ def _extend(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -
             )
         entries.append(entry)
         tip = read_checksum(data)
-    return journal.extended(entries, found[-1][0], damage, tip)
+    return journal.extend(entries, found[-1][0], damage, tip)
 
 
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
@@ -223,7 +223,7 @@ def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> J
     )
     if not store.blobs.put_new(_path(journal.match_id, number), seal(entry)):
         return None
-    return journal.extended([entry], number, (), record_checksum(entry))
+    return journal.extend([entry], number, (), record_checksum(entry))
 
 
 def say(

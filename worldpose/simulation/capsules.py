@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Singles
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 
@@ -187,7 +187,7 @@ def _box(pixels: Floats, margin: Floats, shape: tuple[int, ...]) -> NDArray[np.i
     return np.array([*low, *high], dtype=np.int64) if (high > low).all() else None
 
 
-@compiled
+@compile_kernel
 def _shadow(
     shade: Singles, ground: Singles, rows: Floats, box: NDArray[np.int64], share: float
 ) -> None:
@@ -213,7 +213,7 @@ def _shadow(
             shade[v, u] *= 1.0 - share * most
 
 
-@compiled
+@compile_kernel
 def _capsules(picture: Singles, rows: Floats, colors: Floats) -> None:
     """Draw capsules (n, 6) of ends and radii [px] in order, with rounded shading."""
     height, width = picture.shape[0], picture.shape[1]

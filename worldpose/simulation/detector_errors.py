@@ -98,7 +98,7 @@ def project_bodies(camera: Camera, bodies: Bodies) -> Projections:
     middle = bodies.joints[..., TRUNK, :].mean(axis=-2)
     depth = camera.cam_from_world.apply(middle)[..., 2]
     focal = camera.focal.mean(axis=-1)[..., None]
-    front, left = facing(bodies.joints)
+    front, left = facing_axes(bodies.joints)
     away = camera.center.reshape(-1, 1, 3) - middle
     return Projections(
         keypoints=np.where(np.all(inside, axis=-1, keepdims=True), pixels, np.nan),
@@ -109,7 +109,7 @@ def project_bodies(camera: Camera, bodies: Bodies) -> Projections:
     )
 
 
-def facing(joints: Floats) -> tuple[Floats, Floats]:
+def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
     """Return horizontal unit vectors (..., 3) to the front and left of bodies (..., 17, 3)."""
     left = joints[..., (5, 11), :].sum(axis=-2) - joints[..., (6, 12), :].sum(axis=-2)
     left[..., 2] = 0.0
@@ -212,7 +212,7 @@ def perceived_bias(
         noise: spreads.
         own: (persons, 17, 3) person-specific offsets [standard deviations].
     """
-    front, left = facing(joints)
+    front, left = facing_axes(joints)
     up = np.broadcast_to([0.0, 0.0, 1.0], front.shape)
     offsets = noise.shared_bias_m * systematic.joint_bias + noise.own_bias_m * own
     turned: Floats = offsets @ np.stack([front, left, up], axis=-2)

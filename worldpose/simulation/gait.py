@@ -108,17 +108,17 @@ def _blend_action(stage: _Stage, times: Floats, gait: Pose) -> Pose:
     floor = stage.ground(*pelvis[:, :2].T) + body.ankle_height
     pelvis[:, 2] += share * (floor + _hip_heights(body, motion, since) - pelvis[:, 2])
 
-    def blended(before: Floats, now: Floats) -> Floats:
+    def blend(before: Floats, now: Floats) -> Floats:
         weight = share.reshape(-1, *(1 for _ in now.shape[1:]))
         return (1.0 - weight) * before + weight * now
 
-    hips_left = unit(blended(gait.hips_left, pelvis_axes[:, 1]))
-    trunk = unit(blended(gait.trunk, chest[:, 2]))
-    shoulders_left = unit(blended(gait.shoulders_left, chest[:, 1]))
+    hips_left = unit(blend(gait.hips_left, pelvis_axes[:, 1]))
+    trunk = unit(blend(gait.trunk, chest[:, 2]))
+    shoulders_left = unit(blend(gait.shoulders_left, chest[:, 1]))
     sides = np.array([1.0, -1.0])
     mirror = np.stack([np.ones(2), sides, np.ones(2)], axis=-1)
     arms = channels[:, ARMS].reshape(-1, 2, 2, 3) * mirror[:, None]
-    arms = unit(blended(gait.arms, unit(np.einsum("fsbi,fij->fsbj", arms, chest))))
+    arms = unit(blend(gait.arms, unit(np.einsum("fsbi,fij->fsbj", arms, chest))))
     neck = pelvis + body.trunk * trunk
     shoulders = neck[:, None] + sides[:, None] * (
         body.shoulder_half_width * shoulders_left[:, None]
@@ -143,10 +143,10 @@ def _blend_action(stage: _Stage, times: Floats, gait: Pose) -> Pose:
         hips_left=hips_left,
         trunk=trunk,
         shoulders_left=shoulders_left,
-        head=_orthonormalize(blended(gait.head, _rotate_axes(channels[:, NOD], level))),
+        head=_orthonormalize(blend(gait.head, _rotate_axes(channels[:, NOD], level))),
         arms=arms,
         ankles=(1.0 - free) * on_ground + free * held,
-        knees=(1.0 - free) * unit(blended(gait.knees, level[:, None, 0])) + free * legs[:, :, 2],
+        knees=(1.0 - free) * unit(blend(gait.knees, level[:, None, 0])) + free * legs[:, :, 2],
         feet=feet,
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.geometry.rasters import (
     NOBODY,
@@ -50,7 +50,7 @@ def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floa
     return outline_surfaces(camera, fallen)
 
 
-@compiled
+@compile_kernel
 def _throw(vertices: Singles, light: Floats, ground: Floats, fallen: Singles) -> None:
     """Write the grass points in the shadows of vertices; NaN where none is darkened.
 
@@ -122,7 +122,7 @@ def shade_ground(
     return boxes
 
 
-@compiled
+@compile_kernel
 def _darken(picture: Image, dark: Image) -> None:
     """Subtract a share (height, width) [1/255] from an image, and reset the share to zero."""
     for v in range(picture.shape[0]):
@@ -366,7 +366,7 @@ def _refocus(settings: RenderingSettings, sharp: Image, blurred: Image, box: Box
     blurred[top:bottom, left:right] = soft[top - b : bottom - b, left - a : right - a]
 
 
-@compiled
+@compile_kernel
 def _add_grain(picture: Image, grain: NDArray[np.int8]) -> None:
     """Add noise (height, 3 width) to an image (height, width, 3), in place."""
     for v in range(picture.shape[0]):

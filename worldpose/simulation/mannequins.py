@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
 from worldpose.body import BodyModel, BodyParameters, load_open_body
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.simulation.settings import PATTERNS, Pattern
 
 CELL: Final = 0.03
@@ -181,7 +181,7 @@ def _cloth_thickness(template: Floats, outward: Floats) -> Floats:
     return off
 
 
-@compiled
+@compile_kernel
 def _skin(
     shaped: Singles,
     outward: Singles,

@@ -43,22 +43,20 @@ def hands_on_hips(duration: float) -> Motion:
     """Return a rest with both hands on the hips, looking around."""
     arms = (Arm(-22.0, 46.0, 98.0, 76.0), Arm(-20.0, 44.0, 98.0, 76.0))
 
-    def looking(yaw: float, aside: float) -> Floats:
+    def look(yaw: float, aside: float) -> Floats:
         return key(bend=(2.0, 0.0, 0.15 * yaw), nod=(0.0, 0.0, yaw), away=(0.0, aside), arms=arms)
 
-    looks = [looking(20.0, 0.02), looking(45.0, 0.03), looking(-35.0, -0.02)]
-    return _hold_poses("hands on hips", duration, [key(), *looks, looking(0.0, 0.0), key()])
+    looks = [look(20.0, 0.02), look(45.0, 0.03), look(-35.0, -0.02)]
+    return _hold_poses("hands on hips", duration, [key(), *looks, look(0.0, 0.0), key()])
 
 
 def look_around(duration: float) -> Motion:
     """Return turns of the head, followed by the chest, from side to side."""
 
-    def looking(yaw: float) -> Floats:
+    def look(yaw: float) -> Floats:
         return key(bend=(3.0, 0.0, 0.25 * yaw), nod=(2.0, 0.0, yaw))
 
-    return _hold_poses(
-        "look", duration, [key(), looking(60.0), looking(40.0), looking(-65.0), key()]
-    )
+    return _hold_poses("look", duration, [key(), look(60.0), look(40.0), look(-65.0), key()])
 
 
 def ready(duration: float) -> Motion:

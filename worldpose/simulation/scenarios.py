@@ -25,7 +25,7 @@ _QUARTER: Final = (
 )
 
 
-def _mirrored(seat: Seat, x: float, y: float) -> Seat:
+def _mirror_seat(seat: Seat, x: float, y: float) -> Seat:
     return Seat(
         place_m=(x * seat.place_m[0], y * seat.place_m[1], seat.place_m[2]),
         aim_m=(x * seat.aim_m[0], y * seat.aim_m[1]),
@@ -35,7 +35,7 @@ def _mirrored(seat: Seat, x: float, y: float) -> Seat:
 
 STADIUM_SEATS: Final = (
     *(
-        _mirrored(seat, x, y)
+        _mirror_seat(seat, x, y)
         for seat in _QUARTER
         for x, y in ((1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0))
     ),

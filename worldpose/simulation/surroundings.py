@@ -14,7 +14,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.pitch import ArcSpec
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.pitch import PitchTemplate
 
 LINE_WIDTH: Final = 0.12
@@ -58,7 +58,7 @@ def _arc_row(arc: ArcSpec, center: tuple[float, float, float]) -> tuple[float, .
     return (_ARC, x, y, arc.radius, arc.start_angle, arc.end_angle - arc.start_angle, h, 0.0)
 
 
-@compiled
+@compile_kernel
 def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> float:
     """Return the steps (dx, dy, dz) from `o` to the surface z = -bend y^2; inf if none."""
     a = bend * dy * dy
@@ -71,7 +71,7 @@ def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> floa
     return 2.0 * c / below if below > 0.0 else np.inf
 
 
-@compiled
+@compile_kernel
 def _below(t: float, wide: float, narrow: float) -> float:
     """Return the share of a pixel below t, in the middle of widths |du|, |dv| of a ramp."""
     sum_half, diff_half = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
@@ -86,7 +86,7 @@ def _below(t: float, wide: float, narrow: float) -> float:
     return 1.0 - corner if t > 0.0 else corner
 
 
-@compiled
+@compile_kernel
 def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
     """Return the share of a pixel with low < t < high, where t changes by du and dv per pixel."""
     a, b = abs(du), abs(dv)
@@ -94,7 +94,7 @@ def _share(t: float, du: float, dv: float, low: float, high: float) -> float:
     return _below(high - t, wide, narrow) - _below(low - t, wide, narrow)
 
 
-@compiled
+@compile_kernel
 def paint_cover(paint: Floats, place: Floats) -> float:
     """Return the painted share of a pixel.
 
@@ -153,7 +153,7 @@ def paint_cover(paint: Floats, place: Floats) -> float:
     return 1.0 - bare
 
 
-@compiled
+@compile_kernel
 def texture(table: Floats, x: float, y: float) -> float:
     """Return a smooth periodic pattern at (x, y), one cell of the (64, 64) table per unit."""
     ix, iy = int(np.floor(x)), int(np.floor(y))
@@ -165,7 +165,7 @@ def texture(table: Floats, x: float, y: float) -> float:
     return float((1.0 - fy) * top + fy * bottom)
 
 
-@compiled
+@compile_kernel
 def grass(
     table: Floats, place: Floats, length: float, width: float, stripes: float
 ) -> tuple[float, float]:
@@ -194,7 +194,7 @@ def grass(
     return bright, yellow
 
 
-@compiled
+@compile_kernel
 def wear(table: Floats, place: Floats) -> float:
     """Return the wear of paint at a place: about 0 with spread of about a half."""
     x, y = place[0], place[1]
@@ -215,7 +215,7 @@ _ROW = 0.45
 _SEAT = 0.52
 
 
-@compiled
+@compile_kernel
 def _hash(i: int, j: int, k: int) -> float:
     """Return a pseudorandom number in [0, 1) that depends on three numbers."""
     value = (i * 73856093) ^ (j * 19349663) ^ (k * 83492791)
@@ -224,7 +224,7 @@ def _hash(i: int, j: int, k: int) -> float:
     return float((value ^ (value >> 15)) & 0xFFFFFF) / 16777216.0
 
 
-@compiled
+@compile_kernel
 def _board(along: float, up: float, side: int, look: int) -> tuple[float, float, float]:
     """Return the colour of a board: panels in strong colours with rows of letter-like blocks."""
     panel = int(np.floor(along / _PANEL))
@@ -252,7 +252,7 @@ def _board(along: float, up: float, side: int, look: int) -> tuple[float, float,
     return base
 
 
-@compiled
+@compile_kernel
 def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, float]:
     """Return the colour at a place of a stand: a seated spectator or an empty seat.
 
@@ -287,7 +287,7 @@ def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, 
     return 0.06 * low, 0.08 * low, 0.14 * low
 
 
-@compiled
+@compile_kernel
 def scenery(
     o: Floats, dx: float, dy: float, dz: float, half: Floats, bend: float, look: int
 ) -> tuple[float, float, float, float]:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Floats, Singles
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.capsules import draw_shadows, draw_things
@@ -38,7 +38,7 @@ def plane_grid(camera: Camera, width: int, height: int) -> Floats:
     return camera.normalize(pixels.reshape(-1, 2)).reshape(*pixels.shape)
 
 
-@compiled
+@compile_kernel
 def _interpolate_plane(
     grid: Floats, u: float, v: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -76,7 +76,7 @@ class SceneRows(NamedTuple):
     look: int
 
 
-@compiled
+@compile_kernel
 def paint_scene(
     grid: Floats,
     o: Floats,
@@ -160,7 +160,7 @@ def paint_scene(
                     ground[v, u, 0], ground[v, u, 1] = place[0], place[1]
 
 
-@compiled
+@compile_kernel
 def _paint_turf(paint: Floats, table: Floats, place: Floats, scene: Floats, color: Singles) -> None:
     """Write the colour (3,) of grass and paint at a place."""
     bright, yellow = grass(table, place, scene[0], scene[1], scene[3])

@@ -10,7 +10,7 @@ from worldpose.static_calibration.parameters import (
     PARAMETERS,
     CameraEstimate,
     project_with_jacobian,
-    stepped,
+    step_camera,
 )
 from worldpose.static_calibration.report import (
     CalibrationReport,
@@ -46,5 +46,5 @@ __all__ = [
     "left_out_attributes",
     "median_picture",
     "project_with_jacobian",
-    "stepped",
+    "step_camera",
 ]

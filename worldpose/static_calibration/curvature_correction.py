@@ -22,8 +22,8 @@ from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
     step_between,
+    step_camera,
     step_jacobian,
-    stepped,
 )
 from worldpose.static_calibration.residuals import (
     PRIORS,
@@ -97,7 +97,7 @@ def linearize_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
     step[free] = -shape @ (rows.T @ residuals)
     covariance[np.ix_(free, free)] = shape
     camera = camera_from_row(row, problem.image_size)
-    start = stepped(camera, step)
+    start = step_camera(camera, step)
     turn = step_jacobian(step_between(start, camera))
     return CameraEstimate(start, turn @ covariance @ turn.T)
 
@@ -202,7 +202,7 @@ class ClicksAndBars:
             before = float(((residuals + noise) ** 2).sum())
             for _ in range(_MAX_HALVINGS):
                 step[self.problem.free] = free_step
-                trial = stepped(camera, step)
+                trial = step_camera(camera, step)
                 ahead, by_ahead = self.residuals(trial)
                 # Points that a camera does not see are NaN, which compares false.
                 if ((ahead + noise) ** 2).sum() < before:

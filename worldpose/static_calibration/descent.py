@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.static_calibration.residuals import (
     PRIORS,
     SIZE,
@@ -85,7 +85,7 @@ class Solutions(NamedTuple):
     observed: Floats
 
 
-@compiled
+@compile_kernel
 def descend(given: Measurements, iterations: int, found: Solutions) -> None:
     """Minimize the cost from each row in place; see `adjustment.adjust`.
 
@@ -130,7 +130,7 @@ def descend(given: Measurements, iterations: int, found: Solutions) -> None:
             step_row(rows[b], step, trial)
 
 
-@compiled
+@compile_kernel
 def _linearize(c: Floats, given: Measurements, written: Linearization) -> float:
     """Return the cost at a camera; write information and gradient, zero for fixed parameters."""
     information, observed, gradient = written.information, written.observed, written.gradient
@@ -175,7 +175,7 @@ def _linearize(c: Floats, given: Measurements, written: Linearization) -> float:
     return _cost(click, off, known, given)
 
 
-@compiled
+@compile_kernel
 def _solve(system: Floats, right: Floats) -> None:
     """Solve a damped system in place by Cholesky factorization; write minus the solution.
 
@@ -199,7 +199,7 @@ def _solve(system: Floats, right: Floats) -> None:
         right[j] = -right[j]
 
 
-@compiled
+@compile_kernel
 def _add(by: Floats, residual: float, weight: float, system: Floats, gradient: Floats) -> None:
     for j in range(SIZE):
         scaled = weight * by[j]
@@ -208,18 +208,18 @@ def _add(by: Floats, residual: float, weight: float, system: Floats, gradient: F
             system[j, k] += scaled * by[k]
 
 
-@compiled
+@compile_kernel
 def _weight(squared: float, scale: float) -> float:
     """Return the Cauchy weight of a squared residual; 1 for an infinite scale."""
     return 1.0 / (1.0 + squared / (scale * scale))
 
 
-@compiled
+@compile_kernel
 def _loss(squared: float, scale: float) -> float:
     return scale * scale * np.log1p(squared / (scale * scale)) if scale < np.inf else squared
 
 
-@compiled
+@compile_kernel
 def _cost(click: Floats, off: Floats, known: Floats, given: Measurements) -> float:
     spread, drawn_spread = given.click_noise, given.drawn_noise
     total = 0.0
@@ -233,9 +233,9 @@ def _cost(click: Floats, off: Floats, known: Floats, given: Measurements) -> flo
     return 0.5 * total if total < np.inf else np.inf
 
 
-@compiled
+@compile_kernel
 def step_row(c: Floats, step: Floats, out: Floats) -> None:
-    """Write the row after a step, as `stepped` does."""
+    """Write the row after a step, as `step_camera` does."""
     out[:] = c
     out[0] = c[0] * np.exp(step[6])
     out[1] = c[1] * np.exp(step[6])

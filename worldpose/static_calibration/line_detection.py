@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from data_contracts.arrays import Floats, Image
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.errors import InputError
 
 CANDIDATES: Final = 4
@@ -73,7 +73,7 @@ class CrossSections(NamedTuple):
     curvatures: Floats
 
 
-@compiled
+@compile_kernel
 def find_bars(
     grey: Image,
     sections: CrossSections,
@@ -143,7 +143,7 @@ def find_bars(
                 found += 1
 
 
-@compiled
+@compile_kernel
 def _read(grey: Image, place: Floats, normal: Floats, curvature: float, profile: Floats) -> None:
     """Write the brightness profile across a line, centered on `place`; NaN outside the image.
 
@@ -177,7 +177,7 @@ _FITTINGS: Final = 5
 """Gauss-Newton steps per bar; the search before is accurate to half a pixel."""
 
 
-@compiled
+@compile_kernel
 def fit_bars(
     grey: Image,
     sections: CrossSections,
@@ -223,7 +223,7 @@ def fit_bars(
             variances[i] = variance
 
 
-@compiled
+@compile_kernel
 def _gather(
     grey: Image,
     place: Floats,
@@ -263,7 +263,7 @@ def _gather(
     return count
 
 
-@compiled
+@compile_kernel
 def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float, float, float]:
     """Return a bar's offset [px], its contrast to either side, and the offset's variance [px^2].
 
@@ -308,7 +308,7 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
     return shift, level[1] - level[0], level[1] - level[2], variance
 
 
-@compiled
+@compile_kernel
 def _solve(normal: Floats, right: Floats) -> float:
     """Replace `right` by the solution; return the last unknown's information, 0 if singular.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CrossSections
@@ -285,7 +285,7 @@ def clear(
     return result
 
 
-@compiled
+@compile_kernel
 def _clear(
     corners: Floats,
     radius: Floats,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
@@ -30,8 +30,8 @@ from worldpose.static_calibration.parameters import (
     CameraEstimate,
     project_with_jacobian,
     step_between,
+    step_camera,
     step_jacobian,
-    stepped,
 )
 from worldpose.static_calibration.settings import LineRefinementSettings
 
@@ -163,7 +163,7 @@ def adjust(
     return LineStep(solution[:free], 0.5 * (information + information.T), residuals, weights, spent)
 
 
-@compiled
+@compile_kernel
 def _accumulate(
     shift: Floats,
     weights: Floats,
@@ -313,7 +313,7 @@ class LineSearch:
         )
         scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)
         adjusted = self._adjust(found.camera, found.seen, measured, scales)
-        camera = stepped(found.camera, self._full_step(adjusted.step))
+        camera = step_camera(found.camera, self._full_step(adjusted.step))
         return replace(found, camera=camera, measured=measured, adjusted=adjusted)
 
     def distance(self, camera: Camera) -> float:
@@ -360,7 +360,7 @@ class LineSearch:
                 self.settings.loss_scale,
                 self.settings.loss_scale,
             )
-            camera = stepped(camera, self._full_step(adjusted.step))
+            camera = step_camera(camera, self._full_step(adjusted.step))
             moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
             seen = self.look(camera, samples)
             measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))

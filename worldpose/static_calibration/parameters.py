@@ -13,7 +13,7 @@ from worldpose.geometry import Camera, Projection
 
 PARAMETERS: Final = CAMERA_STEP
 """Steps of a camera: rotation about its center [rad] and shift [m] in its own axes
-(`Rigid.updated`), the logarithm of the focal length, principal point [px], distortion [1]."""
+(`Rigid.update`), the logarithm of the focal length, principal point [px], distortion [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class CameraEstimate:
     covariance: NDArray[np.float64]
 
 
-def stepped(camera: Camera, step: ArrayLike) -> Camera:
+def step_camera(camera: Camera, step: ArrayLike) -> Camera:
     """Return the camera after a step.
 
     Args:
@@ -45,7 +45,7 @@ def stepped(camera: Camera, step: ArrayLike) -> Camera:
         focal=camera.focal * np.exp(step[..., 6:7]),
         principal_point=camera.principal_point + step[..., 7:9],
         distortion=distortion,
-        cam_from_world=camera.cam_from_world.updated(step[..., :6]),
+        cam_from_world=camera.cam_from_world.retract(step[..., :6]),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry.distortion import fold_squared
 from worldpose.geometry.projection import project_with_jacobians
 
@@ -29,7 +29,7 @@ _REACH: Final = 1.5
 a marking back into the image."""
 
 
-@compiled
+@compile_kernel
 def point_residuals(
     c: Floats, world: Floats, pixels: Floats, residual: Floats, jacobian: Floats
 ) -> None:
@@ -85,7 +85,7 @@ def point_residuals(
             jacobian[i, k, 9], jacobian[i, k, 10], jacobian[i, k, 11] = d[13], d[14], d[17]
 
 
-@compiled
+@compile_kernel
 def nearest_on_markings(
     c: Floats,
     reach: float,
@@ -147,7 +147,7 @@ def nearest_on_markings(
                     normal[i, 0], normal[i, 1] = ox / off, oy / off
 
 
-@compiled
+@compile_kernel
 def drawn_residuals(
     c: Floats,
     reach: float,
@@ -180,7 +180,7 @@ def drawn_residuals(
             jacobian[i, j] = normal[i, 0] * by_step[i, 0, j] + normal[i, 1] * by_step[i, 1, j]
 
 
-@compiled
+@compile_kernel
 def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats) -> None:
     """Write the prior's residuals (9,) and derivatives (9, 12).
 

@@ -98,7 +98,7 @@ class Blobs(Protocol):
     def entries(self, prefix: str) -> list[Entry]:
         """Return all files below the folder `prefix`, sorted by path."""
 
-    def staging(self) -> Path:
+    def create_staging(self) -> Path:
         """Create a private local folder for a tree to be published."""
 
     def staged_entries(self) -> list[Entry]:
@@ -236,7 +236,7 @@ class LocalBlobs:
         with storage_errors(str(top)):
             return sorted(_entries_below(str(top), prefix), key=lambda entry: entry.path)
 
-    def staging(self) -> Path:
+    def create_staging(self) -> Path:
         """See `Blobs`. On the project's own file system, so that a rename can publish it."""
         folder = self.root / STAGING / uuid.uuid4().hex
         with storage_errors(str(folder)):

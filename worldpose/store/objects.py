@@ -137,7 +137,7 @@ class ObjectBlobs:
                 key=lambda entry: entry.path,
             )
 
-    def staging(self) -> Path:
+    def create_staging(self) -> Path:
         """See `Blobs`. On this machine's temporary disk."""
         with storage_errors(tempfile.gettempdir()):
             return Path(tempfile.mkdtemp(prefix="worldpose-"))

@@ -71,7 +71,7 @@ def _read_module(name: str, roots: tuple[Path, ...]) -> tuple[dict[str, str], fr
             "worldpose with its sources, for example with `pip install -e .`."
         )
     try:
-        parsed = _source_cache(roots).parsed(name, path.read_bytes())
+        parsed = _source_cache(roots).parse(name, path.read_bytes())
     except (OSError, SyntaxError, ValueError) as error:
         raise StoreError(f"{path}: cannot read module {name}: {error}") from error
     versions = {name: parsed.code}

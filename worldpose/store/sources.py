@@ -64,7 +64,7 @@ class SourceCache:
         self._modules = {} if path is None else _load(path)
         self._is_changed = False
 
-    def parsed(self, name: str, source: bytes) -> ParsedSource:
+    def parse(self, name: str, source: bytes) -> ParsedSource:
         """Return the properties of module `name` with this source.
 
         Raises:

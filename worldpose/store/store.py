@@ -169,7 +169,7 @@ class Store:
         return manifest
 
     @contextmanager
-    def publishing(self, work: Work) -> Iterator[ResultWriter]:
+    def publish(self, work: Work) -> Iterator[ResultWriter]:
         """Yield a writer whose result is published only when the block ends without an error.
 
         An error in the block leaves nothing behind; a killed process leaves only private staging.
@@ -187,7 +187,7 @@ class Store:
                 found=f"key {work.key}",
                 todo="Compute the key with worldpose.store.recipe_key.",
             )
-        folder = self.blobs.staging()
+        folder = self.blobs.create_staging()
         try:
             writer = ResultWriter(work, folder)
             yield writer

@@ -26,11 +26,11 @@ class ResultWriter:
 
     Attributes:
         figures: quality metrics by name, with the unit in the name; fill it before leaving
-            `Store.publishing`.
+            `Store.publish`.
         left_out: static cameras that later stages must not use, by id, with the reason; the stage
             must have `Stage.leaves_out`. See `flows.left_out`.
         warnings: sentences that the run prints at its end.
-        manifest: the published result's manifest; None until `Store.publishing` ends.
+        manifest: the published result's manifest; None until `Store.publish` ends.
     """
 
     def __init__(self, work: Work, folder: Path) -> None:
@@ -89,7 +89,7 @@ class ResultWriter:
         if not self._files:
             raise StoreError(
                 f"{name}: the stage wrote no arrays, so there is nothing to publish. Call "
-                "ResultWriter.write before the block of Store.publishing ends."
+                "ResultWriter.write before the block of Store.publish ends."
             )
         for metric, value in self.figures.items():
             if not math.isfinite(value):

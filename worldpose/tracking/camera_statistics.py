@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 
 MIN_COVERED_JOINTS: Final = 4
@@ -120,7 +120,7 @@ class CameraVisibility:
         return np.asarray(np.where(empty, rate[:, None], 0.0).sum(axis=0))
 
 
-@compiled
+@compile_kernel
 def find_covered_bodies(
     joints: Floats,
     centers: Floats,

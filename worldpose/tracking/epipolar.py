@@ -8,7 +8,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.conventions import COCO17_BODY_BONES
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.tracking.person import Sighting
 from worldpose.tracking.ray_matching import intersect_people, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
@@ -58,7 +58,7 @@ def limb_lengths(joints: Floats, fps: float) -> tuple[Floats, Floats]:
     return median, variance
 
 
-@compiled
+@compile_kernel
 def footprints(
     centers: Floats,
     directions: Floats,
@@ -92,7 +92,7 @@ def footprints(
     return places
 
 
-@compiled
+@compile_kernel
 def pair_distances(
     centers: Floats,
     directions: Floats,

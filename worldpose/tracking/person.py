@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers, Singles
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.tracking.settings import TrackingSettings
 
 BLOCK: Final = 16
@@ -168,7 +168,7 @@ class Person:
         other.evidence = min(other.evidence, float(other.fixed))
 
 
-@compiled
+@compile_kernel
 def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Floats, bool]:
     """Return the pose with known joints replaced and others shifted, the shift, and any known."""
     both, known = np.empty((len(pose), 3)), False

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
 ITERATIONS = 5
 MAX_LAST_STEP = 1e-3
@@ -19,7 +19,7 @@ MIN_DETERMINANT = 1e-9
 Point = tuple[float, float, float]
 
 
-@compiled
+@compile_kernel
 def ray_affinity(
     joints: Floats,
     centers: Floats,
@@ -81,7 +81,7 @@ def ray_affinity(
     return affinity
 
 
-@compiled
+@compile_kernel
 def distance(x: float, y: float, z: float, center: Floats, direction: Floats) -> float:
     """Return the distance [m] of a point to a ray; NaN where either is missing.
 
@@ -95,7 +95,7 @@ def distance(x: float, y: float, z: float, center: Floats, direction: Floats) ->
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@compile_kernel
 def match_greedily(affinity: Floats) -> Integers:
     """Return each person's detection in every camera, best pairs first.
 
@@ -120,7 +120,7 @@ def match_greedily(affinity: Floats) -> Integers:
     return index
 
 
-@compiled
+@compile_kernel
 def nearest_detections(affinity: Floats, unmatched: float) -> tuple[Integers, Flags]:
     """Return each person's best detection (cameras, persons), and the cameras where two share one.
 
@@ -168,7 +168,7 @@ def match_optimally(affinity: Floats, unmatched: float) -> Integers:
     return index
 
 
-@compiled
+@compile_kernel
 def intersect_people(
     centers: Floats,
     directions: Floats,
@@ -232,7 +232,7 @@ def intersect_people(
     return joints
 
 
-@compiled
+@compile_kernel
 def _nearest_point(
     origin: Floats,
     ray: Floats,
@@ -270,7 +270,7 @@ def _nearest_point(
     )
 
 
-@compiled
+@compile_kernel
 def _have_wide_angle(
     origin: Floats,
     ray: Floats,

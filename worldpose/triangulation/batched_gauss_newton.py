@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
 LANES: Final = 64
 """Joints per tile: 16 cameras x 64 joints fit the L2 cache of a processor core."""
@@ -60,13 +60,13 @@ SINGULAR: Final = 1e-14
 """Determinant over product of the diagonal below which rounding dominates the result [1]."""
 
 
-@compiled
+@compile_kernel
 def clear(state: Floats) -> None:
     """Set the sums of a state to zero."""
     state[MATRIX : MATRIX + 9 * LANES] = 0.0
 
 
-@compiled
+@compile_kernel
 def accumulate_linear(tile: Floats, state: Floats) -> None:
     """Add one camera's equations a X = 0, b X = 0 to the sums."""
     for j in range(LANES):
@@ -86,7 +86,7 @@ def accumulate_linear(tile: Floats, state: Floats) -> None:
             state[RIGHT + 2 * LANES + j] -= w * z * r
 
 
-@compiled
+@compile_kernel
 def accumulate(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats) -> None:
     """Add one camera's Gauss-Newton equations at the points to the sums.
 
@@ -132,7 +132,7 @@ def accumulate(tile: Floats, depth: Floats, noise: tuple[float, float], state: F
         state[RIGHT + 2 * LANES + j] -= waz * along + wbz * across
 
 
-@compiled
+@compile_kernel
 def invert(state: Floats) -> None:
     """Replace the matrix by its inverse, NaN where it is singular to working precision."""
     for j in range(LANES):
@@ -150,7 +150,7 @@ def invert(state: Floats) -> None:
         state[MATRIX + 5 * LANES + j] = (a * d - b * b) * over
 
 
-@compiled
+@compile_kernel
 def move(state: Floats) -> None:
     """Add the solution of the sums to the points; the matrix becomes its inverse."""
     invert(state)
@@ -166,7 +166,7 @@ def move(state: Floats) -> None:
         state[STEP + j] = x * x + y * y + z * z
 
 
-@compiled
+@compile_kernel
 def start(tiles: Floats, state: Floats) -> None:
     """Set the points to the linear least-squares ones (inhomogeneous DLT) of the used views."""
     clear(state)
@@ -176,7 +176,7 @@ def start(tiles: Floats, state: Floats) -> None:
     move(state)
 
 
-@compiled
+@compile_kernel
 def step(tiles: Floats, depths: Floats, noise: tuple[float, float], state: Floats) -> None:
     """Take one Gauss-Newton step; errors and the inverted matrix refer to the state before it."""
     clear(state)
@@ -185,7 +185,7 @@ def step(tiles: Floats, depths: Floats, noise: tuple[float, float], state: Float
     move(state)
 
 
-@compiled
+@compile_kernel
 def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats) -> None:
     """Write the leverage of one camera's observations; the matrix is already inverted."""
     pixel, metric = noise[0] ** 2, noise[1] ** 2
@@ -209,7 +209,7 @@ def weigh(tile: Floats, depth: Floats, noise: tuple[float, float], state: Floats
         tile[LEVERAGE + j] = weight * total
 
 
-@compiled
+@compile_kernel
 def survey(tiles: Floats, limit: float, state: Floats) -> None:
     """Write the number of views, the number of views within the limit, and the largest error."""
     state[SEEN : SEEN + 3 * LANES] = 0.0
@@ -217,7 +217,7 @@ def survey(tiles: Floats, limit: float, state: Floats) -> None:
         _survey_view(tiles[camera], limit, state)
 
 
-@compiled
+@compile_kernel
 def _survey_view(tile: Floats, limit: float, state: Floats) -> None:
     for j in range(LANES):
         there = tile[PRECISION + j] > 0.0
@@ -227,7 +227,7 @@ def _survey_view(tile: Floats, limit: float, state: Floats) -> None:
         state[WORST + j] = squared if there & (squared < np.inf) & (squared > worst) else worst
 
 
-@compiled
+@compile_kernel
 def select(tiles: Floats, limit: float, state: Floats) -> None:
     """Mark the views within the limit as used; write the number of views that changed."""
     state[CHANGED : CHANGED + LANES] = 0.0
@@ -235,7 +235,7 @@ def select(tiles: Floats, limit: float, state: Floats) -> None:
         _select_view(tiles[camera], limit, state)
 
 
-@compiled
+@compile_kernel
 def _select_view(tile: Floats, limit: float, state: Floats) -> None:
     for j in range(LANES):
         precision, squared, before = tile[PRECISION + j], tile[SQUARED + j], tile[USED + j]
@@ -244,7 +244,7 @@ def _select_view(tile: Floats, limit: float, state: Floats) -> None:
         tile[USED + j] = used
 
 
-@compiled
+@compile_kernel
 def largest(state: Floats, row: int) -> float:
     """Return the largest number of a row of a state, ignoring NaN."""
     value = 0.0
@@ -253,7 +253,7 @@ def largest(state: Floats, row: int) -> float:
     return value
 
 
-@compiled
+@compile_kernel
 def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays: Floats) -> None:
     """Write the sum of squared pixel errors of the used views, their number and spread.
 

@@ -171,7 +171,7 @@ def _add_margins(
 ) -> Triangulation:
     """Return the triangulation of a chunk with `margin` frames on either side."""
 
-    def joined(name: str) -> NDArray[Any]:
+    def join(name: str) -> NDArray[Any]:
         parts = [getattr(before, name)[-margin:]] if before is not None and margin else []
         parts.append(getattr(here, name))
         if after is not None:
@@ -180,11 +180,11 @@ def _add_margins(
 
     return replace(
         here,
-        joints=joined("joints"),
-        covariance=joined("covariance"),
-        calibration_covariance=joined("calibration_covariance"),
-        exchanged=joined("exchanged"),
-        offsets=joined("offsets"),
+        joints=join("joints"),
+        covariance=join("covariance"),
+        calibration_covariance=join("calibration_covariance"),
+        exchanged=join("exchanged"),
+        offsets=join("offsets"),
     )
 
 

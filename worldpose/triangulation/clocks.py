@@ -179,7 +179,7 @@ def _sum_equations(
     """Return the normal equations from the residuals of an interval of frames."""
     common = shift_in_time(detections, late)
     pixels, index = common.keypoints, common.index
-    precision = NoiseModel.stated(pixels.shape[-2]).precision(common.confidence)
+    precision = NoiseModel.nominal(pixels.shape[-2]).precision(common.confidence)
     joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
     half = max(1, round(VELOCITY_TIME * fps))
     velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)

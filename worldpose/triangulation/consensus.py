@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
     CHANGED,
     INSIDE,
@@ -42,7 +42,7 @@ SHRINK: Final = 0.1
 """Factor on the scale of the loss from step to step [1]."""
 
 
-@compiled
+@compile_kernel
 def consensus(
     tiles: Floats,
     depths: Floats,
@@ -91,7 +91,7 @@ def consensus(
             break
 
 
-@compiled
+@compile_kernel
 def _graduate(
     tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, state: Floats
 ) -> bool:
@@ -120,7 +120,7 @@ def _graduate(
     return True
 
 
-@compiled
+@compile_kernel
 def _take_best_pair(
     tiles: Floats,
     depths: Floats,

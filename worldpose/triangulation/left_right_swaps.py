@@ -13,7 +13,7 @@ from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import TrackedDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry.projection import project_point
 from worldpose.triangulation.observations import Observations
 from worldpose.triangulation.solving import Solution
@@ -97,7 +97,7 @@ def unswap(
     return right
 
 
-@compiled
+@compile_kernel
 def _find_swaps(
     observations: Observations,
     noise: tuple[float, float],

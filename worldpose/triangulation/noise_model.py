@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import TrackedDetections
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,
@@ -57,7 +57,7 @@ class NoiseModel:
     precision_at: Floats
 
     @classmethod
-    def stated(cls, joints: int) -> NoiseModel:
+    def nominal(cls, joints: int) -> NoiseModel:
         """Return the model of the settings: variance proportional to the inverse confidence."""
         return cls(np.ones(joints), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 
@@ -96,7 +96,7 @@ def learn_noise(
     """
     confidence, index = detections.confidence, detections.index
     count, joints = index.shape[1], confidence.shape[-1]
-    model = NoiseModel.stated(joints)
+    model = NoiseModel.nominal(joints)
     place = np.maximum(index, 0).astype(np.int64)[..., None]
     certain = np.take_along_axis(np.asarray(confidence, np.float64), place, axis=2)
     certain = np.where(index[..., None] >= 0, certain, np.nan).transpose(0, 2, 3, 1)
@@ -151,7 +151,7 @@ def _variance_ratio(
     return ratio
 
 
-@compiled
+@compile_kernel
 def _residuals(
     observations: Observations,
     noise: tuple[float, float],
@@ -193,7 +193,7 @@ def _residuals(
                     freedom[first + j, camera] = 0.0
 
 
-@compiled
+@compile_kernel
 def _precision(
     confidence: NDArray[np.floating],
     weight: Floats,

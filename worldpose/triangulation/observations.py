@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import TrackedDetections
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, fold_radius, projection
 from worldpose.geometry.distortion import distort
 from worldpose.triangulation.batched_gauss_newton import (
@@ -159,7 +159,7 @@ def observe_person(
     )
 
 
-@compiled
+@compile_kernel
 def gather(observations: Observations, first: int, tiles: Floats) -> None:
     """Write pixels, precision and additional variance of 64 joints.
 
@@ -205,7 +205,7 @@ def gather(observations: Observations, first: int, tiles: Floats) -> None:
             tile[PRECISION + j] = g if there else 0.0
 
 
-@compiled
+@compile_kernel
 def linearize(tile: Floats, c: Floats) -> None:
     """Turn one camera's pixels into equations.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import TrackedDetections
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -64,7 +64,7 @@ class StatedErrors:
     variance: Floats
     scale: Floats
 
-    def misplaced(self, factor: float) -> tuple[Histogram, ...]:
+    def position_std(self, factor: float) -> tuple[Histogram, ...]:
         """Return the standard deviation at people [m], variance times `factor`, by camera."""
         there = self.variance > 0.0
         variance = np.where(there, self.variance, 0.0) / np.where(there, self.scale, 1.0) ** 2
@@ -210,7 +210,7 @@ def estimate_midhip_shift(
     index = detections.index
     middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
     sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
-    precision = NoiseModel.stated(1).precision(sure)
+    precision = NoiseModel.nominal(1).precision(sure)
     observed = Observations.from_rig(rig, middle, precision, index)
     joints = solve_joints(observed, settings).joints[:, :, 0]
     image = np.empty((len(rig.cameras), joints[..., 0].size, 2))
@@ -225,7 +225,7 @@ def estimate_midhip_shift(
     return np.concatenate([shift, np.zeros((*index.shape, 1))], axis=-1)
 
 
-@compiled
+@compile_kernel
 def _body_offsets(
     observations: Observations,
     noise: tuple[float, float],

@@ -206,7 +206,7 @@ def _run_passes(
         elif settings.learn_noise:
             models.append(learn_noise(rig, detections, shift, settings.noise, limit))
         else:
-            models.append(NoiseModel.stated(detections.confidence.shape[-1]))
+            models.append(NoiseModel.nominal(detections.confidence.shape[-1]))
         return observe(shift)
 
     shift = no_shift()
@@ -239,7 +239,7 @@ def _run_passes(
         variance = factor * stated.variance
         found = estimate_offsets(observations, settings.noise, solution, variance)
         shift, offset_covariance = found.shift, found.covariance
-        misplaced = stated.misplaced(factor)
+        misplaced = stated.position_std(factor)
         observations = observe_in_next_pass(shift)
         solution = solve_joints(observations, settings)
     lengths = limb_lengths(solution) if known is None else known.lengths

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import TrackedDetections
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
     LANES,
@@ -106,7 +106,7 @@ def prepare_tiles(pixels: Floats, weights: Floats, rig: Rig) -> Floats:
     return tiles
 
 
-@compiled
+@compile_kernel
 def _write_tiles(observations: Observations, tiles: Floats) -> None:
     """Write the tiles of a track's observations (one frame, one person, a "joint" per frame)."""
     cameras = observations.cameras
@@ -117,7 +117,7 @@ def _write_tiles(observations: Observations, tiles: Floats) -> None:
             tiles[part, camera, USED : USED + LANES] = 1.0
 
 
-@compiled
+@compile_kernel
 def _solve_track(
     tiles: Floats,
     depths: Floats,
@@ -158,7 +158,7 @@ def _solve_track(
                 covariance[t, a, b] = covariance[t, b, a] = value
 
 
-@compiled
+@compile_kernel
 def held_out_cost(
     tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, points: Floats
 ) -> float:
@@ -179,7 +179,7 @@ def held_out_cost(
     return total
 
 
-@compiled
+@compile_kernel
 def _place(points: Floats, part: int, state: Floats) -> None:
     """Copy the points of one tile into its state."""
     for j in range(LANES):
@@ -188,7 +188,7 @@ def _place(points: Floats, part: int, state: Floats) -> None:
             state[POINT + axis * LANES + j] = points[t, axis]
 
 
-@compiled
+@compile_kernel
 def _write_equations(
     tiles: Floats,
     depths: Floats,
@@ -233,7 +233,7 @@ def _write_equations(
             band[i, 6] += penalty
 
 
-@compiled
+@compile_kernel
 def _factorize(band: Floats) -> None:
     """Replace the matrix by its Cholesky factor, `band[i, k]` = L(i, i - k)."""
     for i in range(len(band)):
@@ -246,7 +246,7 @@ def _factorize(band: Floats) -> None:
             band[i, k] = math.sqrt(total) if k == 0 else total / band[j, 0]
 
 
-@compiled
+@compile_kernel
 def _substitute(band: Floats, right: Floats) -> None:
     """Replace the right side by the solution."""
     size = len(right)
@@ -260,7 +260,7 @@ def _substitute(band: Floats, right: Floats) -> None:
         right[i] /= band[i, 0]
 
 
-@compiled
+@compile_kernel
 def _invert(band: Floats) -> None:
     """Replace the factor by the inverse's entries within the band (Takahashi 1973)."""
     size = len(band)
@@ -349,7 +349,7 @@ def learn_motion(
                     costs = TrackCosts(noise, limit, (fps**2 / acceleration) ** 2)
                     x, _ = solve_segment(pixels[joint], seen, given, rig, costs)
                     cost[n, joint] += held_out_cost(tiles, rig.depths, noise, limit, x)
-            error = _whitened(pixels[joint], weights[joint], given, rig, noise, limit)
+            error = _whiten_errors(pixels[joint], weights[joint], given, rig, noise, limit)
             energy += float(np.nansum(error * error))
             for k in range(1, lag + 1):
                 correlation[k] += float(np.nansum(error[:, k:] * error[:, :-k]))
@@ -379,7 +379,7 @@ def choose_stretches(there: NDArray[np.bool_], fps: float) -> list[tuple[int, sl
     return [every[n] for n in np.unique(chosen)]
 
 
-def _whitened(
+def _whiten_errors(
     pixels: Floats,
     weights: Floats,
     points: Floats,

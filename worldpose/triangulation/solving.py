@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
     LANES,
     MATRIX,
@@ -70,7 +70,7 @@ def solve_joints(observations: Observations, settings: TriangulationSettings) ->
     return solution
 
 
-@compiled
+@compile_kernel
 def _solve_all(
     observations: Observations,
     noise: tuple[float, float],

@@ -60,7 +60,7 @@ class VideoReader:
         """
         for _, picture in self.frames(number, number + 1):
             return picture
-        raise self._broken(number)
+        raise self._damage_error(number)
 
     def frames(
         self, start: int = 0, stop: int | None = None, *, grey: bool = False
@@ -77,7 +77,7 @@ class VideoReader:
         """
         for number, picture in self.readable(start, stop, grey=grey):
             if picture is None:
-                raise self._broken(number)
+                raise self._damage_error(number)
             yield number, picture
 
     def readable(
@@ -157,7 +157,7 @@ class VideoReader:
                 assert isinstance(picture, av.VideoFrame)  # of a video stream
                 yield picture
 
-    def _broken(self, number: int) -> InputError:
+    def _damage_error(self, number: int) -> InputError:
         return InputError(
             f"{self.path}: frame {number}",
             expected="a picture",

@@ -7,7 +7,7 @@ import pytest
 import turning_clip as clip
 
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence
-from worldpose.broadcast_calibration.normal_equations import flow_row, point_row, undistorted
+from worldpose.broadcast_calibration.normal_equations import flow_row, point_row, undistort_point
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, equations_at
@@ -48,7 +48,7 @@ def test_a_pixel_moves_with_the_step_as_derived(number):
             frame[0, number] = by
         else:
             shared[number - 7] = by
-        return pixel_and_rows(camera.stepped(frame, shared))[0]
+        return pixel_and_rows(camera.take_step(frame, shared))[0]
 
     numeric = (moved(size) - moved(-size)) / (2.0 * size)
     # Central differences of pixels known to 1e-12 with steps of 1e-6.
@@ -65,7 +65,7 @@ def test_a_followed_point_moves_with_both_frames_as_derived(number):
             frame[number // 7, number % 7] = by
         else:
             shared[number - 11] = by
-        moved = camera.stepped(frame, shared)
+        moved = camera.take_step(frame, shared)
         image, rows = np.empty(2), np.empty((2, 16))
         lens = moved.principal_point, moved.focal, moved.rotation, moved.distortion
         assert flow_row(*lens, start, image, rows)
@@ -83,7 +83,7 @@ def test_the_lens_is_inverted_exactly():
         s = x * x + y * y
         radial = 1.0 + s * (k[0] + s * (k[1] + s * k[2]))
         # Newton ends at rounding.
-        assert undistorted(x * radial, y * radial, k)[:2] == pytest.approx((x, y), abs=1e-14)
+        assert undistort_point(x * radial, y * radial, k)[:2] == pytest.approx((x, y), abs=1e-14)
 
 
 def test_the_gradient_is_the_slope_of_the_cost():
@@ -102,14 +102,14 @@ def test_the_gradient_is_the_slope_of_the_cost():
         0.7,
         2.0,
     )
-    camera = true.stepped(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
+    camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
     beside = 0.3 * rng.standard_normal((len(problem.painted), 3))
     here = equations_at(camera, beside, problem)
     step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
     paint = rng.standard_normal(beside.shape)
     size = 1e-8
     ahead, behind = (
-        equations_at(camera.stepped(by * step, by * shared), beside + by * paint, problem).cost
+        equations_at(camera.take_step(by * step, by * shared), beside + by * paint, problem).cost
         for by in (size, -size)
     )
     slope = float(

@@ -35,7 +35,7 @@ def problem_of(true, rng, frames=None, noise=0.3, smooth=SMOOTH):
 def off(true, rng):
     step = 1e-3 * rng.standard_normal((len(true), 7))
     step[:, 3] *= 5.0
-    return true.stepped(step, [0.4, -0.5, 0.3, 3.0, 2.0])
+    return true.take_step(step, [0.4, -0.5, 0.3, 3.0, 2.0])
 
 
 def bearing_error(camera, true):
@@ -198,7 +198,7 @@ def test_scipy_finds_no_lower_cost():
     points, prior = problem.points, problem.prior
 
     def residuals(x):
-        camera = start.stepped(x[:35].reshape(5, 7), x[35:40])
+        camera = start.take_step(x[:35].reshape(5, 7), x[35:40])
         pixels = np.empty_like(points.image)
         for frame in range(5):
             mine = points.frame == frame
@@ -249,7 +249,7 @@ def test_what_is_not_solved_for_stays():
         free_clip=np.zeros(5, dtype=np.bool_),
         smoothness=np.full(7, np.inf),
     )
-    start = true.stepped(1e-3 * rng.standard_normal((10, 7)) * (np.arange(7) < 3), np.zeros(5))
+    start = true.take_step(1e-3 * rng.standard_normal((10, 7)) * (np.arange(7) < 3), np.zeros(5))
     found = solve(start, problem, 30).camera
     np.testing.assert_array_equal(found.focal, start.focal)
     np.testing.assert_array_equal(found.center, start.center)
@@ -271,7 +271,7 @@ def test_what_is_held_is_known_exactly_and_the_rest_within_its_covariance():
             known=known,
         )
         solution = solve(
-            true.stepped(1e-3 * rng.standard_normal((12, 7)) * ~held, np.zeros(5)), problem, 30
+            true.take_step(1e-3 * rng.standard_normal((12, 7)) * ~held, np.zeros(5)), problem, 30
         )
         uncertainty = compute_uncertainty(solution, problem)
         variance = np.diagonal(uncertainty.frame, axis1=1, axis2=2)

@@ -135,7 +135,7 @@ def prepared(store, work, first, places):
     }
     frames = np.arange(first, first + COUNT)
     arrays["joints"] = places
-    with store.publishing(work) as result:
+    with store.publish(work) as result:
         result.write(
             BODY_FITTING,
             arrays=arrays,

@@ -109,7 +109,7 @@ def test_drift_is_spread_evenly_between_key_frames():
     true = clip.moving(21)
     step = np.zeros((2, 7))
     step[1, 1] = 1e-3
-    wrong = true.frames(np.array([0, 20])).stepped(step, np.zeros(5))
+    wrong = true.frames(np.array([0, 20])).take_step(step, np.zeros(5))
     links = chain([0, 20], wrong, pairs_of(true, rng, noise=1e-3), 3.5)
     turned = links.camera.rotation[10] @ true.rotation[10].T
     # Half of a milliradian about y in the middle; 2 px of 2,000 at the end.

@@ -5,7 +5,7 @@ from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import PARAMETERS, stepped
+from worldpose.static_calibration import PARAMETERS, step_camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 
@@ -89,7 +89,7 @@ def clip():
         rng = np.random.default_rng(seed)
         true = rig(cameras, rng)
         step = KNOWN * rng.standard_normal((cameras, len(PARAMETERS)))
-        base = stepped(true, step)
+        base = step_camera(true, step)
         joints = people(frames, persons, rng)
         keypoints = true.project(joints.reshape(-1, 3)).reshape(cameras, frames, persons, 17, 2)
         keypoints = keypoints + noise * rng.standard_normal(keypoints.shape)

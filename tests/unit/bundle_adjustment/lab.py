@@ -12,7 +12,7 @@ import numpy as np
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import Clicks, Clip
 from worldpose.geometry import Camera, Rigid
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
 FPS = 25.0
@@ -139,7 +139,7 @@ def make_lab(
     step = np.zeros((cameras, 12))
     step[:, :3] = rotation * rng.standard_normal((cameras, 3))
     step[:, 3:6] = center * rng.standard_normal((cameras, 3))
-    given = stepped(true, step)
+    given = step_camera(true, step)
     if focal is not None:
         wrong = given.focal.copy()
         wrong[1] *= focal

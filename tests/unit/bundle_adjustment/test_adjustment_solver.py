@@ -7,7 +7,7 @@ import pytest
 
 from worldpose.bundle_adjustment import SolverSettings, solve
 from worldpose.errors import InputError, InternalError
-from worldpose.static_calibration import PARAMETERS, stepped
+from worldpose.static_calibration import PARAMETERS, step_camera
 
 DISTURBED = np.array([2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1, 5e-3, 3.0, 3.0, 0.01, 0.005, 0.0])
 
@@ -17,7 +17,7 @@ def disturbed(problem, seed=7):
     step = DISTURBED * rng.standard_normal((len(problem.free), len(PARAMETERS)))
     free = np.where(np.isinf(problem.point_information), 0.0, 0.1)[:, None]
     points = problem.points + free * rng.standard_normal(problem.points.shape)
-    return replace(problem, cameras=stepped(problem.cameras, step), points=points)
+    return replace(problem, cameras=step_camera(problem.cameras, step), points=points)
 
 
 def test_nothing_fixes_the_scene_is_refused(scene):

@@ -7,7 +7,7 @@ import pytest
 
 from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
 from worldpose.static_calibration.line_search import adjust
 
@@ -66,7 +66,7 @@ def test_a_survey_that_is_off_as_a_whole_takes_its_cameras_along(lined):
             seen = camera.project(spot + SURVEY_ERROR * axis)
             # Of 0.3 px that the paint is off; linearised.
             np.testing.assert_allclose(
-                stepped(camera, moved @ common).project(spot), seen, atol=1e-3
+                step_camera(camera, moved @ common).project(spot), seen, atol=1e-3
             )
 
 

@@ -13,7 +13,7 @@ from worldpose.bundle_adjustment import (
     adjust_cameras,
     adjustment,
 )
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.triangulation import triangulate_joints
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
@@ -94,7 +94,9 @@ def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
     made, true, _ = clip()
     step = 5e-4 * np.random.default_rng(2).standard_normal((5, 12))
     step[:, 3:] = 0.0
-    given = replace(made, cameras=stepped(true, step), covariance=np.zeros_like(made.covariance))
+    given = replace(
+        made, cameras=step_camera(true, step), covariance=np.zeros_like(made.covariance)
+    )
     index = made.detection_index.astype(np.int16)
     detections = TrackedDetections(made.keypoints, made.confidence, index)
     placed = triangulate_joints(given.cameras, detections, made.triangulation)

@@ -11,7 +11,7 @@ from worldpose.bundle_adjustment.uncertainty import (
     similarity_steps,
 )
 from worldpose.geometry import Rigid
-from worldpose.static_calibration import project_with_jacobian, stepped
+from worldpose.static_calibration import project_with_jacobian, step_camera
 
 ORIGIN = np.array([0.3, -0.2, 1.0])
 
@@ -39,7 +39,7 @@ def test_steps_are_the_derivatives_of_cameras_that_follow(rng, parameter):
     small[parameter] = 1e-6
     away = points - ORIGIN
     moved = points + small[:3] + np.cross(small[3:6], away) + small[6] * away
-    seen = stepped(cameras, similarity_steps(cameras, ORIGIN) @ small).project(moved)
+    seen = step_camera(cameras, similarity_steps(cameras, ORIGIN) @ small).project(moved)
     # A thousand pixels times the square of the step are left.
     np.testing.assert_allclose(seen, cameras.project(points), atol=1e-8)
 

@@ -10,7 +10,7 @@ import pytest
 from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import compare_errors, held_out_errors
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.triangulation import triangulate_joints
 
 
@@ -29,7 +29,7 @@ def test_a_turned_camera_is_seen_in_its_own_keypoints(clip):
     step[2, 1] = 5e-3  # 10 px
     before = held_out_errors(made, true, frames, everybody, 3.0)
     said = compare_errors(
-        before, held_out_errors(made, stepped(true, step), frames, everybody, 3.0)
+        before, held_out_errors(made, step_camera(true, step), frames, everybody, 3.0)
     )
     assert np.argmax(said.loss[:, 1] - said.loss[:, 0]) == 2
     assert said.error[2, 1] > 5.0 > said.error[2, 0]
@@ -92,7 +92,7 @@ def honest(clip):
     covariance = 0.01 * made.covariance
     spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     step = spread * np.random.default_rng(7).standard_normal((8, 12))
-    made = placed_again(replace(made, cameras=stepped(true, step), covariance=covariance))
+    made = placed_again(replace(made, cameras=step_camera(true, step), covariance=covariance))
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     return made, true, errors(adjusted.cameras, true)
@@ -103,7 +103,7 @@ def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(hones
     step = np.zeros((8, 12))
     step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
     adjusted = adjust_cameras(
-        placed_again(replace(made, cameras=stepped(made.cameras, step))), QUICK
+        placed_again(replace(made, cameras=step_camera(made.cameras, step))), QUICK
     )
     assert adjusted.accepted.all()
     left = errors(adjusted.cameras, true)

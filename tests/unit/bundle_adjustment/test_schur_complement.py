@@ -13,7 +13,7 @@ from worldpose.geometry.optimize.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.static_calibration import PARAMETERS, project_with_jacobian, stepped
+from worldpose.static_calibration import PARAMETERS, project_with_jacobian, step_camera
 
 
 def evidence_of(problem):
@@ -79,8 +79,8 @@ def test_the_gradient_is_the_slope_of_the_cost(scene, scale):
     for parameter in range(STEPS):
         step = np.zeros((4, STEPS))
         step[1, parameter] = 1e-6
-        high = cost(stepped(problem.cameras, step).numbers, points, evidence)
-        low = cost(stepped(problem.cameras, -step).numbers, points, evidence)
+        high = cost(step_camera(problem.cameras, step).numbers, points, evidence)
+        low = cost(step_camera(problem.cameras, -step).numbers, points, evidence)
         # The cost is the sum of squares, the gradient that of half of it.
         slope = 0.5 * (high - low) / 2e-6
         assert slope == pytest.approx(gradient[1, parameter], rel=1e-4, abs=1e-2)

@@ -20,7 +20,7 @@ from worldpose.filtering.systematic_errors import (
 )
 from worldpose.filtering.views import Residuals
 from worldpose.geometry import Rigid
-from worldpose.simulation.detector_errors import facing
+from worldpose.simulation.detector_errors import facing_axes
 
 ROWS = 3000
 
@@ -62,7 +62,7 @@ def test_a_point_beside_the_joint_is_no_bias_of_sides():
 
 def test_azimuths_are_those_that_detectors_see(scene):
     joints = scene.joints[::10]
-    front, left = facing(joints)
+    front, left = facing_axes(joints)
     away = scene.cameras.center[:, None] - joints[..., (5, 6, 11, 12), :].mean(axis=-2)[:, None]
     level = np.arctan2(
         np.einsum("fcpa,fpa->fcp", away, left), np.einsum("fcpa,fpa->fcp", away, front)

@@ -99,7 +99,7 @@ def test_jacobians_equal_finite_differences(camera, seed):
         (found.d_points, lambda d: camera.project(points + d), 3, 1e-2),
         (
             found.d_pose,
-            lambda d: changed(cam_from_world=camera.cam_from_world.updated(d)).project(points),
+            lambda d: changed(cam_from_world=camera.cam_from_world.retract(d)).project(points),
             6,
             1e-4,
         ),

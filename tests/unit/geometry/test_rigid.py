@@ -85,7 +85,7 @@ def test_missing_rotation_stays_missing():
 def test_tangent_update_rotates_before_it_translates():
     start = Rigid(np.eye(3), [1.0, 0.0, 0.0])
     # x = 1 in frame b turns to y = 1, then moves 5 along z.
-    moved = start.updated([0.0, 0.0, np.pi / 2, 0.0, 0.0, 5.0]).apply([[0.0, 0.0, 0.0]])
+    moved = start.retract([0.0, 0.0, np.pi / 2, 0.0, 0.0, 5.0]).apply([[0.0, 0.0, 0.0]])
     np.testing.assert_allclose(moved, [[0.0, 1.0, 5.0]], atol=ROUNDING)
 
 
@@ -97,7 +97,7 @@ def test_tangent_update_has_the_documented_derivative(rotvec, translation, point
     h = 1e-6
     steps = h * np.eye(6)
     found = (
-        transform.updated(steps).apply(point[None]) - transform.updated(-steps).apply(point[None])
+        transform.retract(steps).apply(point[None]) - transform.retract(-steps).apply(point[None])
     )[:, 0].T / (2.0 * h)
     # Central differences at 300 m: 300 h^2 / 6 from the third derivative, and rounding of
     # 300 * 1e-16 * a few / h.
@@ -113,7 +113,7 @@ def test_batches_broadcast_and_index():
     assert batch[..., 0].batch_shape == (4,)
     assert batch[:, np.array([True, False])].batch_shape == (4, 1)
     assert (batch @ batch.inverse()).batch_shape == (4, 2)
-    assert batch.updated(np.zeros(6)).batch_shape == (4, 2)
+    assert batch.retract(np.zeros(6)).batch_shape == (4, 2)
 
 
 def test_single_transform_has_no_items():
@@ -128,7 +128,7 @@ def test_single_transform_has_no_items():
         (lambda: Rigid(np.eye(3), np.zeros((3, 1))), r"\(\.\.\., 3\)", r"\(3, 1\)"),
         (lambda: Rigid(np.zeros((2, 3, 3)), np.zeros((4, 3))), "broadcast", r"\(2,\) and \(4,\)"),
         (lambda: Rigid.identity().apply(np.zeros(3)), r"\(\.\.\., n, 3\)", r"\(3,\)"),
-        (lambda: Rigid.identity().updated(np.zeros(3)), r"\(\.\.\., 6\)", r"\(3,\)"),
+        (lambda: Rigid.identity().retract(np.zeros(3)), r"\(\.\.\., 6\)", r"\(3,\)"),
         (lambda: Rigid.from_rotvec(np.eye(4), np.zeros(3)), r"\(\.\.\., 3\)", r"\(4, 4\)"),
     ],
 )

@@ -16,7 +16,7 @@ def test_a_body_s_doubt_is_that_of_its_joints_across_the_view():
 
 
 def test_who_stands_right_behind_somebody_is_hidden_and_the_one_before_is_not():
-    hidden = expected((0.0, 0.0), (0.0, 1.0), (3.0, 1.0)).hidden(0)
+    hidden = expected((0.0, 0.0), (0.0, 1.0), (3.0, 1.0)).hidden_joints(0)
     assert not hidden[0].any()
     assert not hidden[2].any()
     # The farther body looks a twentieth smaller and so lies on the nearer one's bones.
@@ -25,7 +25,7 @@ def test_who_stands_right_behind_somebody_is_hidden_and_the_one_before_is_not():
 
 def test_half_a_body_behind_another_is_half_hidden():
     # A shoulder's width aside: the arm and leg on that side are behind the other's.
-    hidden = expected((0.0, 0.0), (0.35, 1.0)).hidden(0)[1]
+    hidden = expected((0.0, 0.0), (0.35, 1.0)).hidden_joints(0)[1]
     left = STANDING[:, 0] > 0.05
     assert hidden[~left].mean() > 0.4
     assert not hidden[left].any()
@@ -33,11 +33,11 @@ def test_half_a_body_behind_another_is_half_hidden():
 
 def test_people_side_by_side_at_one_depth_hide_nothing_of_one_another():
     # The depth order of the two is uncertain.
-    assert not expected((0.0, 0.0), (0.1, 0.1)).hidden(0).any()
+    assert not expected((0.0, 0.0), (0.1, 0.1)).hidden_joints(0).any()
 
 
 def test_who_is_no_body_hides_nobody():
     bodies = expected((0.0, 0.0), (0.0, 1.0))
     for array in (bodies.image, bodies.scale, bodies.depth):
         array[0, 0] = np.nan
-    assert not bodies.hidden(0).any()
+    assert not bodies.hidden_joints(0).any()

@@ -16,7 +16,7 @@ from worldpose.simulation.detector_errors import (
     detect,
     draw_false_positives,
     draw_systematic_errors,
-    facing,
+    facing_axes,
     perceived_bias,
     project_bodies,
     report,
@@ -228,7 +228,7 @@ def test_the_nearest_of_those_before_a_joint_hides_it(camera):
 
 def test_azimuth_is_where_the_camera_is_seen_from_the_body(camera):
     # With his left at positive x he faces the camera, which then passes to his right.
-    front, left = facing(standing(0.0, 20.0))
+    front, left = facing_axes(standing(0.0, 20.0))
     np.testing.assert_allclose(front, [0.0, -1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(left, [1.0, 0.0, 0.0], atol=1e-12)
     projections = project_bodies(camera, bodies(standing(0.0, 20.0), standing(20.0, 20.0)))

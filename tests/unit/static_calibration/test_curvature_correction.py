@@ -14,7 +14,7 @@ from worldpose.static_calibration.curvature_correction import ClicksAndBars, fit
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.line_samples import project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
-from worldpose.static_calibration.parameters import stepped
+from worldpose.static_calibration.parameters import step_camera
 
 SETTINGS = StaticCalibrationSettings()
 
@@ -51,7 +51,9 @@ def test_derivatives_are_those_of_the_residuals():
     for column, parameter in enumerate(np.flatnonzero(given.problem.free)):
         step = np.zeros(12)
         step[parameter] = 1e-5 if parameter in (0, 1, 2, 6) else 1e-3
-        ahead, behind = (given.residuals(stepped(camera, sign * step))[0] for sign in (1.0, -1.0))
+        ahead, behind = (
+            given.residuals(step_camera(camera, sign * step))[0] for sign in (1.0, -1.0)
+        )
         slope = (ahead - behind) / (2.0 * step[parameter])
         # Exact bars: residuals are zero, and so is what the turning normals would add.
         scale = np.abs(rows[:, column]).max()
@@ -100,7 +102,7 @@ def test_best_camera_is_found_from_metres_away():
     best = given.fit(camera)
     step = np.zeros(12)
     step[5], step[6] = 0.5, 0.01  # half a metre back, a hundredth longer
-    again = given.fit(stepped(camera, step))
+    again = given.fit(step_camera(camera, step))
     lowest = float((given.residuals(best)[0] ** 2).sum())
     # A hundredth of a deviation ends the search.
     assert float((given.residuals(again)[0] ** 2).sum()) == pytest.approx(lowest, abs=1e-3)

@@ -22,7 +22,7 @@ from worldpose.static_calibration.line_samples import (
     white_structures,
 )
 from worldpose.static_calibration.line_search import LineSearch, adjust
-from worldpose.static_calibration.parameters import CameraEstimate, step_between, stepped
+from worldpose.static_calibration.parameters import CameraEstimate, step_between, step_camera
 from worldpose.static_calibration.settings import LineRefinementSettings
 
 PITCH = PitchTemplate.standard()
@@ -63,7 +63,7 @@ def start(seed, factor=1.0, true=None):
     """The true camera some way off, by as much as its covariance says."""
     spread = factor * SPREAD
     step = spread * np.random.default_rng(seed).standard_normal(12)
-    return CameraEstimate(stepped(true or camera(), step), np.diag(spread**2))
+    return CameraEstimate(step_camera(true or camera(), step), np.diag(spread**2))
 
 
 def line_error(estimate, true=None):
@@ -192,7 +192,7 @@ def test_derivatives_of_samples_are_those_of_projection():
     for parameter in range(12):
         step = np.zeros(12)
         step[parameter] = 1e-6 if parameter < 7 else 1e-4
-        ahead, behind = stepped(view, step), stepped(view, -step)
+        ahead, behind = step_camera(view, step), step_camera(view, -step)
         slope = ahead.project(samples.points_world) - behind.project(samples.points_world)
         slope = (slope * seen.normals).sum(-1) / (2.0 * step[parameter])
         here = seen.visible

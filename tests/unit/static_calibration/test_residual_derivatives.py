@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from worldpose.geometry import Camera
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
 from worldpose.static_calibration.descent import step_row
 from worldpose.static_calibration.evidence import gather_evidence
@@ -28,7 +28,9 @@ def problem_and_row(index=1):
     drawn = people.draw(camera, people.PITCH.marking_names, rng, noise=5.0)
     clicked = clicks.model_copy(update={"drawn": drawn})
     evidence = gather_evidence(people.PITCH, clicked, people.SIZE, 0.5, "test")
-    off = stepped(camera, [0.01, -0.01, 0.02, 0.3, 0.2, -0.4, 0.02, 3.0, -4.0, 0.01, 0.002, 0.001])
+    off = step_camera(
+        camera, [0.01, -0.01, 0.02, 0.3, 0.2, -0.4, 0.02, 3.0, -4.0, 0.01, 0.002, 0.001]
+    )
     return build_problem(evidence, people.SIZE, StaticCalibrationSettings()), off
 
 
@@ -37,7 +39,10 @@ def differences(function, camera: Camera):
     for index, size in enumerate(STEPS):
         step = np.zeros(12)
         step[index] = size
-        forward, backward = function(stepped(camera, step)), function(stepped(camera, -step))
+        forward, backward = (
+            function(step_camera(camera, step)),
+            function(step_camera(camera, -step)),
+        )
         columns.append((forward - backward) / (2 * size))
     return np.stack(columns, axis=-1)
 
@@ -49,7 +54,7 @@ def test_the_compiled_step_is_that_of_the_camera():
     step_row(camera_row(camera), step, row)
     # Rotations of 0.4 rad and numbers up to 1e3 at double precision.
     np.testing.assert_allclose(
-        row[:21], camera_row(stepped(camera, step))[:21], rtol=1e-12, atol=1e-12
+        row[:21], camera_row(step_camera(camera, step))[:21], rtol=1e-12, atol=1e-12
     )
 
 
@@ -119,7 +124,7 @@ def test_the_motion_of_the_ground_under_a_step():
     motion = surface_motion(camera, people.PITCH, places)
     rng = np.random.default_rng(1)
     step = 1e-6 * rng.standard_normal(12)
-    moved = people.ground_errors(stepped(camera, step), camera, places)
+    moved = people.ground_errors(step_camera(camera, step), camera, places)
     predicted = np.linalg.norm(motion @ step, axis=1)
     assert len(places) > 10
     np.testing.assert_allclose(moved, predicted, rtol=1e-3, atol=1e-9)

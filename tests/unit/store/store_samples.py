@@ -139,7 +139,7 @@ def sample_work(store: Store, recipe: Recipe | None = None, run_id: str = "0001"
 def publish(
     store: Store, recipe: Recipe | None = None, seed: int = 0, run_id: str = "0001"
 ) -> ResultWriter:
-    with store.publishing(sample_work(store, recipe, run_id)) as writer:
+    with store.publish(sample_work(store, recipe, run_id)) as writer:
         writer.write(LAYOUT, sample_arrays(seed), sample_coordinates(), ATTRIBUTES)
         writer.figures["mean_views"] = 2.5
     return writer

@@ -63,7 +63,7 @@ def test_what_goes_while_it_is_listed_is_not_there(
     blobs = folder_store.blobs
     blobs.put("a/1", b"1")
     blobs.put("a/2", b"2")
-    staged = blobs.staging()
+    staged = blobs.create_staging()
     (staged / "half").write_bytes(b"half")
     scan = os.scandir
 

@@ -150,13 +150,13 @@ def record_before_results() -> None:
 
     from worldpose.store.runs import write_record
 
-    real = Store.publishing
+    real = Store.publish
 
-    def publishing(self: Store, work: object) -> object:
+    def publish(self: Store, work: object) -> object:
         write_record(self.blobs, sample_record("0001", sample_recipe()))
         return real(self, work)  # type: ignore[arg-type]
 
-    Store.publishing = publishing  # type: ignore[method-assign,assignment]
+    Store.publish = publish  # type: ignore[method-assign,assignment]
 
 
 @pytest.mark.faults

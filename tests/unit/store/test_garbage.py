@@ -71,15 +71,15 @@ def test_what_a_named_result_was_made_from_is_kept(folder_store: Store) -> None:
 
 def test_young_results_and_leftovers_are_spared(store: Store) -> None:
     publish(store)
-    store.blobs.staging()
+    store.blobs.create_staging()
     assert plan_gc(store, older_than=timedelta(hours=1)).garbage == ()
 
 
 def test_orphan_staging_is_removed(tmp_path: object) -> None:
     store = Store.create(f"{tmp_path}/project")
-    folder = store.blobs.staging()
+    folder = store.blobs.create_staging()
     (folder / "chunk").write_bytes(b"12345")
-    store.blobs.staging()
+    store.blobs.create_staging()
     plan = plan_gc(store, older_than=NOW)
     assert sorted(item.size for item in plan.garbage) == [0, 5]
     collect(store, plan)

@@ -29,7 +29,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def written(path: Path) -> Path:
     cache = SourceCache(path)
-    cache.parsed("worldpose.one", SOURCE)
+    cache.parse("worldpose.one", SOURCE)
     cache.save()
     return path
 
@@ -54,7 +54,7 @@ def test_a_source_has_its_imports_and_names_of_data() -> None:
 
 
 def test_the_next_process_parses_nothing(written: Path, parsed_sources: list[bytes]) -> None:
-    read = SourceCache(written).parsed("worldpose.one", SOURCE)
+    read = SourceCache(written).parse("worldpose.one", SOURCE)
     assert parsed_sources == []
     assert read == parse_source(SOURCE)
 
@@ -62,9 +62,9 @@ def test_the_next_process_parses_nothing(written: Path, parsed_sources: list[byt
 def test_another_source_of_the_module_is_parsed(written: Path) -> None:
     changed = SOURCE.replace(b"prior", b"later")
     cache = SourceCache(written)
-    assert cache.parsed("worldpose.one", changed).data == ["later.npz"]
+    assert cache.parse("worldpose.one", changed).data == ["later.npz"]
     cache.save()
-    assert SourceCache(written).parsed("worldpose.one", changed) == parse_source(changed)
+    assert SourceCache(written).parse("worldpose.one", changed) == parse_source(changed)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_a_damaged_file_is_parsed_again(
     assert old in content
     written.write_bytes(content.replace(old, new, 1))
     cache = SourceCache(written)
-    cache.parsed("worldpose.one", SOURCE)
+    cache.parse("worldpose.one", SOURCE)
     assert parsed_sources == [SOURCE]
     cache.save()
     assert written.read_bytes() == content
@@ -87,14 +87,14 @@ def test_a_file_of_another_parser_is_parsed_again(
     written: Path, parsed_sources: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sources, "_parser_version", lambda: b"another Python")
-    SourceCache(written).parsed("worldpose.one", SOURCE)
+    SourceCache(written).parse("worldpose.one", SOURCE)
     assert parsed_sources == [SOURCE]
 
 
 def test_a_folder_that_cannot_be_made_changes_no_answer(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     cache = SourceCache(tmp_path / "file" / "sources.json")
-    assert cache.parsed("worldpose.one", SOURCE) == parse_source(SOURCE)
+    assert cache.parse("worldpose.one", SOURCE) == parse_source(SOURCE)
     cache.save()
 
 
@@ -105,7 +105,7 @@ def test_a_failed_write_leaves_no_file(written: Path, monkeypatch: pytest.Monkey
     before = written.read_bytes()
     monkeypatch.setattr(Path, "replace", fails)
     cache = SourceCache(written)
-    cache.parsed("worldpose.two", b"x = 1")
+    cache.parse("worldpose.two", b"x = 1")
     cache.save()
     assert [each.name for each in written.parent.iterdir()] == [written.name]
     assert written.read_bytes() == before
@@ -115,7 +115,7 @@ def test_a_broken_source_is_not_kept(path: Path) -> None:
     cache = SourceCache(path)
     for _ in range(2):
         with pytest.raises(SyntaxError):
-            cache.parsed("worldpose.one", b"def (")
+            cache.parse("worldpose.one", b"def (")
     cache.save()
     assert not path.exists()
 
@@ -124,7 +124,7 @@ def test_writers_at_once_leave_a_whole_file(path: Path) -> None:
     def write(number: int) -> None:
         cache = SourceCache(path)
         for module in range(20):
-            cache.parsed(f"worldpose.part{module}", f"x = {number}".encode())
+            cache.parse(f"worldpose.part{module}", f"x = {number}".encode())
         cache.save()
 
     with ThreadPoolExecutor(8) as pool:

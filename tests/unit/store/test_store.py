@@ -42,7 +42,7 @@ from worldpose.store.paths import MANIFEST, PROJECT
 
 
 def test_result_comes_back_with_labels_units_and_conventions(store: Store) -> None:
-    with store.publishing(sample_work(store)) as writer:
+    with store.publish(sample_work(store)) as writer:
         writer.write(LAYOUT, all_sample_arrays(), sample_coordinates(), ATTRIBUTES)
         writer.figures["mean_views"] = 2.5
     manifest = writer.manifest
@@ -93,7 +93,7 @@ def test_unknown_result_is_a_store_error_that_says_what_to_run(store: Store) -> 
 
 
 def test_error_while_computing_leaves_nothing(store: Store) -> None:
-    with pytest.raises(ZeroDivisionError), store.publishing(sample_work(store)) as writer:
+    with pytest.raises(ZeroDivisionError), store.publish(sample_work(store)) as writer:
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
         raise ZeroDivisionError
     assert not store.has(*place())
@@ -105,7 +105,7 @@ def test_error_while_computing_leaves_nothing(store: Store) -> None:
 def test_result_without_arrays_is_not_published(folder_store: Store) -> None:
     with (
         pytest.raises(StoreError, match="the stage wrote no arrays"),
-        folder_store.publishing(sample_work(folder_store)),
+        folder_store.publish(sample_work(folder_store)),
     ):
         pass
     assert folder_store.results() == ()
@@ -114,7 +114,7 @@ def test_result_without_arrays_is_not_published(folder_store: Store) -> None:
 def test_result_is_written_once(folder_store: Store) -> None:
     with (
         pytest.raises(StoreError, match="written only once"),
-        folder_store.publishing(sample_work(folder_store)) as writer,
+        folder_store.publish(sample_work(folder_store)) as writer,
     ):
         for _ in range(2):
             writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
@@ -123,7 +123,7 @@ def test_result_is_written_once(folder_store: Store) -> None:
 
 def test_work_with_a_foreign_key_is_refused(folder_store: Store) -> None:
     work = sample_work(folder_store).model_copy(update={"key": "0" * 32})
-    with pytest.raises(InputError, match="of its recipe"), folder_store.publishing(work):
+    with pytest.raises(InputError, match="of its recipe"), folder_store.publish(work):
         pass
 
 
@@ -131,7 +131,7 @@ def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
     work = sample_work(folder_store, sample_recipe(stage="triangulation"))
     with (
         pytest.raises(InternalError, match="layout of stage"),
-        folder_store.publishing(work) as writer,
+        folder_store.publish(work) as writer,
     ):
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
 
@@ -139,7 +139,7 @@ def test_layout_of_another_stage_is_refused(folder_store: Store) -> None:
 def test_figure_that_is_not_finite_is_refused(folder_store: Store) -> None:
     with (
         pytest.raises(InternalError, match="metric error_px"),
-        folder_store.publishing(sample_work(folder_store)) as writer,
+        folder_store.publish(sample_work(folder_store)) as writer,
     ):
         writer.write(LAYOUT, sample_arrays(), sample_coordinates(), ATTRIBUTES)
         writer.figures["error_px"] = float("nan")

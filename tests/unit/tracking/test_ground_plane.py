@@ -8,7 +8,7 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import stepped
+from worldpose.static_calibration import step_camera
 from worldpose.tracking import (
     GroundPositions,
     estimate_plane_clocks,
@@ -111,7 +111,7 @@ def test_calibration_errors_move_places_by_the_stated_covariance(ring):
     moved = []
     for _ in range(2000):
         step = np.sqrt(np.diag(stated[0])) * rng.standard_normal(12)
-        other = Camera.stack([stepped(camera[0], step)])
+        other = Camera.stack([step_camera(camera[0], step)])
         moved.append(locate_feet(other, *seen, PITCH).xy[0, 0, 0])
     np.testing.assert_allclose(found.calibration[0, 0, 0], np.cov(np.array(moved).T), rtol=0.15)
 

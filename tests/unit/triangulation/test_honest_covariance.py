@@ -4,7 +4,7 @@ import pytest
 from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
 from worldpose.simulation import SCENARIOS, simulate_scene
-from worldpose.static_calibration.parameters import stepped
+from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation import (
     ClipDetections,
     TriangulationSettings,
@@ -66,7 +66,7 @@ def coverage(seeds):
         squared["exact"].append(squared_deviations(exact, truth))
         count = len(cameras.focal)
         steps = CALIBRATION * rng.normal(size=(count, 12))
-        given = Camera.stack([stepped(cameras[c], steps[c]) for c in range(count)])
+        given = Camera.stack([step_camera(cameras[c], steps[c]) for c in range(count)])
         covariance = np.broadcast_to(np.diag(CALIBRATION**2), (count, 12, 12)).copy()
         calibrated = triangulate_joints(given, TrackedDetections(*arrays), settings, covariance)
         squared["calibrated"].append(squared_deviations(calibrated, truth))

@@ -4,7 +4,7 @@ from running_samples import detections, runner
 
 from data_contracts.keypoints import TrackedDetections
 from worldpose.geometry import Camera
-from worldpose.static_calibration.parameters import project_with_jacobian, stepped
+from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 from worldpose.triangulation.person_offsets import stated_errors
 
@@ -74,7 +74,7 @@ def misjudged(camera, seed, size):
     rng = np.random.default_rng(seed)
     sigma = np.array([size] * 3 + [0.0] * 9)
     count = len(camera.focal)
-    cameras = [stepped(camera[c], sigma * rng.normal(size=12)) for c in range(count)]
+    cameras = [step_camera(camera[c], sigma * rng.normal(size=12)) for c in range(count)]
     return Camera.stack(cameras), np.broadcast_to(np.diag(sigma**2), (count, 12, 12)).copy()
 
 

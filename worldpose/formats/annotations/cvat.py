@@ -129,7 +129,10 @@ def _write(image: Element, group: int, person: AnnotatedPerson) -> None:
 
 
 def _read_image(image: Element) -> AnnotatedImage:
-    name, size = _given(image, "name"), (_whole(image, "width"), _whole(image, "height"))
+    name, size = (
+        _require_attribute(image, "name"),
+        (_whole(image, "width"), _whole(image, "height")),
+    )
     boxes: dict[tuple[str, str], Element] = {}
     for key, box in _of_label(image, "box", BOX):
         if key in boxes:
@@ -182,7 +185,7 @@ def _attributes(element: Element) -> dict[str, str]:
 def _box(element: Element) -> Floats:
     if element.get("rotation", "0") not in ("0", "0.0", "0.00"):
         raise ContentError("a box that is rotated")
-    given = [_number(_given(element, name)) for name in ("xtl", "ytl", "xbr", "ybr")]
+    given = [_number(_require_attribute(element, name)) for name in ("xtl", "ytl", "xbr", "ybr")]
     box = np.array(given) - CORNER
     if (box[2:] < box[:2]).any():
         raise ContentError("a box of negative size")
@@ -192,12 +195,12 @@ def _box(element: Element) -> Floats:
 def _skeleton(element: Element) -> tuple[Floats, NDArray[np.int8]]:
     keypoints, visible = _nowhere()
     for point in element.findall("points"):
-        joint = _given(point, "label")
+        joint = _require_attribute(point, "label")
         if joint not in COCO17:
             raise ContentError(f"COCO-17 has no joint {joint[:40]!r}")
         if point.get("outside", "0") == "1":
             continue
-        place = _given(point, "points").split(",")
+        place = _require_attribute(point, "points").split(",")
         if len(place) != 2:
             raise ContentError(f"{joint} has not one place")
         k = COCO17.index(joint)
@@ -211,7 +214,7 @@ def _nowhere() -> tuple[Floats, NDArray[np.int8]]:
     return np.full((17, 2), np.nan), np.zeros(17, dtype=np.int8)
 
 
-def _given(element: Element, name: str) -> str:
+def _require_attribute(element: Element, name: str) -> str:
     value = element.get(name)
     if not value:
         raise ContentError(f"<{element.tag}> has no {name}")
@@ -219,7 +222,7 @@ def _given(element: Element, name: str) -> str:
 
 
 def _whole(element: Element, name: str) -> int:
-    value = _number(_given(element, name))
+    value = _number(_require_attribute(element, name))
     if value < 1 or value != int(value):
         raise ContentError(f"<{element.tag}> has {name} {value}")
     return int(value)

@@ -174,12 +174,12 @@ def _read(task: _Task) -> AnnotatedImage:
             box = np.concatenate([begin, begin + np.array([value.width, value.height]) * pixels])
             if region.id in boxes:
                 raise ContentError(f"{name}: two regions have one id")
-            boxes[region.id] = (region, _rounded(box))
+            boxes[region.id] = (region, _round_pixels(box))
     keypoints = {owner: np.full((17, 2), np.nan) for owner in boxes}
     visible = {owner: np.zeros(17, dtype=np.int8) for owner in boxes}
     for region in shapes:
         if region.type == "keypointlabels":
-            place = _rounded(np.array([region.value.x, region.value.y]) * pixels - CORNER)
+            place = _round_pixels(np.array([region.value.x, region.value.y]) * pixels - CORNER)
             owner = _owner(name, region, place, {key: box for key, (_, box) in boxes.items()})
             labels = region.value.keypointlabels or ("",)
             if len(labels) > 1:
@@ -219,6 +219,6 @@ def _owner(name: str, region: _Region, place: Floats, boxes: dict[str, Floats]) 
     return around[0]
 
 
-def _rounded(pixels: Floats) -> Floats:
+def _round_pixels(pixels: Floats) -> Floats:
     """Round to single precision, as stored: errors from percentages are far smaller."""
     return pixels.astype(np.float32).astype(np.float64)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_contracts.arrays import Floats
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class BandedFactor:
         return inverse[0, :frames]
 
 
-@compiled
+@compile_kernel
 def _factorize(lower: Floats) -> bool:
     """Factorise in place, left to right; False when the matrix is not positive definite."""
     frames, size = lower.shape[1], lower.shape[2]
@@ -94,7 +94,7 @@ def _factorize(lower: Floats) -> bool:
     return True
 
 
-@compiled
+@compile_kernel
 def _subtract(target: Floats, first: Floats, second: Floats, below: bool) -> None:
     """Subtract `first second^T`; only the lower triangle where `below`."""
     size = len(target)
@@ -107,7 +107,7 @@ def _subtract(target: Floats, first: Floats, second: Floats, below: bool) -> Non
                 target[i, j] -= factor * turned[k, j]
 
 
-@compiled
+@compile_kernel
 def _divide(target: Floats, block: Floats) -> None:
     """Multiply from the right with the inverse transpose of a lower triangle."""
     size = len(target)
@@ -125,7 +125,7 @@ def _divide(target: Floats, block: Floats) -> None:
             target[i, j] = turned[j, i]
 
 
-@compiled
+@compile_kernel
 def _substitute(lower: Floats, right: Floats) -> None:
     """Substitute forward and backward in place."""
     frames, size = lower.shape[1], lower.shape[2]

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.geometry.distortion import distort
 from worldpose.geometry.projection import project_point
 
@@ -57,7 +57,7 @@ class CameraEquations(NamedTuple):
     """(cameras, 12)"""
 
 
-@compiled
+@compile_kernel
 def eliminate(
     cameras: Floats,
     points: Floats,
@@ -124,7 +124,7 @@ def eliminate(
                     rows[row + 2, column] += (mixed[o - start, 2, i] - d * y0 - e * y1) / f
 
 
-@compiled
+@compile_kernel
 def substitute(
     cameras: Floats,
     points: Floats,
@@ -171,7 +171,7 @@ def substitute(
         trial[p, 2] += z2
 
 
-@compiled
+@compile_kernel
 def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
     """Return the robust sum of squares with the points' priors; infinite if one has no image.
 
@@ -201,7 +201,7 @@ def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
     return total
 
 
-@compiled
+@compile_kernel
 def _prior(point: Floats, anchor: Floats, known: float, normal: Floats, slope: Floats) -> None:
     """Initialise a point's normal equations with its prior."""
     normal[:] = 0.0
@@ -212,7 +212,7 @@ def _prior(point: Floats, anchor: Floats, known: float, normal: Floats, slope: F
             slope[j] = known * (point[j] - anchor[j])
 
 
-@compiled
+@compile_kernel
 def _add_point(
     w: float, dx: float, dy: float, by_point: Floats, normal: Floats, slope: Floats
 ) -> None:
@@ -226,7 +226,7 @@ def _add_point(
             k += 1
 
 
-@compiled
+@compile_kernel
 def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float, float, float]:
     """Return the Cholesky factor by rows, the diagonal raised by the damping.
 
@@ -241,7 +241,7 @@ def _factor(normal: Floats, damping: float) -> tuple[float, float, float, float,
     return a, b, c, d, e, _pivot(more * normal[5] - d * d - e * e, normal[5])
 
 
-@compiled
+@compile_kernel
 def _pivot(left: float, whole: float) -> float:
     """Return the square root of a reduced diagonal entry, at least that of its rounding error."""
     if whole <= 0.0:
@@ -249,7 +249,7 @@ def _pivot(left: float, whole: float) -> float:
     return float(np.sqrt(max(left, _ROUNDING * whole)))
 
 
-@compiled
+@compile_kernel
 def _observe(
     cameras: Floats,
     c: int,

@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from data_contracts.arrays import Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
-from worldpose.simulation.foreign.rigs import View, facing
+from worldpose.simulation.foreign.rigs import View, facing_axes
 
 
 class DetectorProfile(Record):
@@ -217,7 +217,7 @@ def defined_joints(joints: Floats, detector: Detector, personal: Floats) -> Floa
         detector: definitions.
         personal: (persons, 17, 3) each person's own offsets, in units of the profile's.
     """
-    _, left = facing(joints)
+    _, left = facing_axes(joints)
     along = joints - joints[:, :, _PARENT]
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     side = left[:, :, None] - (left[:, :, None] * along).sum(-1, keepdims=True) * along

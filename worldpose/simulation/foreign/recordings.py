@@ -108,7 +108,7 @@ def read_recordings(folder: Path) -> Recordings:
         if {"joints", "joint_names", "fps"} <= content.keys():
             motions.append(_motion(path, content))
         elif "xy" in content and content["xy"].ndim == 3:
-            tracks += _tracking(path, content)
+            tracks += _read_tracking(path, content)
     if not motions and not tracks:
         raise InputError(
             str(folder),
@@ -155,7 +155,7 @@ def _motion(path: Path, content: dict[str, NDArray[np.generic]]) -> Motion:
     return Motion(path.stem, fps, {name: joints[:, index] for name, index in found.items()})
 
 
-def _tracking(path: Path, content: dict[str, NDArray[np.generic]]) -> list[Tracking]:
+def _read_tracking(path: Path, content: dict[str, NDArray[np.generic]]) -> list[Tracking]:
     xy = np.asarray(content["xy"], dtype=np.float64)
     if "time" in content:
         clock = np.asarray(content["time"], dtype=np.float64)
@@ -234,14 +234,17 @@ def play_motion(
     course = gaussian_filter1d(course, 0.1 / step, mode="nearest")
     cos, sin = np.cos(course), np.sin(course)
 
-    def turned(vectors: Floats) -> Floats:
+    def turn_into_body(vectors: Floats) -> Floats:
         """Return vectors in forward, left, up, of unit length."""
         x, y = vectors[..., 0], vectors[..., 1]
         local = np.stack([cos * x + sin * y, cos * y - sin * x, vectors[..., 2]], axis=-1)
         return np.asarray(local / np.linalg.norm(local, axis=-1, keepdims=True))
 
     def limb(begin: str, end: str) -> Floats:
-        sides = [turned(at[f"{side}_{end}"] - at[f"{side}_{begin}"]) for side in ("left", "right")]
+        sides = [
+            turn_into_body(at[f"{side}_{end}"] - at[f"{side}_{begin}"])
+            for side in ("left", "right")
+        ]
         return np.stack(sides, axis=1)
 
     middle = 0.5 * (at["left_hip"] + at["right_hip"])
@@ -263,12 +266,12 @@ def play_motion(
         f"recording {motion.name}, from {begin:.2f} s, tempo {tempo:.2f}"
         f"{', left and right exchanged' if mirrored else ''}"
     )
-    head_up = turned(at["head"] - at["neck"])
-    shoulders = turned(at["left_shoulder"] - at["right_shoulder"])
+    head_up = turn_into_body(at["head"] - at["neck"])
+    shoulders = turn_into_body(at["left_shoulder"] - at["right_shoulder"])
     gaze = np.cross(shoulders, head_up)
     posture = Posture(
-        hips=turned(across),
-        trunk=turned(at["neck"] - middle),
+        hips=turn_into_body(across),
+        trunk=turn_into_body(at["neck"] - middle),
         shoulders=shoulders,
         head_up=head_up,
         gaze=np.asarray(gaze / np.linalg.norm(gaze, axis=-1, keepdims=True)),

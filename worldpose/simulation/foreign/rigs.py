@@ -284,7 +284,7 @@ def view_people(
     depth = camera.camera.cam_from_world.apply(trunk)[..., 2]
     scale = float(camera.camera.focal.mean()) / np.where(depth > 0.1, depth, np.nan)
     away = camera.camera.center - trunk
-    forward, left = facing(joints)
+    forward, left = facing_axes(joints)
     level = np.linalg.norm(away[..., :2], axis=-1)
     return View(
         pixels=pixels,
@@ -298,7 +298,7 @@ def view_people(
     )
 
 
-def facing(joints: Floats) -> tuple[Floats, Floats]:
+def facing_axes(joints: Floats) -> tuple[Floats, Floats]:
     """Return horizontal unit vectors (..., 3) forward and to the left of bodies (..., 17, 3)."""
     across = joints[..., 5, :] - joints[..., 6, :] + joints[..., 11, :] - joints[..., 12, :]
     across = across * [1.0, 1.0, 0.0]
