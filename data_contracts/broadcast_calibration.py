@@ -1,4 +1,4 @@
-"""Clicks in the key frames of a clip, and the result of stage `broadcast_calibration`."""
+"""Clicks in a clip's key frames, and the result of stage `broadcast_calibration`."""
 
 from __future__ import annotations
 

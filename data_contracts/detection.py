@@ -19,5 +19,5 @@ DETECTION = GroupLayout(
 
 
 def detection_unit(camera_id: str, clip_id: str) -> str:
-    """Return the unit with the detections of a static camera in a clip."""
+    """Return the name of the unit that detects people in one clip of a static camera."""
     return f"{camera_id}.{clip_id}"

@@ -65,7 +65,7 @@ ProcessId = Annotated[int, Field(ge=1, le=1 << 32)]
 """Process id of the operating system."""
 
 PersonId = Annotated[int, Field(ge=0, le=FRAME_LIMIT)]
-"""Id of the track of a person, unique in its clip."""
+"""Id of a person's track, unique in its clip."""
 
 
 class Record(BaseModel):

@@ -64,7 +64,7 @@ class ResultManifest(Record):
 
 
 class UnitFailure(Record):
-    """Failure of a unit, which has no result."""
+    """A failed unit, which has no result."""
 
     unit: str
     """Stage and unit: `tracking/clip`."""
@@ -109,7 +109,7 @@ RunState = Literal["complete", "waiting", "partial", "failed"]
 
 
 class RunRecord(Record):
-    """One run of a match, with the result of every unit."""
+    """One run of a match and the result of every unit."""
 
     contract: Literal[1] = CONTRACT_VERSION
     run_id: Name

@@ -104,7 +104,7 @@ TRACKING = GroupLayout(
 
 
 class Track(Record):
-    """The track of one person in a clip."""
+    """The track of one person within one clip."""
 
     person: PersonId
     first_frame: Frame

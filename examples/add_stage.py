@@ -1,4 +1,4 @@
-"""A stage of one's own on the results of a run: how far and how fast everybody ran.
+"""A custom stage on the results of a run: each person's distance and speed.
 
     worldpose run match
     python examples/add_stage.py worldpose-data tiny-1-1s
