@@ -1,4 +1,4 @@
-"""Fixtures that tests of the whole system share: a match, a project, one Prefect server."""
+"""Fixtures that tests of the whole system share: one match, one project, one Prefect server."""
 
 import os
 import shutil

@@ -28,7 +28,7 @@ def says_nothing(port):
         try:
             said = plain.recv(100)
         except TimeoutError:
-            return False  # it waits for something, and nobody knows for what
+            return False  # it waits, for an unknown reason
         except OSError:
             said = b""
     # TLS answers with an alert; nothing that speaks HTTP or Dask's protocol does.

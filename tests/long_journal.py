@@ -11,8 +11,8 @@ POINTS_EVERY = 10
 
 
 def write_corrections(store, match_id, count):
-    """Add so many corrections to the journal of a match, one entry each, without waiting for the
-    disk after each of them."""
+    """Add `count` corrections to a match's journal, one entry each, without waiting for the disk
+    after each."""
     match = open_for_review(store, match_id)
     camera, clicked = next(iter(match.folder.clicked.items()))
     point = clicked.points[0]

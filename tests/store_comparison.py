@@ -22,7 +22,7 @@ def compare_stores(ours: Store, theirs: Store) -> list[str]:
 
     Compared are the registered matches, every result's files and manifest, and the latest run of
     each match, which is the current one after interruptions. Ignored are times, run numbers and
-    places, and whether a run computed or reused a unit.
+    places, and whether a run computed or reused the units.
     """
     return [
         *_compare_matches(ours, theirs),

@@ -119,7 +119,7 @@ def account(project, editors):
     found = [f"{name} is there {n} times" for name, n in counts.items() if n > 1]
     found += journal.damage
     known = {name: editor for editor in editors for name in editor.sent}
-    found += [f"nobody sent {name}" for name in counts if name not in known]
+    found += [f"no editor sent {name}" for name in counts if name not in known]
     for each in kept:
         if (editor := known.get(each.id)) is None:
             continue

@@ -1,8 +1,8 @@
 """Minutes of random faults over a stream of matches: `python tests/faults/soak.py --minutes 30`.
 
-Two lanes of matches are run at once, each again and again until it is done; meanwhile parts are
-killed, the disk fills up and the network is cut, as a seed decides. After each round the project
-has to be that of undisturbed runs. Exit code 1 if it is not, or if a run hangs.
+Two threads run matches at the same time and restart each until it is done; meanwhile a seeded
+random sequence of faults kills processes, fills the disk and cuts the network. After each round
+the project must equal that of undisturbed runs. Exit code 1 if it does not, or if a run hangs.
 """
 
 import argparse
@@ -30,14 +30,14 @@ WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}
 LANES = 2
 STUCK_SECONDS = 420.0
-"""A run that does nothing for so long, whatever struck, hangs."""
-MOST_BEGINNINGS = 60
-"""A match that is begun so often and not done never will be."""
+"""A run without progress for this long hangs, whatever the fault was [s]."""
+MAX_STARTS = 60
+"""Maximum number of starts per match; one that is not done by then never will be."""
 UNFORESEEN = 'File "<string>", line 1, in <module>'
-"""An error that reached the end of the command line."""
+"""Text of an exception that the command line did not catch."""
 BETWEEN = (0.1, 0.8)
-"""From the end of one fault to the next, at least and at most, as a share of the time that a match
-takes undisturbed: faster, and no machine is ever up for long enough."""
+"""Minimum and maximum time from the end of one fault to the next, as a share of an undisturbed
+match's time: with shorter times no machine runs for long enough."""
 FAULTS = {
     "worker killed": (0.5, 10.0),
     "worker's child killed": (0.0, 0.0),
@@ -52,18 +52,18 @@ FAULTS = {
 
 @dataclass
 class Stream:
-    """Matches on their way through the machines.
+    """Matches that the machines process, and what went wrong.
 
     Attributes:
-        machines: what computes.
-        folders: of the matches.
-        beginnings: maximum number of starts of a match.
-        problems: what must not be.
+        machines: the machines that compute.
+        folders: match folders.
+        max_starts: maximum number of starts per match.
+        problems: descriptions of what went wrong.
     """
 
     machines: Machines
     folders: list
-    beginnings: int = 1
+    max_starts: int = 1
     problems: list = field(default_factory=list)
     endings: Counter = field(default_factory=Counter)
     tracebacks: list = field(default_factory=list)
@@ -100,7 +100,7 @@ class Stream:
         return found
 
     def _until_done(self, folder):
-        for _ in range(self.beginnings):
+        for _ in range(self.max_starts):
             code, said = self._run(folder)
             self.begun += 1
             if code == 0:
@@ -111,7 +111,7 @@ class Stream:
                 self.tracebacks.append(said[said.index(UNFORESEEN) :][-3000:])
             time.sleep(1.0)
         self.problems.append(
-            f"{folder.name} was begun {self.beginnings} times and is not done: {said}"
+            f"{folder.name} was begun {self.max_starts} times and is not done: {said}"
         )
 
     def _run(self, folder):
@@ -204,7 +204,7 @@ def soak(
     preload=None,
     kinds=tuple(FAULTS),
     between=BETWEEN,
-    beginnings=MOST_BEGINNINGS,
+    max_starts=MAX_STARTS,
 ):
     """The report of so many minutes of faults, as plain values.
 
@@ -216,7 +216,7 @@ def soak(
         preload: a file that workers load when they begin, in which a test spoils them.
         kinds: of faults.
         between: from the end of one to the next, as a share of an undisturbed match's time.
-        beginnings: maximum number of starts of a match.
+        max_starts: maximum number of starts per match.
     """
     folders = []
     for number in range(matches):
@@ -230,7 +230,7 @@ def soak(
         calm = stream.round(undisturbed)
         problems += [f"undisturbed: {each}" for each in stream.problems]
         stream.problems.clear()
-        stream.beginnings = beginnings
+        stream.max_starts = max_starts
         began = time.monotonic()
         dice = random.Random(seed)
         while time.monotonic() - began < 60.0 * minutes and not problems:

@@ -47,6 +47,6 @@ def test_a_store_that_keeps_no_promise_is_found(how, found, tmp_path, monkeypatc
         preload=SPOIL,
         kinds=("worker's child killed",),
         between=(0.05, 0.2),
-        beginnings=3,
+        max_starts=3,
     )
     assert any(found in problem for problem in report["problems"]), report

@@ -24,7 +24,7 @@ def test_rows_have_mean_and_spread_and_the_paper_beside_them(two_trials, capsys)
     base = next(line for line in said.splitlines() if line.startswith("base"))
     assert "72.0 ± 2.0" in base
     assert "83.5 / 70.8" in base
-    # A row that nothing computes yet stands with the paper's figures alone.
+    # A row that nothing computes yet contains the paper's numbers alone.
     body = next(line for line in said.splitlines() if line.startswith("+ BA + SMPL"))
     assert body.split()[-3:] == ["80.0", "/", "66.3"]
 

@@ -250,7 +250,7 @@ def test_what_the_system_refuses_is_said_as_json_too(monkeypatch, capsys):
 
     monkeypatch.setattr("flows.cli.app.app", refused)
     monkeypatch.setattr("sys.argv", ["worldpose", "status", "--json"])
-    monkeypatch.setattr("gc.freeze", lambda: None)  # the process goes on here
+    monkeypatch.setattr("gc.freeze", lambda: None)  # this process continues
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 1
@@ -267,7 +267,7 @@ def test_a_bug_is_called_one_and_its_traceback_is_kept(monkeypatch, capsys, flag
 
     monkeypatch.setattr("flows.cli.app.app", broken)
     monkeypatch.setattr("sys.argv", ["worldpose", "status", *flags])
-    monkeypatch.setattr("gc.freeze", lambda: None)  # the process goes on here
+    monkeypatch.setattr("gc.freeze", lambda: None)  # this process continues
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 1

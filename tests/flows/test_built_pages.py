@@ -24,7 +24,7 @@ def source_digest():
 
 def test_the_built_pages_are_of_the_sources_as_they_are():
     built = (BUILT / "built_from.sha256").read_text().strip()
-    assert built == source_digest(), "build them anew: make pages"
+    assert built == source_digest(), "build them again: make pages"
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A lost Prefect server or Dask scheduler is no failure of a unit."""
+"""A lost Prefect server or Dask scheduler is not a unit's failure."""
 
 import time
 

@@ -46,7 +46,7 @@ def test_the_farthest_views_of_two_people_come_worst_first():
             seen[2, 1, :10] = np.nan  # seven joints are too few
             seen[2, 1, 10:] += 900.0
         else:
-            seen[3, 0] += 900.0  # nobody's
+            seen[3, 0] += 900.0  # no person's
         run[f"ingest/{name}"] = xr.Dataset(
             {"keypoints": (("frame", "detection", "joint", "axis"), seen)},
             coords={"frame": FRAMES},

@@ -19,7 +19,7 @@ from worldpose.store import Store, open_run
 
 pytestmark = [
     *IN_BROWSER,
-    pytest.mark.timeout(1200),  # the run is done four times, each after somebody's answer
+    pytest.mark.timeout(1200),  # four runs, each after a reviewer's answer
 ]
 SCRIPT = Path(__file__).with_name("pages_in_browser.mjs")
 

@@ -1,4 +1,4 @@
-"""A match of one camera: nobody can be triangulated, and everybody has a place on the pitch."""
+"""A match of one camera: no person is triangulated, and every person has a pitch position."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""`worldpose import` of a surveyed pitch and of clicks: files of a match, or a clear message."""
+"""`worldpose import` of a surveyed pitch and of clicks: match files, or a clear message."""
 
 import json
 

@@ -152,7 +152,7 @@ def test_who_stands_where_somebody_stood_is_that_person():
     # Frames in which one is missing say nothing of them.
     after[0, 0] = np.nan
     assert pair_people(before, after) == {0: 1, 1: 0}
-    # Beyond a metre, or with another one nearer, it is another person.
+    # Beyond 1 m, or with another one nearer, it is another person.
     assert pair_people(before, after + 2.0) == {}
     assert pair_people(before, np.repeat(before[:, :1], 2, axis=1)) == {0: 0}
     assert pair_people(before[:, :0], after) == {}

@@ -153,7 +153,7 @@ def test_a_run_that_waits_outlives_all_servers_and_goes_on_from_the_page(served)
     assert len(names) == 6
     for body in ({}, {"reviews": names, "seen": {}}):
         assert servers.pages.post(f"{path}/decisions", json=body).status_code == 422
-    assert servers.pages.post(f"{path}/runs", json={}).status_code == 422  # nobody has decided
+    assert servers.pages.post(f"{path}/runs", json={}).status_code == 422  # no decision yet
     assert (state(), store.runs(TINY)) == ("Suspended", ("0001",))
 
     verdict = {"verdict": "approve", "why": "looked", "seen": dict.fromkeys(names, "waits")}

@@ -13,7 +13,7 @@ HUGE = 10**9
 
 
 def some(draft, rng):
-    """The id of a camera, at random."""
+    """Return a random camera id."""
     return str(rng.choice(list(draft.cameras)))
 
 
@@ -27,7 +27,7 @@ def change(draft, rng, **values):
 
 
 def put(draft, name, camera):
-    """Add a camera to a match."""
+    """Add a camera to the match."""
     draft.cameras[name] = camera
     draft.spec["cameras"].append({"id": name, "width": camera.width, "height": camera.height})
 

@@ -30,7 +30,7 @@ SECONDS = 600
 
 
 def run_by_command_line(names, seed, template, keep=None):
-    """The outcome of a case that is a match."""
+    """Run a case's match by the command line, and return the outcome."""
     if base_of(names) == "stored":
         return {"class": "not built", "message": "a store's, or a page's"}
     work = Path(tempfile.mkdtemp(prefix="worldpose-fuzz-", dir=keep))

@@ -111,7 +111,7 @@ def _spoil(draft, rng, how):
             file.write_bytes(change(file.read_bytes(), np.random.default_rng(seed)))
 
     draft.after.append(strike)
-    draft.truth = None  # nobody knows what a flipped bit says
+    draft.truth = None  # the meaning of a flipped bit is unknown
 
 
 BASES = {"toml": "given", "clicks": "clicked", "pitch": "clicked"}

@@ -158,7 +158,7 @@ def failure_class(error):
 
 
 def run_match(folder, project, overrides=(), until=None):
-    """All stages of a match, without Prefect: record, and the exceptions of its units.
+    """Run a match's stages without Prefect; return store, match, record and failed units.
 
     Raises:
         WorldposeError: the match or a setting is refused.
@@ -210,13 +210,13 @@ def _open_results_once(store_kind):
 
 
 def warnings_said(record, match):
-    """What `worldpose run` warns of after a run, in its own words."""
+    """Return the warnings that `worldpose run` prints after a run."""
     from flows.review.advice import clock_advice
 
     said = [*record.warnings, *clock_advice(record.figures, match.folder.spec)]
     for name, figures in record.figures.items():
         if figures.get("joints") == 0:
-            said.append(f"{name} found nobody")
+            said.append(f"{name} found no person")
     return said
 
 

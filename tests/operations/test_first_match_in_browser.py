@@ -38,4 +38,4 @@ def test_a_match_goes_from_the_inbox_to_its_release_in_a_browser(served, tmp_pat
     assert (record.state, record.failed, record.waiting) == ("complete", (), ())
     assert json.loads((released / "v1" / "manifest.json").read_text())["release"] == "v1"
     with capsys.disabled():
-        print(f"\nseconds since the match was put into the inbox: {seen['seconds']}")
+        print(f"\nseconds since the match arrived in the inbox: {seen['seconds']}")

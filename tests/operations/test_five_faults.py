@@ -33,11 +33,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.faults, pytest.mark.timeout(3600)]
 CORRECTIONS = 20_000
 CONNECTIONS = 1100
 SECONDS = 45.0
-"""Of each measurement."""
+"""Duration of each measurement [s]."""
 LIMIT = 1.0
-"""Of the 99th percentile [s]."""
+"""Maximum 99th percentile of the response times [s]."""
 UNPRIVILEGED = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
-"""Root for whom permissions of files hold."""
+"""Prefix of a command: root without the right to ignore file permissions."""
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def matches(small_match, tmp_path):
 
 @contextmanager
 def crowd(ports):
-    """A process that holds connections to some ports open, each with half a request."""
+    """Run a process that holds connections to `ports` open, each with half a request."""
     context = get_context("spawn")
     is_over = context.Event()
     process = context.Process(target=press, args=[ports, is_over])
@@ -83,7 +83,7 @@ def crowd(ports):
 
 
 def press(ports, is_over):
-    """Whom the server has closed comes again, as many as a hundred in half a second."""
+    """Hold connections open; every 0.5 s reopen at most 100 per port that the server closed."""
     resource.setrlimit(resource.RLIMIT_NOFILE, (8192, 8192))
     opened = {port: open_many(port, CONNECTIONS) for port in ports}
     while not is_over.wait(0.5):

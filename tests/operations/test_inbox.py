@@ -80,7 +80,7 @@ def test_a_complete_match_is_taken_once_and_stays_where_it_is(desk, drop):
     assert desk.store.matches() == (taken.match_id,)
     assert desk.begun == [(taken.match_id, "normal")]
     assert (desk.look(), desk.take_in(), len(desk.begun)) == (0, [], 1)
-    (folder / "notes.txt").write_text("later")  # people may go on working in it
+    (folder / "notes.txt").write_text("later")  # people may continue to work in it
     assert (desk.look(), desk.look(), desk.take_in()) == (0, 0, [])
     (folder / "notes.txt").unlink()
     assert content(folder) == before
@@ -95,7 +95,7 @@ def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
         file.write_bytes(whole[:size])
         assert desk.look() == 0
         assert desk.known()["small"][0] == "arriving"
-    # It was whole at 1030 s: ten seconds count from then, whatever was waited before.
+    # It was whole at 1030 s: the ten seconds count from then, regardless of earlier waiting.
     clock.now = 1039.9
     assert (desk.look(quiet=10.0), desk.take_in(quiet=10.0)) == (0, [])
     clock.now = 1040.0
@@ -106,12 +106,12 @@ def test_a_growing_match_waits_until_nothing_has_changed(desk, drop, clock):
 def test_time_that_was_waited_before_a_reboot_does_not_count(desk, drop, clock):
     drop()
     desk.look(quiet=10.0)
-    clock.now = 3.0  # it begins again
+    clock.now = 3.0  # the clock restarts
     assert desk.look(quiet=10.0) == 0
     clock.now = 12.9
     assert desk.look(quiet=10.0) == 0
     clock.now = 13.0
-    assert desk.look(quiet=10.0) == 1, "it is waited for once more, and no longer"
+    assert desk.look(quiet=10.0) == 1, "the inbox waits the settle time again, and no longer"
 
 
 def test_since_when_an_arrival_is_as_it_is_stays_until_that_changes(desk, drop):
@@ -282,7 +282,7 @@ def test_what_was_ended_on_purpose_or_by_an_error_is_no_death(desk, drop, monkey
     assert desk.state.arrivals()["aaa"].deaths == 0
     for _ in range(3):
         assert die(desk) == 137
-        desk.state.end_orderly()  # as `worldpose serve` does when it is told to end
+        desk.state.end_orderly()  # as `worldpose serve` does on a signal to end
     assert [each.state for each in desk.take_in()] == ["taken"]
 
 
@@ -410,7 +410,7 @@ def take_in_and_count(folder, queue, kill):
     if kill:
 
         def begin(match, arrival):
-            os._exit(9)  # registered, and nothing is said of it yet
+            os._exit(9)  # registered, and not reported yet
 
         take_in(desk.store, desk.state, desk.inbox, 0.0, begin)
     queue.put(len(desk.take_in()))

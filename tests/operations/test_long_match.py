@@ -33,11 +33,11 @@ FILES = {
     "refitting": 180,
     "filtering": 107,
 }
-"""Of one unit of a minute, as a run of `match` left them."""
+"""Number of files per unit of one minute, as a run of `match` wrote them."""
 
 
 def long_match(folder):
-    """A match folder of so many clips and cameras; what was seen in them is next to nothing."""
+    """Write a match folder of CLIPS clips and CAMERAS cameras with almost no detections."""
     small = folder.with_name("small")
     seen = {"duration": 0.2, "cameras": CAMERAS, "players": 1}
     bare = {"calibrated": True, "stills": False, "video": False}

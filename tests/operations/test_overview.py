@@ -1,4 +1,4 @@
-"""A project at a glance: what waits for a person, and which runs are at work."""
+"""Overview of a project: what waits for review, and which runs are active."""
 
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace

@@ -45,7 +45,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     assert served.end(signal.SIGKILL) == 0
     assert served.check().code == 1
     served.begin()
-    note("killed and begun again")
+    note("killed and restarted")
     browser = Browser(served)
     assert browser.approve_all(name) > 0
     note("approved")
@@ -54,7 +54,7 @@ def test_a_match_in_the_inbox_becomes_a_result_with_one_command(served, webhook,
     wait_until(lambda: served.runs(name)[0]["state_name"] == "Running", served.explain)
     assert served.end(signal.SIGTERM) == 0
     served.begin()
-    note("ended at work and begun again")
+    note("ended at work and restarted")
     browser = Browser(served)
 
     def is_done():

@@ -196,7 +196,7 @@ def test_eleven_hundred_slow_connections(tmp_path, capsys):
         took, left = attack(port, 1100, 45.0)
         with capsys.disabled():
             print(
-                f"\n{len(took)} requests beside 1,100 slow connections: "
+                f"\n{len(took)} requests during 1,100 slow connections: "
                 f"p50 {1e3 * quantiles(took, n=100)[49]:.0f} ms, "
                 f"p99 {1e3 * quantiles(took, n=100)[98]:.0f} ms, "
                 f"most {1e3 * max(took):.0f} ms (before: p50 {1e3 * sorted(quiet)[25]:.0f} ms); "

@@ -20,7 +20,7 @@ from worldpose.store import Store
 
 @pytest.fixture
 def two(small_match, tmp_path):
-    """A project of two matches, `first` and `second`, with their folders beside it."""
+    """A project of two matches, `first` and `second`, and their folders next to it."""
     store = Store.create(tmp_path / "project")
     for number, name in enumerate(("first", "second")):
         folder = Path(shutil.copytree(small_match, tmp_path / name))
@@ -47,7 +47,7 @@ def stale_mount(monkeypatch, two):
 
 
 def without_rights(*arguments):
-    """The command line as a user for whom permissions hold, also where tests run as root."""
+    """Run the command line as a user to whom file permissions apply, even if tests run as root."""
     drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
     command = [*(drop if os.geteuid() == 0 else ()), *WORLDPOSE, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=480)

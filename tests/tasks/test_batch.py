@@ -44,7 +44,7 @@ def test_a_units_failure_is_its_own(works, monkeypatch):
 
     def compute(work):
         if work.recipe.unit == "b":
-            raise DegenerateError("nobody to be seen")
+            raise DegenerateError("no person to be seen")
         done.append(work)
 
     failures = run(works, compute, monkeypatch)

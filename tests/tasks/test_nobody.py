@@ -25,7 +25,7 @@ def empty(tiny, tmp_path):
     spec = yaml.safe_load((folder / "match.yaml").read_text())
     (folder / "pitch.json").unlink()
     shutil.rmtree(folder / "annotations")
-    spec["pitch"] = "none"  # on a pitch, feet would place everybody
+    spec["pitch"] = "none"  # on a pitch, feet would place every person
     spec["roster"] = [{"id": "ann"}]
     spec["clips"] = [
         {"id": "first", "frame_count": 6, "people": {0: "ann"}},

@@ -46,7 +46,7 @@ def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
         pass
 
 
-@pytest.mark.parametrize("again", ["another project", "a project made anew"])
+@pytest.mark.parametrize("again", ["another project", "a new project at the same place"])
 def test_what_killed_runs_left_counts_for_no_other_run(work, tmp_path, monkeypatch, again):
     for _ in range(3):
         die(work)

@@ -1,4 +1,4 @@
-"""Ends every process that opens one file of a match, as the system does when memory runs out."""
+"""Ends every process that opens one match file, as the system does when memory runs out."""
 
 import os
 import signal

@@ -7,7 +7,7 @@ from worldpose.body import SKELETONS, BodyParameters, fold_keypoints, fold_regre
 from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
 from worldpose.errors import InputError
 
-# 0.02 mm is asked for; double precision at tens of metres gives 1e-11.
+# The requirement is 0.02 mm; double precision at tens of metres gives 1e-11.
 ROUNDING = 1e-10
 
 

@@ -152,7 +152,7 @@ def test_two_lines_make_a_joint_and_one_more_makes_it_surer():
 
     one = nothing.add_rays(*line([4.0, 2.0, 1.0], across_x))
     two = one.add_rays(*line([3.0, 7.0, 1.0], across_y))
-    # One knows y and z, the other x and z. 1e-6 1/m^2 beside 28 to 280 is 0.2 um of metres.
+    # One knows y and z, the other x and z. 1e-6 1/m^2 against 28 to 280 is 0.2 um of metres.
     np.testing.assert_allclose(two.joints[0], np.tile([3.0, 2.0, 1.0], (17, 1)), atol=1e-6)
     np.testing.assert_allclose(two.information, two.information.swapaxes(-1, -2))
     assert (np.linalg.eigvalsh(two.information) > 0.9 * one.information[..., :1, :1] + 1.0).all()

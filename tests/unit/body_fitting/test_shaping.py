@@ -1,4 +1,4 @@
-"""Shape and the detector's offsets: neither drifts for the length of a clip."""
+"""Shape and the detector's offsets: neither drifts over a whole clip."""
 
 import numpy as np
 import pytest

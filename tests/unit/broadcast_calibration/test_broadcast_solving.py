@@ -50,7 +50,7 @@ def test_exact_evidence_gives_the_exact_camera():
     problem = problem_of(true, rng, noise=1e-6, smooth=np.full(7, np.inf))
     problem = replace(problem, flow=FlowEvidence.none())
     found = solve(off(true, rng), problem, 60).camera
-    # A prior of pixels beside evidence of 1e-6 px.
+    # A prior of pixels against evidence of 1e-6 px.
     np.testing.assert_allclose(found.center, true.center, atol=1e-3)
     assert np.median(bearing_error(found, true)) < 1e-5
 
@@ -221,7 +221,7 @@ def test_frames_without_points_are_carried_by_followed_ones():
     problem = problem_of(true, rng, frames=np.r_[0:5, 35:40])
     start = off(true, rng)
     found = solve(start, problem, 60).camera
-    # 60 points of 0.1 px a pair: a thousandth of a degree a frame, twenty from either end.
+    # 60 points of 0.1 px per pair: a thousandth of a degree per frame, twenty from either end.
     assert np.median(bearing_error(start, true)[5:35]) > 0.05
     assert np.median(bearing_error(found, true)[5:35]) < 0.02
 

@@ -114,7 +114,7 @@ def folder(tmp_path_factory):
 
 
 def clicks(true, frame):
-    """The centre circle and lines through it as they are in a frame."""
+    """Return the drawn centre circle, halfway line and far touch line of one frame."""
     drawn = []
     for name in ("center_circle", "halfway_line", "touch_line_far"):
         pixels = true.camera[frame].project(clip.PITCH.marking_points(name, 0.5))

@@ -212,7 +212,7 @@ def test_a_feed_beside_the_static_cameras_is_said_and_corrected_on_request(true,
     assert any("frames later in the static cameras" in each for each in said.report.reasons)
     assert corrected.report.reasons == ()
     players = [np.nanmedian(each.report.player_rms) for each in (said, corrected)]
-    # People go 0.1 m in two frames, 3 px beside 1.4 px of noise.
+    # People go 0.1 m in two frames, which is 3 px; the noise is 1.4 px.
     assert players[1] < 0.8 * players[0]
 
 

@@ -35,7 +35,7 @@ def moving(frames=40, pan=(-3.0, 4.0), zoom=(1900.0, 2100.0), size=SIZE):
 
 
 def ground_points(camera, rng, each=40, noise=0.3):
-    """Places on the pitch as points across random directions, `each` a frame."""
+    """Return `each` random pitch points per frame, each measured across a random direction."""
     frames = len(camera)
     x, y = rng.uniform(-30.0, 30.0, 4000), rng.uniform(-30.0, 30.0, 4000)
     places = np.stack([x, y, PITCH.height(x, y)], axis=-1)

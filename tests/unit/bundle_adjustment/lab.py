@@ -93,7 +93,7 @@ def detected(cameras, joints, rng, bias=0.02, noise=0.025, missing=0.08, gross=0
     """Keypoints (frames, cameras, persons, 17, 2) with the errors of a detector [px].
 
     Errors are metres at the person: a bias of each joint that depends on the view and stays, noise
-    that lasts a fifth of a second, and some gross errors.
+    that lasts 0.2 s, and some gross errors.
     """
     frames, persons = joints.shape[:2]
     count = len(cameras.focal)

@@ -64,7 +64,7 @@ def test_a_survey_that_is_off_as_a_whole_takes_its_cameras_along(lined):
         for camera, moved in zip(lined.cameras[:3], response[:3], strict=True):
             # The paint is there, the survey says here: the camera has to make up for it.
             seen = camera.project(spot + SURVEY_ERROR * axis)
-            # Of 0.3 px that the paint is off; linearised.
+            # Tolerance for a paint error of 0.3 px, linearized.
             np.testing.assert_allclose(
                 step_camera(camera, moved @ common).project(spot), seen, atol=1e-3
             )

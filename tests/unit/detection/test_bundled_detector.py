@@ -1,4 +1,4 @@
-"""People who stand close together are detected in an enlarged view, in frame coordinates."""
+"""The detector finds people close together in an enlarged view, in frame coordinates."""
 
 import numpy as np
 

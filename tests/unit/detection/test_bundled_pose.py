@@ -143,7 +143,7 @@ def test_the_embedded_net_looks_beside_and_means_of_two_looks_do_not():
     assert isinstance(pose, FindsOccludedPeople)
     assert not isinstance(FlipTest(pose), FindsOccludedPeople)
     people = pose.find_occluded(np.zeros((240, 320, 3), np.uint8), found(FRONT))
-    assert len(people.boxes) == len(people.keypoints) == 0  # nobody in the dark
+    assert len(people.boxes) == len(people.keypoints) == 0  # no person in the dark
 
 
 AS_IS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

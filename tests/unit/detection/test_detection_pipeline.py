@@ -52,7 +52,7 @@ def test_players_stay_over_the_touch_line_too_and_the_crowd_goes(camera):
     throwing_in = np.array([[10.0, 35.5], [-20.0, -35.0], [0.0, 36.0]])
     xy = np.vstack([xy, throwing_in])
     players = np.column_stack([xy, PITCH.height(xy[:, 0], xy[:, 1])])
-    # Behind boards and a track, in a stand that rises by half a metre a metre.
+    # Behind boards and a track, in a stand that rises by 0.5 m per metre.
     away = rng.uniform(42.0, 70.0, 500)
     crowd = np.column_stack([rng.uniform(-50.0, 50.0, 500), away, 1.0 + 0.5 * (away - 42.0)])
     boxes = boxes_of(camera, np.vstack([players, crowd]))

@@ -1,4 +1,4 @@
-"""One box a person, whoever found it, and in whichever view."""
+"""Suppression keeps one box per person, from any detector and any view."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_an_ensemble_agrees_on_the_mean_weighted_by_score():
 
 
 def test_a_member_never_joins_two_people_of_its_own():
-    # Two people in a duel, whom each detector separates, and who overlap by half.
+    # Two people in a duel overlap by half; each detector separates them.
     duel = people([0, 0, 10, 20, 0.9], [3, 0, 13, 20, 0.8])
     assert len(fuse([duel, duel], 0.6).scores) == 2
 

@@ -56,14 +56,14 @@ def test_a_mirrored_box_is_turned_onto_its_thinnest_side():
     for axis in range(3):
         mirrored = BOX * np.where(np.arange(3) == axis, -1.0, 1.0)
         np.testing.assert_allclose(residuals(mirrored, BOX, False), 2.0, atol=1e-12)
-        # Umeyama's scale is (9 + 4 - 1) / (9 + 4 + 1) = 6/7: the corner (3, 2, 1) is off by
-        # (3/7, 2/7, 13/7).
+        # Umeyama's scale is (9 + 4 - 1) / (9 + 4 + 1) = 6/7: the error of the corner (3, 2, 1)
+        # is (3/7, 2/7, 13/7).
         expected = np.sqrt(9.0 + 4.0 + 169.0) / 7.0
         np.testing.assert_allclose(residuals(mirrored, BOX, True), expected, atol=1e-12)
 
 
 def test_size_is_kept_without_scale():
-    # Twice the box: each corner is off by its distance from the middle, sqrt(14).
+    # Twice the box: each corner's error is its distance from the middle, sqrt(14).
     np.testing.assert_allclose(residuals(2.0 * BOX, BOX, False), np.sqrt(14.0), atol=1e-12)
     assert align(2.0 * BOX, BOX, with_scale=True).scale == pytest.approx(0.5, abs=1e-15)
 

@@ -114,7 +114,7 @@ def test_case_x_a_transposed_rotation():
     assert found.rotation_error_deg == pytest.approx(180.0, abs=1e-9)
     # t = (0, 15, 60): the centre -R t comes to (0, 60, -15).
     assert found.center_error_m == pytest.approx(2.0 * np.hypot(60.0, 15.0), abs=1e-9)
-    # From under the ground no ray comes down on the pitch: all points are off by its diagonal.
+    # From under the ground no ray meets the pitch: the error of all points is its diagonal.
     assert found.ground_error_median_m == pytest.approx(np.hypot(105.0, 68.0), abs=1e-9)
 
 

@@ -144,7 +144,7 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     true, motion, suspects = with_a_late_camera(scene, 0.6, held=0.0)
     people = (scene.cameras, scene.joints, scene.views, motion, suspects)
     systematic = learn_systematic_errors(*people, FilteringSettings(), 25.0)
-    # The exchange between viewing-angle errors and clocks is below a tenth of a frame.
+    # The coupling between viewing-angle errors and clocks is below 0.1 frame.
     late = true.late - true.late.mean()
     np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
     right = suspects.subtract(systematic.shift(motion, scene.views))

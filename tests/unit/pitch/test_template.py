@@ -168,7 +168,7 @@ def test_samples_follow_the_crown_at_the_spacing(standard):
     assert set(samples.marking) == set(range(len(samples.names)))
     gaps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)[np.diff(samples.marking) == 0]
     assert gaps.max() <= 0.25 + ROUNDING
-    # 105 m in steps of 0.25 m and 68 m likewise, whole numbers both.
+    # 105 m and 68 m in steps of 0.25 m: both are whole numbers of steps.
     assert len(marking(standard, "touch_line_far", 0.25)) == 421
     assert len(marking(standard, "halfway_line", 0.25)) == 273
 

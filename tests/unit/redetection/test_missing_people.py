@@ -30,7 +30,7 @@ def test_who_was_not_detected_is_looked_for_where_the_body_is():
     ("where", "deviation"),
     [
         ((0.0, 40.0), 0.02),  # 31 px high
-        ((0.0, 0.0), 0.2),  # may be anybody there
+        ((0.0, 0.0), 0.2),  # may be any person there
         ((10.05, 0.0), 0.02),  # at the border: seven joints are in the image
         ((0.0, -30.0), 0.02),  # behind the camera
     ],

@@ -300,7 +300,7 @@ def interleave(folder, rng):
     kept = standing_corrections(read_journal(store, "m").records)
     replay = replay_corrections(folder, kept)
     assert list(kept) == acknowledged, "an acknowledged edit is lost or doubled"
-    assert replay.stale == (), "somebody's edit was written over unseen"
+    assert replay.stale == (), "an edit overwrote another person's unseen edit"
     last = acknowledged[-1].edit.xy if acknowledged else (1.0, 2.0)
     assert points(replay.folder.clicked["a"])[CORNER] == last
     return len(acknowledged), count

@@ -1,4 +1,4 @@
-"""Figures over the frames of a clip, counted by hand."""
+"""Metrics over a clip's frames, counted by hand."""
 
 import numpy as np
 

@@ -478,7 +478,7 @@ def test_they_have_human_bones_and_stand_on_the_pitch():
     joints = drawn(ObservationNoise(false_people=0.4), frames=2000)
     for a, b in RIGID_BONES:
         length = np.linalg.norm(joints[..., a, :] - joints[..., b, :], axis=-1)
-        # Rounding at 100 m from the origin of the walk they are taken from.
+        # Rounding at 100 m from the origin of their walk.
         assert np.nanmax(length) - np.nanmin(length) < 1e-11
     lowest = np.nanmin(joints[..., 2].min(axis=-1))
     assert -0.2 < lowest < 0.15

@@ -134,7 +134,7 @@ def test_strides_are_as_long_as_people_of_that_speed_make_them(minute):
         rate.append(np.gradient(stride_cycle(path, 0.0), STEP)[::10])
     speed, rate = np.concatenate(speed), np.concatenate(rate)
     # Published (docs/explanation/simulation.md): a walker of 1.4 m/s makes 1.35 to 1.6 m, runners
-    # of 3 m/s 75 to 95 strides a minute, sprinters at 7 to 9 m/s 1.8 to 2.3 a second.
+    # of 3 m/s 75 to 95 strides per minute, sprinters at 7 to 9 m/s 1.8 to 2.3 per second.
     for at, shortest, longest in ((1.4, 1.35, 1.6), (3.0, 1.9, 2.4), (6.0, 3.2, 4.0)):
         near = np.abs(speed - at) < 0.1
         assert near.sum() > 20

@@ -254,7 +254,7 @@ def test_flight_is_free(name, played):
     middle = joints[:, HIPS].mean(axis=1)
     flies = (times > BEGIN + off + 1.0 / FPS_ACTIONS) & (times < BEGIN + land - 1.0 / FPS_ACTIONS)
     fall_of_it = np.diff(middle[flies, 2], 2) * FPS_ACTIONS**2
-    # Second differences of a parabola are its acceleration; rounding of 1e-15 m at 200 a second.
+    # Second differences of a parabola are its acceleration; rounding of 1e-15 m at 200 1/s.
     np.testing.assert_allclose(fall_of_it, -GRAVITY, atol=1e-6)
     # The path is sampled every 0.01 s and linear between, so pace is what is constant.
     pace = np.diff(middle[flies, :2], axis=0) * FPS_ACTIONS
@@ -320,7 +320,7 @@ def test_the_other_side_is_the_mirror_image(name):
         joints[left] = walk(body, path, times, flat, np.random.default_rng(1))
     swap = [0, 2, 1, *(i + 1 if i % 2 else i - 1 for i in range(3, 17))]
     mirrored = joints[True][:, swap] * [1.0, -1.0, 1.0]
-    # Heads look where they looked when an action begins; a figure's face and stride are its own.
+    # Heads look where they looked when an action begins; face and stride differ between people.
     np.testing.assert_allclose(joints[False][:, 5:11], mirrored[:, 5:11], atol=1e-9)
 
 

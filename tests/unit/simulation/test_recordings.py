@@ -115,7 +115,7 @@ def test_a_played_clip_is_the_files_forward_kinematics(file):
     expected = 0.01 * expected[..., [2, 0, 1]]
     shift = joints[:, 5:] - expected
     # One shift for all: the start is at the origin and the floor at the ground; nine decimals of
-    # degrees and centimetres over a chain of a metre.
+    # degrees and centimetres over a chain of 1 m.
     np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-8)
     np.testing.assert_allclose(shift[0, 0, :2], 0.0, atol=1e-8)
     lowest = read_bvh(file).positions[:, [capture.names.index("lFoot")], 1].min()

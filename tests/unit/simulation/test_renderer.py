@@ -200,7 +200,7 @@ def test_people_are_drawn_where_they_are():
         changed = np.abs(empty[frame].astype(int) - peopled[frame]).sum(axis=-1) > 30
         v, u = np.nonzero(changed)
         middle = cameras[frame].project(np.array([[0.0, 0.0, 1.0]]))[0]
-        # Limbs reach as far to one side as to the other, within a fifth of the figure.
+        # Limbs reach as far to one side as to the other, within a fifth of the person.
         np.testing.assert_allclose([u.mean(), v.mean()], middle, atol=6.0)
 
 

@@ -198,7 +198,7 @@ def test_people_touch_in_the_penalty_box():
     apart[:, np.arange(6), np.arange(6)] = np.inf
     assert apart.min() < 1.5
     assert (np.abs(middle[..., 0]) > 33.0).all()  # the box begins 36 m from the halfway line
-    assert (scene.truth.views < 10).mean() > 0.1  # somebody before it, or a camera's border
+    assert (scene.truth.views < 10).mean() > 0.1  # occluded by a person, or outside the image
 
 
 def test_all_bias_and_no_noise_is_the_same_in_all_frames_for_who_stands():

@@ -96,7 +96,7 @@ def body():
 
 
 def standing(body):
-    """The unposed figure's own 17 joints, facing x, arms along y, soles on the ground."""
+    """Return a body's 17 joints at rest, facing x, arms along y, soles on the ground."""
     rest = body.figure.joints
     points = np.concatenate([body.figure.head, rest[16:22], rest[[1, 2, 4, 5, 7, 8]]])
     points = points - [0.0, body.figure.sole, 0.0]

@@ -193,8 +193,8 @@ def test_of_two_tracks_on_one_person_the_one_that_was_fixed_more_often_stays(rin
 
 
 def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, people, seen):
-    # Two cameras follow a person; then the second shows only a neighbour 0.45 m beside, within
-    # the gate: its ray misses the other camera's by more than two views of a body do.
+    # Two cameras follow a person; then the second sees only a neighbour 0.45 m away, within
+    # the gate: its ray misses the other camera's by more than two views of one body do.
     places = np.broadcast_to([[0.0, 0.0], [0.0, 0.45]], (40, 2, 2))
     camera = ring(2)
     keypoints, confidence = seen(camera, people(places), noise=0.5)

@@ -210,7 +210,7 @@ def test_runners_tell_the_clock_offset_of_two_cameras(late):
         phase = 0.8 * at[:, None] + turn
         return starts + 5.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)
 
-    # Camera 1 shows the world `late` frames after camera 0, and its calibration is off.
+    # Camera 1 shows the world `late` frames after camera 0, and its calibration is biased.
     seen = np.stack([places(time), 1.004 * places(time + late / FPS) + [0.2, -0.1]], axis=1)
     seen += 0.1 * rng.standard_normal(seen.shape)
     clocks = estimate_plane_clocks(positions_at(seen), FPS, pitch_size=SIZE)

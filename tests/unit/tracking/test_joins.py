@@ -113,8 +113,8 @@ def test_nobody_to_join_is_no_join():
 @pytest.mark.parametrize(
     ("frames", "velocity", "variance"),
     [
-        # 1 dm of the place, and 2.5 m/s in a second's velocity: a third of its square times the
-        # cube of half a second, or of the one second that a velocity lasts.
+        # 1 dm of the position, and 2.5 m/s in a velocity that lasts 1 s: a third of its square
+        # times the cube of 0.5 s, or of that second.
         (25, (np.nan, np.nan), 0.01 + 6.25 * 0.125 / 3.0),
         # Then 2 m/s either way, twice its square for each second more.
         (100, (np.nan, np.nan), 0.01 + 6.25 / 3.0 + 8.0),

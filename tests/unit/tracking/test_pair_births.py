@@ -228,7 +228,7 @@ def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people)
 
 
 def test_people_at_eye_level_are_found_once_they_stand_apart(people):
-    # The second comes into view after a second, when the first is known.
+    # The second person comes into view after 1 s, when the first is known.
     cameras = rig(*LOW)
     joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (60, 2, 2)))
     keypoints, confidence = picture(cameras, joints, np.ones((2, 2)))

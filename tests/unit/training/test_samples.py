@@ -138,7 +138,7 @@ def test_the_fit_is_what_the_box_shares_with_anybody(labelled):
     )
     said = torch.from_numpy(batch.boxes)
     sure, denied = (box_loss(batch, said, torch.full((2,), logit)) for logit in (12.0, -12.0))
-    # The true box: nothing is off, and a fit of all but 6e-6 costs as much.
+    # The true box has no error, and a fit of all but 6e-6 costs as much.
     assert float(sure) < 1e-4 < 11.0 < float(denied)
 
 
@@ -161,7 +161,7 @@ def test_the_net_is_told_of_the_box_given_and_of_others_where_they_are(labelled)
     for maps, box in zip(batch.surroundings[told], batch.boxes[told], strict=True):
         rows, columns = ((middles > box[k]) & (middles < box[k + 2]) for k in (1, 0))
         np.testing.assert_array_equal(maps[0] > 0.5, np.outer(rows, columns[:24]))
-        # The other has the same size and stands 50 px beside, in a box of 60: a sixth is common.
+        # The other has the same size and stands 50 px away, in a box of 60: a sixth is common.
         assert 0.1 < (maps[1] * maps[0]).sum() / maps[0].sum() < 0.25
 
 

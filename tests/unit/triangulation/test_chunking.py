@@ -21,7 +21,7 @@ FRAMES = 330
 
 
 class Watched:
-    """An array that counts how many frames are asked for at once."""
+    """An array that records the largest number of frames read at once."""
 
     def __init__(self, values):
         self.values, self.shape, self.most = values, values.shape, 0
