@@ -4,8 +4,8 @@
 
 Cameras are calibrated from the scenario's clicks and one image each, people are tracked and
 triangulated with them, and all cameras are adjusted together. Ground: the true pixel of a player's
-place, back through the camera onto the pitch, median / 95 %. Regions: share of these places, seen
-by a camera, whose image error is within the camera's covariance.
+position, projected back through the camera onto the pitch, median / 95 %. Regions: share of the
+positions in a camera's image whose image error is within the camera's covariance.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ SHARES = (0.5, 0.8, 0.95, 0.99)
 
 
 def true_camera(folder: Path, size: tuple[int, int], clip: str) -> MovingCamera:
-    """Return the true camera of a clip."""
+    """Return the true broadcast camera of one clip."""
     camera = read_camera(folder / "reference" / "cameras" / f"{clip}.npz", size)
     return MovingCamera.of(camera, camera.center[0], camera.principal_point[0])
 

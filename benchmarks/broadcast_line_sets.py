@@ -3,7 +3,7 @@
     python benchmarks/broadcast_line_sets.py DATA
 
 DATA holds `wc14` (lines.json, calib_eval.py), as for pitch_lines.py. There are no images: every
-line set is the only key frame of a clip, and its camera depends on the drawn lines alone.
+line set is the only key frame of its clip, whose camera depends on the drawn lines alone.
 """
 
 from __future__ import annotations

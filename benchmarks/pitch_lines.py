@@ -74,7 +74,7 @@ class Fitted:
 
     @property
     def residual(self) -> float:
-        """Return the largest residual of a drawn pixel [px], infinite without a camera."""
+        """Return the largest residual of a drawn pixel [px], infinite without a calibration."""
         if self.calibration is None:
             return np.inf
         return max(marking.worst for marking in self.calibration.report.drawn)
@@ -127,7 +127,7 @@ def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, i
 
 
 def score_images(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
-    """Return JaC of every image with a camera."""
+    """Return the JaC of every calibrated image."""
     return {
         key: jaccards(scorer, lines[key], fitted.calibration.estimate.camera, size)
         for key, fitted in fits.items()
@@ -164,7 +164,7 @@ def contradictions(
     Args:
         scorer: projects the markings.
         lines: the annotation.
-        fitted: an image's fit with a camera.
+        fitted: the fit of a calibrated image.
         size: width, height [px].
         limit: maximum distance of a drawn pixel [px].
         seen: length in the image from which a marking has to be drawn [px].

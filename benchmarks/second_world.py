@@ -174,7 +174,7 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict[str, Any]:
-    """Return the row of a match, measured in a process that may crash or hang."""
+    """Return one match's row, measured in a process that may crash or hang."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if keep is None else keep
         if keep is not None:

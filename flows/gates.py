@@ -1,4 +1,4 @@
-"""Review gates: where a run waits for a person, and the metric limits that trigger a review.
+"""Review gates: where a run waits for review, and the metric limits that require it.
 
 A gate follows a stage and checks each of its results separately; `GATES` lists all gates. The
 `Gatekeeper` of a run decides from verdicts, metrics and policy which results need review.
@@ -131,7 +131,7 @@ class ConsistencyLimits(Record):
 
 
 class IdentityLimits(Record):
-    """Metric limits of the tracks of a clip."""
+    """Metric limits of a clip's tracks."""
 
     undecided: float = Field(default=0, ge=0)
     """Joins of two tracks with ambiguous evidence [1]: a person decides these at once, and a
@@ -147,7 +147,7 @@ class IdentityLimits(Record):
 
 
 class JointLimits(Record):
-    """Metric limits of the triangulated joints of a clip."""
+    """Metric limits of a clip's triangulated joints."""
 
     standard_deviation_m: float = Field(default=0.10, ge=0)
     """Of a joint along an axis, median over joints [m]; 0.03 with five views."""
@@ -179,7 +179,7 @@ class ClipLimits(Record):
 
 
 class BroadcastLimits(Record):
-    """Metric limits of the calibrated broadcast camera of a clip."""
+    """Metric limits of a clip's calibrated broadcast camera."""
 
     expected_error_median_px: float = Field(default=3.0, ge=0)
     """Expected error of the pitch in the image, median over frames [px]. A painted line of 0.12

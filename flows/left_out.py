@@ -1,6 +1,6 @@
 """Static cameras that a run leaves out, and the warnings of a run.
 
-One bad camera must not end a match. A stage that finds a camera unusable reports this with its
+One bad camera must not end a run. A stage that finds a camera unusable reports this with its
 result, and every later stage is planned as if the match did not have this camera: it is in none of
 their camera lists, recipes and arrays. A stage does this in three steps:
 

@@ -86,7 +86,7 @@ def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]
 
 
 def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
-    """Return the state of a unit, and the reasons.
+    """Return a unit's state and the reasons for it.
 
     Args:
         store: the store.

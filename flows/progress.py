@@ -33,7 +33,7 @@ class Reporter:
         logger.info(text)
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
-        """Report the start of a stage, its number of units and how many must be computed."""
+        """Report that a stage starts, with the numbers of its units and of those to compute."""
         self.left, self.every = missing, max(1, math.ceil(missing / MOST_TOLD))
         logger.info("%s: %s (%d units, %d to compute)", stage, about, units, missing)
 

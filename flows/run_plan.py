@@ -220,7 +220,7 @@ class RunPlan:
         """Hold back the results of a stage that need review; return these.
 
         Args:
-            stage: a stage.
+            stage: the stage of these results.
             results: `stage/unit` to key of existing results.
         """
         held = (

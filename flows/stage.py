@@ -92,12 +92,12 @@ class Stage:
         about: text of progress lines.
         settings: the record of its settings.
         units: names of the pieces that are computed, retried and stored separately.
-        inputs: for a unit, the `stage/unit` names of its input results.
-        sources: for a unit, all data of the match folder that its result depends on.
-        previous_pass_inputs: for a unit, its further inputs from the previous iteration.
-        late_inputs: for a unit, its further inputs from its own iteration, from the second on.
+        inputs: returns the `stage/unit` names of a unit's input results.
+        sources: returns all data of the match folder that a unit's result depends on.
+        previous_pass_inputs: returns a unit's further inputs from the previous iteration.
+        late_inputs: returns a unit's further inputs from its own iteration, from the second on.
         first_pass: the first iteration that includes the stage.
-        external_inputs: for its settings, digests of the external files that they name.
+        external_inputs: returns the digests of the external files that its settings name.
         worker_tag: tag of the workers that compute it, if the cluster has any.
         leaves_out: whether its results can leave static cameras out of all later stages.
         min_cameras: static cameras that it needs after some are left out.

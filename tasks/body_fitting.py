@@ -93,7 +93,7 @@ def fit_people(
     glimpses: MonocularPoses | None = None,
     known: Mapping[int, Shape] | None = None,
 ) -> tuple[BodyModel, BodyFit]:
-    """Fit the bodies of a clip.
+    """Fit a clip's bodies.
 
     Args:
         people: people of the clip.

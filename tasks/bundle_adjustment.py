@@ -1,4 +1,4 @@
-"""Task of stage `bundle_adjustment`: joint adjustment of all static cameras of a match."""
+"""Task of stage `bundle_adjustment`: joint adjustment of a match's static cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task of stage `camera_consistency`: static cameras that are outliers to the others in a clip."""
+"""Task of stage `camera_consistency`: finds a clip's static cameras that contradict the others."""
 
 from __future__ import annotations
 

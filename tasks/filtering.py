@@ -210,7 +210,7 @@ def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) 
 
 
 def _evenly(frames: int, most: int) -> NDArray[np.int64]:
-    """Return evenly spaced frames of a clip."""
+    """Return at most `most` evenly spaced frames."""
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
 
 

@@ -146,7 +146,7 @@ def _track_people(store: Store, work: Work) -> Tracked:
             found, further, clocks = plane
             figures |= further
             warnings = (
-                f"{work.recipe.name} could not triangulate anybody: {reason.message} "
+                f"{work.recipe.name} could not triangulate any person: {reason.message} "
                 f"{len(found.person)} people are placed on the pitch from their feet, without "
                 f"joints and bodies.{clocks}",
             )
@@ -167,7 +167,7 @@ def _pitch(work: Work) -> PitchTemplate | None:
 def _feet(
     store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate
 ) -> tuple[GroundPositions, PlaneClocks]:
-    """Return where everybody stands by each camera, and the clock offsets by these places."""
+    """Return people's foot positions by camera, and the clock offsets estimated from them."""
     positions = locate_feet(
         clip.cameras,
         clip.keypoints[:],

@@ -38,7 +38,7 @@ def triangulation(work: Work) -> str:
 
 
 def load_triangulation_settings(store: Store, work: Work, clip: str) -> TriangulationSettings:
-    """Return the settings of the first triangulation of a clip."""
+    """Return the settings of a clip's first triangulation."""
     match_id, key = work.recipe.match_id, work.recipe.inputs[f"triangulation/{clip}"]
     recipe = store.manifest(match_id, "triangulation", clip, key).recipe
     return TriangulationSettings.model_validate(recipe.settings)

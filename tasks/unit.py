@@ -174,7 +174,7 @@ def require_registered(path: Path, sha256: str) -> None:
 
 
 def figures_of(report: Record, camera_ids: Sequence[str]) -> dict[str, float]:
-    """Return a stage's report as metrics of its result; a value per camera is `figure.camera`."""
+    """Return a stage's report as metrics of its result; a value per camera is `metric.camera`."""
     figures: dict[str, float] = {}
     for name, value in report:
         per_camera = isinstance(value, tuple)

@@ -77,7 +77,7 @@ def statistics(
     )
     if found.subjects_per_frame is not None and found.speed_m_s is not None:
         line(
-            f"{found.subjects_per_frame:.1f} people in a frame, {found.speed_m_s:.1f} m/s, "
+            f"{found.subjects_per_frame:.1f} people per frame, {found.speed_m_s:.1f} m/s, "
             f"trajectories up to {found.longest_trajectory_m or 0.0:.0f} m"
         )
     for written in (picture, page):

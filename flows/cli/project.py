@@ -45,7 +45,7 @@ def init(
 
 
 def status(
-    match: Annotated[str | None, typer.Argument(metavar="[MATCH]", help="Id of a match.")] = None,
+    match: Annotated[str | None, typer.Argument(metavar="[MATCH]", help="Match id.")] = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:

@@ -80,7 +80,7 @@ def run(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the missing and stale results of a match, and nothing else.
+    """Compute a match's missing and stale results, and nothing else.
 
     Example: worldpose run matches/tiny --set triangulation.min_views=3
     """
@@ -309,7 +309,7 @@ def _total(record: RunRecord, stage: str, name: str) -> float:
 
 
 def _last_bodies(record: RunRecord) -> dict[str, float]:
-    """Return the metrics of the bodies of all clips, `unit.figure`, refitted ones if available."""
+    """Return the body metrics of all clips as `unit.metric`, of refitted bodies if available."""
     found: dict[str, float] = {}
     for stage in ("body_fitting", "refitting"):
         for unit, figures in record.figures.items():

@@ -156,7 +156,7 @@ def serve(
         login = "/login" if token else f"/login#token={access.token}"
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")
-        line(f"figures        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
+        line(f"metrics        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
         line("Ctrl-C ends it; the next start resumes")
 
     serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
@@ -184,6 +184,6 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
     for finding in [] if as_json else findings:
         line(f"{'ok' if finding.is_well else 'UNHEALTHY':<10}{finding.part}: {finding.state}")
         if not finding.is_well:
-            line(f"          mend: {finding.mend}")
+            line(f"          fix: {finding.mend}")
     if not all(finding.is_well for finding in findings):
         raise typer.Exit(1)

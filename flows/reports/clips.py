@@ -128,7 +128,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
 
 
 def clip_scene(run: Run, match: Match, clip: str) -> Scene:
-    """Return the 3D scene of a clip, with the broadcast camera if it is known in all frames."""
+    """Return a clip's 3D scene, with the broadcast camera if it is known in all frames."""
     tracks = joint_tracks(run, clip)
     broadcast = broadcast_cameras(run).get(clip)
     if broadcast is not None:

@@ -48,7 +48,7 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
 
 
 def clip_title(clip: str) -> str:
-    """Return the heading of a clip."""
+    """Return a clip's heading."""
     return "The clip" if clip == "clip" else f"Clip {clip}"
 
 
@@ -100,7 +100,7 @@ def clip_positions(run: Run, clip: str) -> Positions:
 
 
 def bodies_unit(run: Run, clip: str) -> str:
-    """Return the best bodies of a clip, as `stage/unit`, whether or not they exist."""
+    """Return the name of a clip's best bodies, as `stage/unit`, whether or not they exist."""
     first, again = (f"{stage}/{clip}" for stage in BODY_STAGES)
     return again if again in run else first
 
@@ -173,6 +173,6 @@ def broadcast_cameras(run: Run) -> dict[str, Camera]:
 
 
 def broadcast_unit(run: Run, clip: str) -> str:
-    """Return the best broadcast camera of a clip, as `stage/unit`."""
+    """Return the name of a clip's best broadcast camera, as `stage/unit`."""
     pooled = f"broadcast_pooling/{clip}"
     return pooled if pooled in run else f"broadcast_calibration/{clip}"

@@ -64,7 +64,7 @@ class Change:
 
 @dataclass(frozen=True)
 class SubjectChange:
-    """Metrics of a camera, clip, player or the match in two runs.
+    """Metrics of one camera, clip, player or the match in two runs.
 
     Attributes:
         kind: kind of the subject.
@@ -161,7 +161,7 @@ def _order(subject: Subject) -> tuple[int, list[str | int]]:
 
 
 FRAMES: Final = 50
-"""Frames whose positions are compared, spread over a clip, so that briefly close people differ."""
+"""Compared frames, spread over the clip, so that people who are close only briefly differ."""
 NEAR: Final = 1.0
 """Maximum mean joint distance of one person [m]: no two people stay closer for long."""
 

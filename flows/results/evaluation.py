@@ -74,8 +74,9 @@ def score(
         reference: a joints file, a folder with `joints.npz`, `cameras/` or both, or a C3D or TRC
             file of markers, which is aligned with the prediction in time and space.
         project: project with the runs of matches.
-        run_id: number of the run, for a match.
-        stage: stage whose joints are scored, for a match; None = the last one with joints.
+        run_id: number of the match's run; only if `prediction` is a match.
+        stage: stage whose joints are scored if `prediction` is a match; None = the last one with
+            joints.
         fps: frames per second; None = the match's, if there is one.
         match_in: reference camera in whose image tracks are matched (E3).
         marker_map: YAML file that maps markers to joints; None = markers have the joints' names.

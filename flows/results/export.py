@@ -261,7 +261,7 @@ def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
 
 def export_recording(origin: Origin, out: Path) -> list[Path]:
     """Write `rerun/<clip>.rrd` for the rerun viewer."""
-    # Imported here: it loads matplotlib's colours, which takes half a second.
+    # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.rerun_recording import write_recording
 
     written = []
@@ -282,7 +282,7 @@ def export_recording(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_positions(origin: Origin, out: Path) -> list[Path]:
-    """Write `positions/<clip>.csv`: everybody on the pitch, triangulated or by the feet alone."""
+    """Write `positions/<clip>.csv`: people on the pitch, triangulated or placed by their feet."""
     written = []
     for clip in origin.clips:
         written.append(out / "positions" / f"{clip}.csv")

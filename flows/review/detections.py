@@ -131,7 +131,7 @@ def stored_people(store: Store, match: Match, name: str) -> tuple[xr.Dataset, st
 def _open_stored(
     store: Store, match: Match, camera: str, frame: int
 ) -> tuple[xr.Dataset, list[JsonValue]]:
-    """Return the result with a frame of a camera, and the edits of that frame that it contains."""
+    """Return the result that contains one frame of one camera, and its edits of that frame."""
     stored = _result(store, match, results_of(store, match, camera, frame)[0])
     here = [each for each in stored.edits if isinstance(each, dict) and each["frame"] == frame]
     return stored.result, list(here)
@@ -139,7 +139,7 @@ def _open_stored(
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """Stored detections of a camera.
+    """One camera's stored detections.
 
     Attributes:
         result: without corrections if that version is stored.

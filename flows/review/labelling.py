@@ -56,7 +56,7 @@ def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, NDArray[n
                 if shape is not None and picture.shape != shape:
                     raise InputError(
                         str(video),
-                        expected=f"pictures of {shape[1]} x {shape[0]} as in the videos before",
+                        expected=f"frames of {shape[1]} x {shape[0]}, as in the previous videos",
                         found=f"{picture.shape[1]} x {picture.shape[0]}",
                         todo="Label videos of another size in a separate folder.",
                     )

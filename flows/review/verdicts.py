@@ -51,7 +51,7 @@ class Review:
 
 
 def reviews_of(match: Match, latest: RunRecord | None) -> list[Review]:
-    """Return all review requests of a match, first to last.
+    """Return all of a match's review requests, first to last.
 
     Args:
         match: with its journal.

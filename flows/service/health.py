@@ -113,7 +113,7 @@ def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
         is_refused = problem.endswith(" 401")
         mend = f"Set {variable} as it was when the service began." if is_refused else ""
-        yield Finding("deployments", False, problem, mend or "Mend prefect first.")
+        yield Finding("deployments", False, problem, mend or "Fix prefect first.")
         return
     offered = {each["name"] for each in _flows(serving, deployments, ask)}
     missing = set(FLOWS) - offered

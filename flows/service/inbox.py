@@ -257,7 +257,7 @@ MAX_DEATHS: Final = 2
 """Processes that end during the intake of an arrival before it is refused."""
 
 Begin = Callable[[Match, Arrival], str]
-"""Starts a run for a match, only once however often it is called; returns the run's Prefect id."""
+"""Starts a match's run, only once however often it is called; returns the run's Prefect id."""
 
 
 def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
@@ -287,7 +287,7 @@ def take_in(
         state: holds the known state of the inbox.
         inbox: the folder.
         quiet: time without changes after which an arrival is complete [s].
-        begin: starts a run for a match.
+        begin: starts a match's run.
     """
     decided = []
     with state.only_one("arrivals", wait=True):

@@ -27,7 +27,7 @@ class UnitSummary:
     """One unit of a match's latest run.
 
     Attributes:
-        unit: its name within the stage: a camera, a clip.
+        unit: its name within the stage, often the id of a camera or clip.
         state: done; waiting for review; failed; blocked by a unit that is not done.
         seconds: computation time [s]; None if there is no result.
         figures: its quality metrics.

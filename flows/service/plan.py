@@ -81,7 +81,7 @@ class ServePlan(Record):
 
     @property
     def match_deployment(self) -> str:
-        """Prefect's name of the deployment that processes a match."""
+        """Name of the Prefect deployment that processes matches."""
         return f"match/{self.name}"
 
     @property

@@ -146,7 +146,7 @@ def _cell(units: Sequence[UnitSummary]) -> str:
 
 
 def _details(match: MatchStatus) -> str:
-    """Render every camera and clip of a match, stage by stage."""
+    """Render a match's units, stage by stage."""
     rows = "".join(
         f"<tr><td>{escape(stage.replace('_', ' '))}</td><td>{escape(unit.unit)}</td>"
         f'<td class="{unit.state}">{unit.state}</td>'

@@ -12,7 +12,7 @@ from worldpose.detection import DetectionSettings, weights_of
 
 
 def seen_by(match: Match, camera_id: str, clip_id: str) -> str:
-    """Return the result with a static camera's detections in a clip, given or detected."""
+    """Return the result with a static camera's detections in one clip, given or computed."""
     if camera_id in match.folder.detections:
         return f"ingest/{camera_id}"
     return f"detection/{detection_unit(camera_id, clip_id)}"

@@ -55,8 +55,8 @@ def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> 
     Args:
         run: names of the run's results, as `stage/unit`.
         match: the match.
-        camera_id: a static camera.
-        clip_id: a clip.
+        camera_id: the static camera.
+        clip_id: the clip.
     """
     again = detection.again(match, camera_id, clip_id)
     found = [name for name in again if name in run]

@@ -41,7 +41,7 @@ def found_again(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
-    """Return every static camera, and its detections in a clip."""
+    """Return the results with every static camera and its detections in one clip."""
     cameras = [camera.id for camera in match.folder.spec.static_cameras]
     known = (f"static_calibration/{camera}" for camera in cameras)
     return (*detection.seen_by_cameras(match, clip_id), *known)

@@ -57,7 +57,7 @@ class Access:
         return f"worldpose_review_{self._sign('cookie')[:8]}"
 
     def session(self, who: str, now: float | None = None) -> str:
-        """Return a new session of a person, as the cookie's value."""
+        """Return a new session for `who`, as the cookie's value."""
         until = (time.time() if now is None else now) + SESSION_SECONDS
         content = json.dumps({"who": who, "until": until, "nonce": secrets.token_hex(8)})
         packed = base64.urlsafe_b64encode(content.encode()).decode().rstrip("=")

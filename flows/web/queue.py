@@ -152,7 +152,7 @@ def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any
 
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
-    """Return a clip, and its broadcast key frames: clicked, and those to click next."""
+    """Return a clip with its broadcast key frames: the clicked ones, and those to click next."""
     picked = match.folder.key_frames.get(clip)
     latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")

@@ -45,7 +45,7 @@ class SceneKind:
         exposure: logarithm of the images' brightness [1].
         blur: of the lens [px].
         noise: of the sensor [levels of 255].
-        movements: probabilities of a match, a corner, wandering people, and crossing paths [1].
+        movements: probabilities of match play, a corner, wandering people, and crossing paths [1].
     """
 
     first_seed: int

@@ -130,7 +130,7 @@ def calibrate_broadcast(
 
     Raises:
         InputError: the clip has cuts, or no key frame is usable.
-        DegenerateError: the evidence does not determine a frame.
+        DegenerateError: the evidence does not determine the camera of every frame.
 
     Note:
         M1 to M6; paper section "Broadcasting Camera Calibration" and its supplement.

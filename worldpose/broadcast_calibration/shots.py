@@ -40,14 +40,14 @@ class ProgrammeSettings(Record):
     """Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
     replay."""
     min_duration_s: float = Field(default=4.0, ge=1e-6, le=1000)
-    """Minimum duration of a clip [s]."""
+    """Minimum clip duration [s]."""
     min_grass_share: float = Field(default=0.5, gt=0, lt=1)
     """Minimum median share of grass in frames of a main camera [1]."""
     max_person_height: float = Field(default=0.35, ge=1e-6, le=100)
     """Maximum median height of the tallest region on the grass, in image heights [1]: people are a
     tenth in a main camera, half and more in other cameras."""
     min_pan: float = Field(default=0.25, ge=0, le=100)
-    """Minimum pan of a clip, in image widths [1]: 7 degrees at a usual focal length."""
+    """Minimum pan per clip, in image widths [1]: 7 degrees at a usual focal length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class _Course:
     right: float = 0.0
 
     def look(self, picture: Image) -> None:
-        """Record the grass share and the tallest region of a frame."""
+        """Record one frame's grass share and tallest region."""
         grass, tallest = grass_and_people(picture)
         if len(self.grass) % self.every == 0:
             self.pictures.append(picture)
@@ -111,7 +111,7 @@ def find_shots(
     fps: float,
     settings: ProgrammeSettings = ProgrammeSettings(),  # noqa: B008
 ) -> Iterator[Shot]:
-    """Yield the shots of a programme in order, each with the reasons against it as a clip.
+    """Yield the shots of a programme in order, each with the reasons to reject it.
 
     One pass in bounded memory. Simple features select shots of the main camera: grass, the size of
     people, a pan, and the wipes about replays; a person confirms the selection.

@@ -78,7 +78,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Cost, gradient and Gauss-Newton matrix at a camera.
+    """Cost, gradient and Gauss-Newton matrix, linearized at one camera estimate.
 
     Attributes:
         cost: half the sum of losses and squares.
@@ -110,7 +110,7 @@ class Solution:
 
 
 def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equations:
-    """Return cost, gradient and matrix of a problem at a camera.
+    """Return cost, gradient and Gauss-Newton matrix of a problem, linearized at `camera`.
 
     Args:
         camera: all frames.

@@ -53,7 +53,7 @@ def compute_uncertainty(
     """Return the covariance of a solution, marginalized over paint errors.
 
     The inverse of the system covers noise that is independent per sample. The error of a piece of a
-    marking, or of a person, lasts for the whole clip and does not average out: the function
+    marking or of a person lasts for the whole clip and does not average out: the function
     propagates the remaining gradient of each such source to the solution and adds it, which makes
     the covariance too large by a factor of two without such errors. A shift of all lines in the
     image, or of all keypoints of all people, leaves no gradient, since the camera follows it: the

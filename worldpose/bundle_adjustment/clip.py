@@ -1,4 +1,4 @@
-"""Input of bundle adjustment: a clip, its most informative frames (B1), and their keypoints."""
+"""Input of bundle adjustment: a clip's most informative frames (B1) and their keypoints."""
 
 from __future__ import annotations
 

@@ -202,13 +202,14 @@ def common_motion(before: Floats, after: Floats) -> Similarity:
 
 _SIZE: Final = len(PARAMETERS)
 _LIMIT: Final = 4.0
-"""Median squared error, over the stated variance of noise and calibration, from which the others'
-people place a camera [1]: twice the stated error, as for one correct camera in thirty."""
+"""Median squared error, over the stated variance of noise and calibration, from which on a camera
+is estimated again from the other cameras' people [1]: twice the stated error, as for one correct
+camera in thirty."""
 _MIN_STEP: Final = 9.0
-"""Squared step to that place in stated standard deviations, per parameter, from which its
+"""Squared step to that estimate in stated standard deviations, per parameter, from which on the
 calibration is distrusted [1]: three of them in every direction."""
 _VARIANCE_FACTOR: Final = 16.0
-"""Factor on the variances of a camera during this placement [1]: people outweigh the prior where
+"""Factor on the variances of a camera during this estimate [1]: people outweigh the prior where
 they carry information; elsewhere the camera stays."""
 _SCALES: Final = (30.0, 3.0)
 """Scales of the loss, one after the other [standard deviations]: the first allows a far step."""

@@ -28,8 +28,8 @@ from worldpose.static_calibration import step_camera
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
 _MIN_SHARE: Final = 0.1
-"""Share of the weakest direction from which a message names a camera, relative to an equal share of
-all cameras [1]."""
+"""Minimum share of a camera in the weakest direction for a message to name it, relative to an equal
+share of all cameras [1]."""
 
 
 class SolverSettings(Record):

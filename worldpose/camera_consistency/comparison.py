@@ -67,7 +67,7 @@ SAME_PIXELS: Final = 1.5
 SAME_SHARE: Final = 0.015
 """The same as a share of a person's height in the image."""
 UNCERTAIN: Final = 2.0
-"""Factor on the standard deviation of a camera's rays that widens the gate around a person."""
+"""Factor on the standard deviation of a camera's rays that widens the gate around each person."""
 IN_VIEW: Final = 0.7
 """Share of a person's joints in the image from which on a camera should detect the person."""
 

@@ -42,7 +42,7 @@ LENGTH_UNITS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A possible fault of a camera, represented by its correction.
+    """A possible camera fault, represented by its correction.
 
     Attributes:
         kind: of the fault.

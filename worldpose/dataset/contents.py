@@ -239,7 +239,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
 def _sources(
     folder: Path, clip: str, clips: tuple[str, ...], body: Callable[[str | None], BodyModel]
 ) -> tuple[list[PointSource], list[Finding], tuple[int, ...]]:
-    """Return the 3D points of every file of a clip, the reader's findings, and person ids."""
+    """Return the 3D points of every file of one clip, the reader's findings, and person ids."""
     sources: list[PointSource] = []
     findings: list[Finding] = []
     ids: tuple[int, ...] = ()

@@ -28,7 +28,7 @@ class CheckSettings(Record):
     max_ground_m: float = Field(default=0.13, ge=0, le=100)
     """Maximum median height of the lower foot [m]: heels and toes are some cm above the ground."""
     bounds_m: tuple[Positive, Positive] = (65.0, 46.0)
-    """Maximum |x| and |y| of a person [m]: the pitch of 105 x 68 m and 12 m around it."""
+    """Maximum |x| and |y| of people [m]: the pitch of 105 x 68 m and 12 m around it."""
     min_plausible_share: Share = 0.9
     """Minimum share of bodies near the ground, head up, within the bounds [1]."""
     max_speed_m_s: Positive = 13.0

@@ -76,10 +76,10 @@ intersection over union]."""
 KNOWN_PERSON_IOU: Final = 0.7
 """A box that overlaps a detected person more is that person [1, intersection over union]."""
 MIN_SECOND_CROP_SCORE: Final = 0.15
-"""Below this product of fit and surest keypoints a result gets no second crop [1]."""
+"""Minimum product of fit and surest keypoints at which a result gets a second crop [1]."""
 MIN_OCCLUDED_SCORE: Final = 0.4
-"""From this product on a result is a person [1]. In scenes like those of training, one in five of
-the results kept is a new person; of detector boxes with such scores, one in four is."""
+"""Minimum product at which a result counts as a person [1]. In scenes like those of training, one
+in five of the results kept is a new person; of detector boxes with such scores, one in four is."""
 ONE_PERSON_IOU: Final = 0.5
 """Two occluded people that overlap more are one [1, intersection over union]."""
 UNSEEN_SCORE: Final = 0.3

@@ -142,7 +142,7 @@ class Place:
 
 
 class PeopleFinder:
-    """Detectors, an estimator and settings, for the videos of a match.
+    """Detectors, an estimator and settings, for a match's videos.
 
     Attributes:
         report: of the last video.

@@ -58,9 +58,9 @@ class DetectionSettings(Record):
     view_overlap: float = Field(default=0.25, ge=0, lt=0.9)
     """Share of a view that its neighbour shows too [1]; a person of that size is whole in one."""
     high_score_threshold: float = Field(default=0.4, gt=0, lt=1)
-    """A box from this score on is a person, and may begin a track [1]."""
+    """Minimum score of a box that is a person and may begin a track [1]."""
     low_score_threshold: float = Field(default=0.1, gt=0, lt=1)
-    """A box from this score on is a person where a track predicts one (ByteTrack's second pass)."""
+    """Minimum score of a box that is a person if a track predicts one (ByteTrack's second pass)."""
     track_buffer_frames: int = Field(default=25, ge=1, le=10000)
     """Time after which an unseen track ends [frame]."""
     max_gap_frames: int = Field(default=8, ge=0, le=1000)

@@ -116,8 +116,8 @@ def _starts(length: int, view: int, overlap: float) -> list[int]:
 
 
 def _cut(image: Image, views: Sequence[View], size: tuple[int, int]) -> list[Image]:
-    """Return each view of a frame, filled with grey beyond the frame's border."""
-    import cv2  # late: it takes a fifth of a second, and planning a run needs none of it
+    """Return each view of one frame, filled with grey beyond the frame's border."""
+    import cv2  # late: it takes 0.2 s, and planning a run does not need it
 
     scaled: dict[float, Image] = {}
     cut = []

@@ -194,7 +194,7 @@ class ReferenceSettings(Record):
     step_s: float = Field(default=0.2, gt=0)
     """Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
     match_gate_m: float = Field(default=1.0, gt=0)
-    """Maximum mean joint distance of a match after alignment [m], as in the evaluation."""
+    """Maximum mean joint distance of matched persons after alignment [m], as in the evaluation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,7 @@ def identity_scores(
         distances: (frames, true persons, predicted persons) [m]; infinite where either is absent.
         true_exists: (frames, true persons).
         predicted_exists: (frames, predicted persons).
-        gate: maximum distance of a match [m].
+        gate: maximum distance between matched persons [m].
 
     Note:
         IDF1: Ristani et al., ECCV-W 2016. Switches and fragmentations: Bernardin and Stiefelhagen,
@@ -214,7 +214,7 @@ def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int6
 
     Args:
         distances: (frames, true persons, predicted persons) [m].
-        gate: maximum distance of a match [m].
+        gate: maximum distance between matched persons [m].
     """
     match = np.full(distances.shape[:2], -1, dtype=np.int64)
     costs = np.minimum(distances, gate)
@@ -232,7 +232,7 @@ def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]
 
     Args:
         overlap: (frames, true persons, predicted persons) intersection over union [1].
-        least: minimum overlap of a match [1].
+        least: minimum overlap of matched boxes [1].
     """
     frames, true, predicted = overlap.shape
     match = np.full((frames, true), -1, dtype=np.int64)
@@ -298,7 +298,7 @@ _ROUNDS: Final = 3
 def register_world(
     predicted: NDArray[np.float64], true: NDArray[np.float64], gate: float
 ) -> Similarity | None:
-    """Return the similarity that matches most predicted people to true ones, None without a match.
+    """Return the similarity that matches most predicted people to true ones, None if none match.
 
     Every pair of a predicted and a true person gives a candidate, from their whole paths. The
     candidate with the least sum of distances from true to predicted people, each clipped at the
@@ -307,7 +307,7 @@ def register_world(
     Args:
         predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
         true: (frames, true persons, joints, 3) [m]; NaN where missing.
-        gate: maximum distance of a match, after the motion [m].
+        gate: maximum distance between matched persons after the motion [m].
     """
     shared = np.flatnonzero(_any_joint(predicted) & _any_joint(true))
     if not len(shared):

@@ -197,7 +197,7 @@ def drift_per_meter(
     Args:
         errors: (frames, persons, joints) [m]; NaN where missing.
         lengths: (persons,) path lengths [m].
-        min_length: minimum path length of a person [m].
+        min_length: minimum path length per person [m].
 
     Note:
         E1. The ratio of the published columns does not give the published drift, so that the drift

@@ -11,8 +11,8 @@ class EvaluationSettings(Record):
     """Thresholds for matches, correct limbs and visible joints."""
 
     match_gate_m: float = Field(default=1.0, ge=1e-6, le=100)
-    """Maximum mean joint distance of a match [m]: more than the error of a poor reconstruction,
-    less than the distance between two players without contact."""
+    """Maximum mean joint distance of matched persons [m]: more than the error of a poor
+    reconstruction, less than the distance between two players without contact."""
     pcp_alpha: float = Field(default=0.5, ge=1e-6, le=100)
     """Maximum mean error of a correct limb's ends, as a share of its length [1]: the value of the
     published PCP3D results."""

@@ -52,7 +52,7 @@ def write_moving_camera(path: Path, camera: Camera) -> None:
 
     Args:
         path: the file.
-        camera: a batch (frames,); NaN marks a frame without a camera.
+        camera: a batch (frames,); NaN where a frame has no camera.
     """
     intrinsics = np.zeros((len(camera.focal), 3, 3))
     intrinsics[:, (0, 1), (0, 1)] = camera.focal
@@ -68,7 +68,7 @@ def write_moving_camera(path: Path, camera: Camera) -> None:
 def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camera:
     """Read the camera of a file: a single one if it has one row, else a batch (frames,).
 
-    NaN marks a frame without a camera.
+    The batch is NaN where a frame has no camera.
 
     Args:
         path: the file.

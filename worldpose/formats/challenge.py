@@ -60,7 +60,7 @@ def challenge_truth(model: BodyModel, poses: BodyParameters, camera: Camera) -> 
     Args:
         model: body model of the parameters.
         poses: (persons, frames).
-        camera: (frames,); NaN marks a frame without a camera.
+        camera: (frames,); NaN where a frame has no camera.
     """
     persons, frames = poses.batch_shape
     points = fold_keypoints(model, BODY25)
@@ -109,7 +109,7 @@ Edition = Literal[2025, 2026]
 SUBMISSION: Final = "submission.npz"
 """Member of a submission's zip."""
 KINDS: Final = {"boxes": (4,), "skel_2d": ("points", 2), "skel_3d": ("points", 3)}
-"""Arrays of a clip, and their dimensions after frames and persons."""
+"""Arrays per clip, and their dimensions after frames and persons."""
 
 
 def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None:

@@ -3,7 +3,7 @@
 Per person: `image_id`, the frame index; `keypoints`, x y c of the 17 COCO joints, where c is the
 confidence in 0..1 (in a data set it may be COCO's visibility 0, 1, 2) and 0 means missing; `bbox`
 (x y width height) and `score` are optional: the defaults are the box of the found joints and their
-mean confidence. People keep the order of the file within a frame.
+mean confidence. Within each frame, people keep the file's order.
 
 Reader and writer of 2D poses as npz: the arrays of `KeypointDetections`, faster than JSON.
 
@@ -62,7 +62,7 @@ def read_coco_results(path: Path) -> KeypointDetections:
 
     Raises:
         InputError: with file, result and joint: unreadable, another number of joints, NaN, a
-            confidence outside 0..1, no frame index, or too many people in a frame.
+            confidence outside 0..1, no frame index, or too many people per frame.
     """
     items = JsonItems(path, "annotations", JSON_BYTES)
     batches = [_read_batch(path, results, first) for first, results in _batches(path, items)] or [

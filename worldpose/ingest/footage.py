@@ -128,7 +128,7 @@ def read_footage(
         clips: id, first match frame and number of frames of each clip.
 
     Raises:
-        InputError: no video, another size or rate, or no frame of a clip.
+        InputError: no video, another size or rate, or a clip of which it has no frame.
     """
     index = index_video(path)
     if index.size != image_size:
@@ -227,7 +227,7 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
 
 def write_still(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write an image (height, width, 3), RGB, as PNG; equal images give equal bytes."""
-    import cv2  # late: it takes a fifth of a second, and few commands open an image
+    import cv2  # late: it takes 0.2 s, and few commands open an image
 
     path.parent.mkdir(parents=True, exist_ok=True)
     _, content = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -32,9 +32,9 @@ class MatchFolder:
         folder: path of the folder as given.
         spec: match.yaml.
         calibrations: given static cameras by id; may lack some.
-        detections: given 2D poses, by id of a static camera or of a clip (its broadcast camera).
+        detections: given 2D poses, by id of the static camera or clip (its broadcast camera).
         pitch: the surveyed or standard pitch; None without a pitch.
-        videos: video file or folder of images, by id of a static camera or of a clip.
+        videos: video file or folder of images, by id of the static camera or clip.
         clicked: clicked markings, by id of a static camera; may lack some.
         stills: one image, by id of a static camera; may lack some.
         key_frames: clicked key frames of the broadcast camera, by id of a clip; may lack some.

@@ -22,9 +22,9 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     """Return the match with the SHA-256 of its files, and its identity.
 
     The registration covers match.yaml, calibration.toml, the pitch file, videos, stills,
-    detections, estimates and annotations; `reference/` is not part of a match. The identity covers
-    only the paths and contents of videos, detections and pitch, so that neither the folder's name
-    nor an edited click, still, roster, estimate or calibration changes it.
+    detections, estimates and annotations; `reference/` is not part of the match. The identity
+    covers only the paths and contents of videos, detections and pitch, so that neither the
+    folder's name nor an edited click, still, roster, estimate or calibration changes it.
 
     Args:
         match: as read by `read_match`.

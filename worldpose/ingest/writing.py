@@ -31,12 +31,12 @@ from worldpose.ingest.validation import require_local
 
 @dataclass(frozen=True)
 class MatchAnnotations:
-    """Clicked markings of a match, written to `annotations/`."""
+    """A match's clicked markings, written to `annotations/`."""
 
     clicked: Mapping[str, ClickedMarkings] = field(default_factory=dict)
-    """Clicks in one image, by id of a static camera."""
+    """Clicks in one image, by static camera id."""
     key_frames: Mapping[str, KeyFrames] = field(default_factory=dict)
-    """Clicked key frames of the broadcast camera, by id of a clip."""
+    """Clicked key frames of the broadcast camera, by clip id."""
 
 
 def write_match(

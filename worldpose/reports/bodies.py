@@ -37,7 +37,7 @@ _FACING: Final = 0.25
 
 @dataclass(frozen=True, eq=False)
 class BodyTracks:
-    """Bodies of all people in the frames of a clip."""
+    """Bodies of all people in a clip's frames."""
 
     frames: NDArray[np.int64]
     """(frames,) match frames."""

@@ -1,4 +1,4 @@
-"""Plots of a broadcast camera over a clip, with uncertainty."""
+"""Plots of a clip's broadcast camera over time, with uncertainty."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def plot_camera_course(
     covariance: Floats,
     before: Camera | None = None,
 ) -> bytes:
-    """Return a PNG of focal length, pan, tilt, roll, k1 and k2 over a clip.
+    """Return a PNG of a clip's focal length, pan, tilt, roll, k1 and k2 over time.
 
     Bands are two standard deviations to either side; frames without a camera stay empty.
 
@@ -126,7 +126,7 @@ def plot_before_after(
     seen: Floats,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of a person, their surroundings and the markings in two camera estimates.
+    """Return a PNG of one person, their surroundings and the markings in two camera estimates.
 
     Crosses are detected keypoints, which are the same in both.
 

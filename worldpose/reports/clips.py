@@ -263,7 +263,7 @@ class ImageDetections:
     keypoints: NDArray[np.floating]
     """(detections, 17, 2) [px]."""
     used: NDArray[np.integer]
-    """Indices of the detections assigned to a person."""
+    """Indices of the detections that belong to tracked people."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, Che
     tiles = (
         (f"{found.minutes:.1f} min", f"{found.frames:,} frames"),
         (f"{len(found.clips)}", "clip" if len(found.clips) == 1 else "clips"),
-        (people, "people in a frame"),
+        (people, "people per frame"),
         (f"{found.poses:,}", "3D poses"),
         (f"{found.distance_km:.1f} km", "run and walked by all"),
         ("passed" if not wrong else f"{wrong} wrong", "check of cameras, poses and 2D"),
@@ -51,7 +51,7 @@ def counted_section(found: DataSetStatistics) -> Section:
     )
     columns = (
         "camera",
-        ">people in a frame",
+        ">people per frame",
         ">frames",
         ">poses",
         ">minutes",
@@ -131,14 +131,14 @@ def plot_statistics(statistics: DataSetStatistics) -> bytes:
     lengths = [clip.seconds for clip in statistics.clips.values()]
     figure = Figure(figsize=(14.0, 4.2), dpi=110, layout="constrained", facecolor="white")
     left, right = figure.subplots(1, 2)
-    _histogram(left, ways, "length of a player's trajectory [m]", "trajectories")
-    _histogram(right, lengths, "length of a clip [s]", "clips")
+    _histogram(left, ways, "trajectory length per player [m]", "trajectories")
+    _histogram(right, lengths, "clip length [s]", "clips")
     people = statistics.subjects_per_frame
     figure.suptitle(
         f"{len(statistics.clips)} {'clip' if len(statistics.clips) == 1 else 'clips'}, "
         f"{statistics.minutes:.1f} min, {statistics.frames:,} frames, {statistics.poses:,} poses, "
         f"{statistics.distance_km:.1f} km"
-        + (f", {people:.1f} people in a frame" if people is not None else ""),
+        + (f", {people:.1f} people per frame" if people is not None else ""),
         color=INK,
         fontsize=12,
     )

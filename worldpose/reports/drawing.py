@@ -90,7 +90,7 @@ def style(axes: Axes) -> None:
 
 
 def person_color(person_id: int) -> str:
-    """Return the colour of a person, the same in all plots."""
+    """Return a person's colour, the same in all plots."""
     return PALETTE[person_id % len(PALETTE)]
 
 

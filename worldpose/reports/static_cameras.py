@@ -36,7 +36,7 @@ ERROR_RANGE: Final = (0.005, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Click:
-    """A clicked point, as inlier or outlier of a camera.
+    """A clicked point, as inlier or outlier of its camera.
 
     Attributes:
         name: of the pitch template.

@@ -94,7 +94,7 @@ def add_previous_value(folder: MatchFolder, edit: Edit) -> Edit:
 
     Args:
         folder: with the corrections so far.
-        edit: as given by a person.
+        edit: as entered.
     """
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit

@@ -85,7 +85,7 @@ def open_detections(
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One metric over the frames of a clip.
+    """One metric over a clip's frames.
 
     Attributes:
         title: name with unit.
@@ -140,7 +140,7 @@ HEIGHTS: Final = (-0.3, 3.2)
 """Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are
 raised in a jump."""
 DISTANCES: Final = (0.5, 300.0)
-"""Range of distances of people from a camera [m]: across the largest stadium."""
+"""Range of distances between people and cameras [m]: across the largest stadium."""
 BEGIN: Final = 33
 """Initial samples along a ray."""
 APART: Final = 12.0

@@ -154,7 +154,7 @@ def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
 def find_sighting(
     found: Identities, person: int, first: int | None = None, last: int | None = None
 ) -> Sighting | None:
-    """Return the detection with the smallest ray distance of a person, None without detections.
+    """Return a person's detection with the smallest ray distance, None without detections.
 
     Args:
         found: the identities.

@@ -101,7 +101,7 @@ class Journal:
 
 
 def read_journal(store: Store, match_id: str) -> Journal:
-    """Return the journal of a match, empty before its first entry.
+    """Return a match's journal, empty before its first entry.
 
     A damaged entry without a successor was never acknowledged, or its disk lost it: the function
     ignores it and lists it in `damage`.

@@ -112,7 +112,7 @@ def _person_boxes(camera: Camera, people: Floats) -> Floats:
 def _are_visible(
     camera: Camera, places: Floats, pixels: Floats, boxes: Floats
 ) -> NDArray[np.bool_]:
-    """Return which points (n,) are in the image and not occluded by a person."""
+    """Return which points (n,) are in the image and not occluded by people."""
     depth = camera.cam_from_world.apply(places)[:, 2]
     inside = (pixels >= BORDER) & (pixels <= camera.image_size - 1.0 - BORDER)
     x, y = pixels[:, None, 0], pixels[:, None, 1]
@@ -238,7 +238,7 @@ def click_key_frames(
     count: int,
     rng: np.random.Generator,
 ) -> KeyFrames:
-    """Return clicks in frames spread over a clip, each at a local maximum of clickable markings.
+    """Return clicks in frames spread over the clip, each at a local maximum of clickable markings.
 
     Args:
         cameras: the true ones, a batch (frames,).

@@ -42,7 +42,7 @@ one another."""
 ACCELERATION: Final = 5.0
 """Maximum acceleration and braking by a person's own legs [m/s^2]."""
 SHOVED: Final = 20.0
-"""Maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in a tenth of a second."""
+"""Maximum in all, pushed by others [m/s^2]: a body check takes 2 m/s in 0.1 s."""
 REACTION: Final = 0.25
 """Time constant of a wished change of velocity [s]."""
 KEEN: Final = 2.5

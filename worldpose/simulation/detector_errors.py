@@ -34,7 +34,7 @@ TRUNK: Final = (5, 6, 11, 12)
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """People, or false positives, in front of a camera.
+    """People, or false positives, in front of one camera.
 
     Attributes:
         joints: (frames, persons, 17, 3) [m], world; NaN where absent.
@@ -409,7 +409,7 @@ POSTURES: Final = 12.0
 def draw_false_positives(
     scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
 ) -> Bodies:
-    """Return still human figures that appear and vanish at random places on and around the area.
+    """Return still false people that appear and vanish at random places on and around the area.
 
     Args:
         scenario: area and the rates of false positives.
@@ -434,7 +434,7 @@ def draw_false_positives(
     )
     joints[..., :2] += place[:, :, None]
     joints[..., 2] += pitch.height(place[..., 0], place[..., 1])[..., None]
-    # A figure keeps the posture of its appearance.
+    # A false person keeps the posture of its appearance.
     since = np.maximum.accumulate(np.where(appeared, np.arange(frames)[:, None], 0), axis=0)
     joints = np.take_along_axis(joints, since[..., None, None], axis=0)
     joints[~on] = np.nan

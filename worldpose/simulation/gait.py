@@ -392,7 +392,7 @@ def stride_cycle(path: GroundPath, phase: float) -> Floats:
     A standing person rests a quarter of the way between the two, with both feet on the ground.
 
     Args:
-        path: of a person.
+        path: one person's path.
         phase: stride at the start of the path [1], for a person who never stands.
     """
     pace = _pace(path)

@@ -343,7 +343,7 @@ def to_bytes(light: Singles) -> Image:
 
 
 def sensor_grain(venue: Venue, camera: Camera) -> NDArray[np.int8]:
-    """Return noise (height + 64, 3 (width + 64)) of a camera, the same for all colours."""
+    """Return a camera's noise (height + 64, 3 (width + 64)), the same for all colours."""
     width, height = (int(n) for n in camera.image_size.reshape(-1, 2)[0])
     center = np.abs(np.rint(1e3 * camera.center.reshape(-1, 3)[0])).astype(int)
     rng = np.random.default_rng([venue.seed, 3, *center])

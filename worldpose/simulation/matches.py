@@ -120,7 +120,7 @@ def render_frame(
         cast: the people.
         opened: their surfaces when the shutter opens.
         closed: their surfaces when it closes; None = no motion.
-        frame: seeds the noise of this image of a clip.
+        frame: index of the image, which seeds its noise.
         props: things in addition to the goals.
     """
     moment = Moment(cast, opened, closed or opened, [*view.props, *props])

@@ -211,7 +211,7 @@ def read_trajectories(
         max_people: maximum number of people, in file order.
 
     Raises:
-        InputError: unreadable, wrong shapes, or no person present for a fifth of a second.
+        InputError: unreadable, wrong shapes, or no person present for 0.2 s.
     """
     xy, time, segment = _read_tracking_archive(path)
     edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(time) <= 0.0)) + 1

@@ -228,7 +228,7 @@ def render_broadcast(
 def film_broadcast(
     cameras: Camera, venue: Venue, moments: Iterable[Moment]
 ) -> Iterator[RenderedFrame]:
-    """Yield the frames of a clip, like `worldpose.simulation.matches.render_frame`.
+    """Yield a clip's frames, like `worldpose.simulation.matches.render_frame`.
 
     Args:
         cameras: a batch (frames,) with one center.

@@ -236,7 +236,7 @@ class StaticViews:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Ground truth of a match, and its detections.
+    """A match's ground truth and its detections.
 
     Attributes:
         truth: `views` counts the static cameras that have the joint in their image without an

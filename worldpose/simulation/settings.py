@@ -302,7 +302,7 @@ class ClickSettings(Record):
     window: float = Field(default=0.34, gt=0, le=1)
     """Of the image width [1]."""
     clustered_points: tuple[Count, Count] = (5, 7)
-    """Minimum and maximum number of points in such a camera [1]."""
+    """Minimum and maximum number of points per such camera [1]."""
     wrong: float = Field(default=0.2, ge=0, le=1)
     """Share of cameras with one wrong click [1]: every second of them a point with another's name,
     the other a slip."""

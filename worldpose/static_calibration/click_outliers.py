@@ -349,7 +349,7 @@ def noise_ratio(problem: Problem, row: NDArray[np.float64]) -> float:
 
 
 def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
-    """Return each click's Mahalanobis distance (n,) from its prediction by a camera.
+    """Return each click's Mahalanobis distance (n,) from the camera's prediction of it.
 
     Args:
         problem: clicks, noise and prior.
@@ -404,7 +404,7 @@ def _select_markings(
     """Return a mask of drawn markings (m,) near their projections; all where too few remain.
 
     The mask rejects markings only if the remaining clicks and markings hold most of all
-    constraints, and enough for a camera.
+    constraints, and enough to determine the camera.
     """
     evidence = problem.evidence
     off = np.abs(compute_residuals(problem, row).drawn)

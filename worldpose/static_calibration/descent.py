@@ -56,7 +56,7 @@ class Measurements(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """Normal equations at a camera, written by the kernels.
+    """Normal equations linearized at one estimate, written by the kernels.
 
     Attributes:
         information: (12, 12) of evidence and prior.

@@ -214,7 +214,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
 
 
 def has_enough_points(evidence: Evidence) -> bool:
-    """Return whether the clicked points alone can determine a camera."""
+    """Return whether the clicked points alone can determine the camera."""
     plan = evidence.points_world[:, :2]
     if len(plan) < _POINTS:
         return False

@@ -310,7 +310,7 @@ def _judge(
 ) -> tuple[InlierFit, LineRefinement] | None:
     """Return the fit to the inliers of a camera refined on lines, and stage 3 from there.
 
-    None without such a camera, or with too few inliers.
+    None if no such camera exists, or with too few inliers.
     """
     if not lines.refined:
         return None

@@ -418,7 +418,7 @@ class LineSearch:
         return replace(adjusted, residuals=residuals, weights=weights)
 
     def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return information and mean of the prior on the free parameters' step from a camera."""
+        """Return information and mean of the prior on the free parameters' step from `camera`."""
         gone = step_between(self.start.camera, camera)
         chain = step_jacobian(gone)[np.ix_(self.free, self.free)]
         information: Floats = chain.T @ self.information @ chain

@@ -192,8 +192,8 @@ def build_report(
     if abs(scale - 1.0) > _SAME:
         decisions = (
             *decisions,
-            f"clicks and drawn pixels are {scale:.2g} times as far off as stated, which "
-            "is taken for their noise",
+            f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "
+            "calibration uses this noise",
         )
     if lines is not None and not lines.refined:
         reasons.append(f"no painted lines to confirm it: {lines.reason}")

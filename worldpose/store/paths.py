@@ -128,7 +128,7 @@ def checked_name(name: str) -> str:
     try:
         return _NAME.validate_python(name)
     except ValidationError as error:
-        raise _bad_name("name of a match, stage or run", "1 to 64", name) from error
+        raise _bad_name("name of a match, stage, unit, run or pin", "1 to 64", name) from error
 
 
 def _bad_name(where: str, length: str, name: str) -> InputError:

@@ -183,7 +183,7 @@ def recipe_differences(old: Recipe, new: Recipe) -> list[RecipeDifference]:
         *_changes("module", old.code, new.code),
         *_changes("library", old.libraries, new.libraries),
     ]
-    # Digests with equal beginnings look equal when shortened; every difference must show.
+    # Digests with equal prefixes look equal when shortened; every difference must show.
     if not found and recipe_key(old) != recipe_key(new):
         found.append(RecipeDifference("recipe", "", recipe_key(old), recipe_key(new)))
     return found

@@ -77,7 +77,7 @@ def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
 
 
 def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
-    """Return all pins of a match, sorted by name."""
+    """Return all of a match's pins, sorted by name."""
     files = [entry.path.rpartition("/")[2] for entry in blobs.entries(f"pins/{match_id}")]
     names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
     pins = (read_pin(blobs, match_id, name) for name in names if is_name(name))

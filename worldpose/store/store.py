@@ -125,7 +125,7 @@ class Store:
         return None if data is None else unseal_repairable(Registration, data, where)
 
     def register(self, registration: Registration) -> None:
-        """Register a match, or replace its registration."""
+        """Register a match or replace its registration."""
         match_id = registration.spec.match_id
         self.blobs.put_new(PROJECT, seal(Project(store_format=STORE_FORMAT)))
         if self.registration(match_id) != registration:
@@ -263,11 +263,11 @@ class Store:
         write_record(self.blobs, record)
 
     def runs(self, match_id: str) -> tuple[str, ...]:
-        """Return the ids of the finished runs of a match, first to last."""
+        """Return the ids of a match's finished runs, first to last."""
         return tuple(list_runs(self.blobs, match_id)[0])
 
     def unfinished_runs(self, match_id: str) -> tuple[Reservation, ...]:
-        """Return active and killed runs of a match, first to last."""
+        """Return a match's active and killed runs, first to last."""
         _, reserved = list_runs(self.blobs, match_id)
         found = (read_reservation(self.blobs, match_id, run_id) for run_id in reserved)
         return tuple(reservation for reservation in found if reservation)

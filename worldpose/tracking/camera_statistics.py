@@ -76,7 +76,7 @@ class CameraVisibility:
         weights: Floats,
         seen: Flags,
     ) -> None:
-        """Update with the known people of a frame.
+        """Update with the known people of one frame.
 
         Args:
             joints: (n, 17, 3) [m], world; NaN where unknown, not all of one person.

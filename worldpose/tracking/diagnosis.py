@@ -211,7 +211,7 @@ def diagnose_no_people(
     ground: bool,
     births: int = 0,
 ) -> NoPeople:
-    """Return the reason why tracking found no person in a clip.
+    """Return the reason why tracking found no person in the clip.
 
     Args:
         cameras: batch (cameras,).
@@ -326,7 +326,7 @@ def _explain_missing_detections(
     """Return the reason if detections cannot be compared at all, else None.
 
     Args:
-        present: (frames, cameras), whether a camera has a usable detection in a frame.
+        present: (frames, cameras), whether the camera has a usable detection.
         detected: usable detections by camera.
         keypoints: as given.
         confidence: as given.

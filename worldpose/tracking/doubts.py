@@ -1,4 +1,4 @@
-"""Ambiguous identities in a clip, and the warning of a run about them."""
+"""A clip's ambiguous identities, and a run's warning about them."""
 
 from __future__ import annotations
 

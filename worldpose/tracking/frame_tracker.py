@@ -32,7 +32,7 @@ LEARN_EVERY = 5
 
 
 class FrameTracker:
-    """Tracker state of a clip, updated frame by frame.
+    """A clip's tracker state, updated frame by frame.
 
     Attributes:
         active: people being tracked.
@@ -215,7 +215,7 @@ class FrameTracker:
                 index[a if affinity[a, n, i] < affinity[b, n, j] else b, n] = -1
 
     def _evidence(self, sighting: Sighting, pairs: Pairs | None) -> float:
-        """Return the evidence of a sighting for a person [1].
+        """Return a sighting's weight as evidence that its person exists [1].
 
         Two views count in full if the odds are clear, not at all if the detections more likely
         belong to others, and in part otherwise.

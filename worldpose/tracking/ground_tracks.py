@@ -26,7 +26,7 @@ ACCELERATION_S: Final = 0.2
 SPEED: Final = 3.0
 """Standard deviation of the velocity of a person who appears, per axis [m/s]."""
 GATE: Final = 13.8
-"""Largest squared Mahalanobis distance of a match [1]: 99.9 % of two dimensions."""
+"""Maximum squared Mahalanobis distance of a matched detection [1]: 99.9 % of two dimensions."""
 MAX_LOST_S: Final = 1.0
 """Time after which an unseen person's track ends [s]."""
 MIN_TRACK_S: Final = 0.4
@@ -49,7 +49,7 @@ SAME_PERSON_M: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class GroundTracks:
-    """People on the pitch plane over a clip.
+    """A clip's people on the pitch plane.
 
     Attributes:
         detection_index: (frames, cameras, persons) int16, each person's detection; -1 = not seen.
@@ -143,13 +143,13 @@ def track_on_plane(
 ) -> GroundTracks:
     """Return the tracks of people by their feet (T1, without triangulation).
 
-    A Kalman filter at constant velocity predicts everybody. In every frame, each camera in turn
+    A Kalman filter at constant velocity predicts each person. In every frame, each camera in turn
     gives its detections to the predicted people by the Hungarian method; the remaining detections
     start people. A backward pass smooths each track. Tracks of two cameras that stay together are
     one person.
 
     Args:
-        positions: feet of a clip.
+        positions: the clip's foot positions.
         fps: frames per second [1/s].
         clock_s: by camera, time of its image minus time of the frame [s]; None = in step.
         pitch_size: length and width of the pitch [m].
@@ -197,7 +197,7 @@ def locate_tracks(
     """Return smoothed places of people whose detections are known.
 
     Args:
-        positions: feet of a clip.
+        positions: the clip's foot positions.
         detection_index: (frames, cameras, persons), each person's detection; -1 = not seen.
         fps: frames per second [1/s].
         clock_s: as in `track_on_plane`.
@@ -228,13 +228,13 @@ def locate_tracks(
 
 
 def _is_flag(path: _Path, pitch_size: tuple[float, float]) -> bool:
-    """Return whether a path never leaves a corner: a flag, which nets take for a person."""
+    """Return whether a path never leaves a corner: a flag, which nets mistake for people."""
     corner = np.abs(path.xy) - 0.5 * np.asarray(pitch_size)
     return bool((np.linalg.norm(corner, axis=1) < FLAG_DISTANCE).all())
 
 
 def _drop_doubles(paths: list[_Path]) -> list[_Path]:
-    """Drop paths that stay beside a longer one for all their time: a second box of one person.
+    """Drop paths that always stay close to a longer one: second boxes of the same person.
 
     Two players in a tackle have been apart before, or part after it.
     """

@@ -8,9 +8,9 @@ Bystanders are never on the pitch or near it (D2, in 3D). A single camera locate
 a metre, and given 2D poses may show any person. Several cameras locate a track to centimetres, and
 so distinguish people waiting behind the lines from players.
 
-Shadows are false tracks that follow a person, in a few of the cameras that see it. If a detector
-reports halves of two people as a third, in two cameras at once, rays may meet. A real person so
-near to another is seen by most of the cameras that see the other; a shadow is not.
+A shadow is a false track that follows a person in a few of the cameras that see the person. If a
+detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
+of the cameras that see a person also see a real person so near; they do not see a shadow.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def drop_bystanders(
     """Return the people without those who are always farther outside than `margin`.
 
     Args:
-        people: tracks of a clip.
+        people: the clip's tracks.
         pitch_size: length along x and width along y of the pitch around the origin [m]; None keeps
             all.
         margin: largest distance of a player outside of the lines [m].
@@ -146,7 +146,7 @@ def drop_shadows(people: list[Person], distance: float) -> list[Person]:
     """Return the people without those nearly always close to a person seen by far more cameras.
 
     Args:
-        people: tracks of a clip.
+        people: the clip's tracks.
         distance: between bodies, below which one may be the other's shadow [m]; 0 keeps all.
     """
     if distance <= 0.0:
@@ -212,7 +212,7 @@ def limit_people(people: list[Person], limit: int | None) -> list[Person]:
     """Return the people without those beyond the limit at any time, who have the least evidence.
 
     Args:
-        people: tracks of a clip.
+        people: the clip's tracks.
         limit: most people at once; None = any number.
     """
     if limit is None:

@@ -47,7 +47,7 @@ def estimate_plane_clocks(
     left out (jackknife), give its standard deviation.
 
     Args:
-        positions: feet of a clip.
+        positions: the clip's foot positions.
         fps: frames per second [1/s].
         pitch_size: length and width of the pitch [m].
         max_offset_s: largest offset between two cameras [s].
@@ -173,7 +173,7 @@ def _pair_tracks(a: Floats, b: Floats) -> list[tuple[int, int]]:
 
 
 def _refine(a: Floats, b: Floats, late: float, pairs: list[tuple[int, int]]) -> float:
-    """Return the change of `late` [frames] that reduces the distances, beside an affine map."""
+    """Return the change of `late` [frames] that, with an affine map, reduces the distances."""
     here, faster = _shift(b, late), _shift(b, late + 0.5) - _shift(b, late - 0.5)
     rows, values = [], []
     for i, j in pairs:

@@ -1,4 +1,4 @@
-"""The tracker: follows people through a clip, joins their tracks, assigns identities."""
+"""The tracker: follows a clip's people, joins their tracks, assigns identities."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TrackingReport(Record):
     unmatched_share: float | None
     """Share of them that belong to no tracked person; None without any."""
     mean_ray_distance_m: float | None
-    """Mean of `ray_distance` [m]; None without a match."""
+    """Mean of `ray_distance` [m]; None without matches."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def track_people(
     pitch_size: tuple[float, float] | None = None,
     people: int | None = None,
 ) -> Tracking:
-    """Return the person of every camera's detections, over a clip.
+    """Return the person to which every camera's detections belong, in all frames.
 
     In every frame, known people take detections by ray distance, confirmed people before new ones
     (T1); remaining detections are associated across views and start people (T2). A track ends when

@@ -38,7 +38,7 @@ class PeopleWindows(Record):
     height: tuple[float, float] = (28.0, 160.0)
     """Shortest and tallest people after scaling [px]."""
     aimed: float = 0.75
-    """Share of windows around a person [1]; the others lie anywhere."""
+    """Share of windows placed around people [1]; the others lie anywhere."""
     looks: AugmentationSettings = AugmentationSettings()
 
 

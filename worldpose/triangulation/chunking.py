@@ -44,7 +44,7 @@ that ends the iteration, across gaps too."""
 
 @dataclass(frozen=True, eq=False)
 class ClipModel:
-    """Noise model and clock offsets of a clip, estimated from sample frames.
+    """A clip's noise model and clock offsets, estimated from sample frames.
 
     Attributes:
         clocks: clock offsets of the cameras.

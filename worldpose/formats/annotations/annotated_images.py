@@ -80,7 +80,7 @@ class Attributes(TypedDict):
 
 
 def format_attributes(person: AnnotatedPerson) -> dict[str, str]:
-    """Return the attributes of a person, as text by name."""
+    """Return a person's attributes, as text by name."""
     given = {"detection": person.detection, "origin": person.origin, "score": person.score}
     return {name: str(value) for name, value in given.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""Baseline methods: readers for the results of other methods on a clip.
+"""Baseline methods: readers for the results of other methods on one clip.
 
 Inputs: the files that a method's own code wrote, and the body model for its poses. Outputs:
     `MethodResult`: joints, their world frame, boxes in the image.

@@ -1,4 +1,4 @@
-"""Result of a baseline method for a clip, independent of its file format and frame rate."""
+"""Result of a baseline method for one clip, independent of its file format and frame rate."""
 
 from __future__ import annotations
 
@@ -168,10 +168,10 @@ def rotation_vectors(matrices: Any) -> Floats:  # noqa: ANN401
 
 
 def resample_result(result: MethodResult, seen_fps: float, fps: float) -> MethodResult:
-    """Return a result at the frames of a clip, with linear interpolation of joints and boxes.
+    """Return a result at its clip's frames, with linear interpolation of joints and boxes.
 
-    The first images of both are simultaneous. If a person is missing in one of the two images
-    around a frame, the person is missing in the frame, too.
+    The first images of both are simultaneous. If either of the two images around a frame
+    lacks a person, the frame lacks the person, too.
 
     Args:
         result: its frames count the images of the method's input.

@@ -129,7 +129,7 @@ def _read_run(
             continue
         if row >= count:
             raise format_error(where, f"tracks below {count}, as the results have", f"{row}")
-        # A track lasts from the first to the last image with a person, visible or not.
+        # A track lasts from the first to the last image of its person, visible or not.
         seen = np.flatnonzero(mask) - start
         rows = np.arange(seen[0], min(seen[-1] + 1, length))
         joints, used = pose_track(

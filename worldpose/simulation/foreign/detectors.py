@@ -68,9 +68,9 @@ class DetectorProfile(Record):
     merged: float = 0.4
     """Share of overlaps in which two people merge into one detection [1]."""
     ghosts: float = 0.4
-    """Persistent false positives in a camera, mean number [1]: a bush, a poster."""
+    """Persistent false positives per camera, mean number [1]: a bush, a poster."""
     flashes: float = 0.03
-    """False positives of a single frame, mean number [1]."""
+    """False positives that last one frame, mean number per frame [1]."""
     duplicates: float = 0.006
     """Share of people reported twice [1]."""
     confidence: Literal["honest", "blind", "sure", "meek"] = "honest"
@@ -160,7 +160,7 @@ _STICKMAN: Final = (
     .reshape(2, 17)
     .T
 )
-"""Across and down, of a figure of height one that faces the camera."""
+"""Across and down, of a person of height one who faces the camera."""
 
 
 @dataclass(frozen=True, eq=False)
