@@ -107,7 +107,7 @@ def figures(camera: MovingCamera, true: MovingCamera, points: PointEvidence) -> 
 
 
 def by_scipy(start: MovingCamera, problem: Problem, seconds: float) -> tuple[MovingCamera, int]:
-    """Return SciPy's trust region result after about so many seconds, and its evaluations."""
+    """Return SciPy's trust region result after about `seconds`, and its number of evaluations."""
     points, prior = problem.points, problem.prior
     frames, count = len(start), len(problem.points)
     frame = points.frame

@@ -171,7 +171,7 @@ class Registration(Record):
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        """Of all files and folders at once: a video as single pictures is 180,000 files an hour."""
+        """All digests by path, cached: a video as single images has 180,000 files per hour."""
         listed: dict[str, Any] = {}
         for source in self.files:
             for end in (match.start() for match in re.finditer("/", source.path)):

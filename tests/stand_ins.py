@@ -1,4 +1,4 @@
-"""Something in the place of units' results, for tests of what is decided from their keys alone."""
+"""Placeholder results, for tests of decisions that depend on keys alone."""
 
 from datetime import UTC, datetime
 
@@ -11,7 +11,7 @@ from worldpose.store.writer import content_digest, stored_files
 
 
 def publish_stand_in(store, match, unit, files=("zarr.json",)):
-    """Publish a planned unit without computing it, of so many files as it is given names."""
+    """Publish a planned unit without computing it, with a placeholder per name in `files`."""
     folder = store.blobs.create_staging()
     for name in files:
         file = folder / name

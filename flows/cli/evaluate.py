@@ -236,7 +236,7 @@ def print_ablation(seeds: int, *, as_json: bool) -> None:
 
 
 def _is_of(row: str, how: str) -> bool:
-    """Return whether a row is triangulated this way; the first way has no name."""
+    """Return whether an ablation's row uses this triangulation; the first one has no suffix."""
     from flows.results.ablation import TRIANGULATIONS
 
     return max((end for end in TRIANGULATIONS if row.endswith(end)), key=len) == how

@@ -76,7 +76,7 @@ def import_annotations(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Take what an annotator changed in as corrections; what was exported is compared with.
+    """Import an annotator's changes as corrections, found by comparison with the export.
 
     Example: worldpose review import tiny-1 out.xml --exported to_annotate/exported.json --who Ada
     """
@@ -109,7 +109,7 @@ def convert_annotations(
     out: Annotated[Path, typer.Option(help="Output file; it must not exist.")],
     form: FormatOption = "coco",
 ) -> None:
-    """Write annotations in another format, such as labels for CVAT, or what it wrote for finetune.
+    """Convert annotations to another format, for example COCO labels to CVAT, or CVAT to COCO.
 
     Example: worldpose review convert annotations.xml --out labels.json
     """

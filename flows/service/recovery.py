@@ -75,7 +75,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
 
 
 def may_begin_again(run: FlowRun) -> bool:
-    """Return whether a run ended by no fault of its own: killed, or its machines were lost."""
+    """Return whether a run may restart: its process was killed, or its machines were lost."""
     if run.state is None or run.run_count >= MOST_BEGINNINGS:
         return False
     was_lost = LostWorkersError.__name__ in (run.state.message or "")

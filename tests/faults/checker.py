@@ -1,4 +1,4 @@
-"""Whether a store is what it must be, whatever was killed on the way to it."""
+"""Checks that a store is correct after its writers were killed."""
 
 from collections import Counter
 from datetime import timedelta
@@ -10,10 +10,10 @@ from worldpose.store.garbage import collect, plan_gc
 
 
 def problems_of(project, undisturbed):
-    """One line for each way in which a project is not an undisturbed one; none if it is.
+    """Return one line per difference between a project and an undisturbed one.
 
-    The same matches, results, bytes and latest records; nothing damaged; no unit computed for two
-    records; and all that dead writers left can be cleared away.
+    Both must have the same matches, results, bytes and latest records. Nothing may be damaged, no
+    unit computed for two records, and `gc` must clear everything that dead writers left.
     """
     store = Store.open(str(project))
     problems = [*differences(project, undisturbed), *doubled(store)]
@@ -44,7 +44,7 @@ def doubled(store):
 
 
 def half_written(project):
-    """Read what a damaged or busy project still shows."""
+    """Return damages and incomplete runs of a project that is damaged or in use."""
     if not (project / "project.json").exists():
         return []
     store = Store.open(str(project))

@@ -77,7 +77,7 @@ class Disk:
         _do("umount", "--lazy", str(self.folder))
 
     def fill(self):
-        """Nothing fits any more, not even what ends meanwhile would leave free."""
+        """Fill the disk, and keep taking the space that other processes free meanwhile."""
         try:
             with (self.folder / "ballast").open("wb") as ballast:
                 while True:
@@ -174,7 +174,7 @@ class Machines:
         self._stack.close()
 
     def keep_up(self, held=()):
-        """Begin again what has ended, but for what is held down; gives the names."""
+        """Restart the parts that ended, except those in `held`; return their names."""
         ended = [name for name, part in self.parts.items() if not (name in held or part.is_up())]
         for name in ended:
             self.parts[name].kill()

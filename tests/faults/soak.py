@@ -73,7 +73,7 @@ class Stream:
     is_over: threading.Event = field(default_factory=threading.Event)
 
     def round(self, project):
-        """Run every match until it is done, two at a time; gives seconds by match."""
+        """Run every match until it is done, two at a time; return seconds by match."""
         self.project = project
         waiting, seconds = iter(self.folders), {}
 
@@ -170,7 +170,7 @@ def disturb(stream, dice, kinds, pause, faults):
 
 
 def _strike(stream, kind, target):
-    """Do it; the parts that stay down meanwhile, None where there was nothing to strike."""
+    """Cause the fault; return the parts that it keeps down, None if it found no target."""
     machines = stream.machines
     if kind == "disk full":
         machines.small.fill()
@@ -206,13 +206,13 @@ def soak(
     between=BETWEEN,
     max_starts=MAX_STARTS,
 ):
-    """The report of so many minutes of faults, as plain values.
+    """Run matches under random faults, and return the report as plain values.
 
     Args:
-        minutes: how long matches are begun for; the last round ends all the same.
+        minutes: time during which rounds start; the last round still ends.
         seed: of the faults.
-        folder: a new one.
-        matches: of a round.
+        folder: a new folder for matches and projects.
+        matches: number per round.
         preload: a file that workers load when they begin, in which a test spoils them.
         kinds: of faults.
         between: from the end of one to the next, as a share of an undisturbed match's time.

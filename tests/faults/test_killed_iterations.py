@@ -35,7 +35,7 @@ LOOPED = ["--iterations", str(PASSES), "--workers", "2"]
 
 
 def compute_here(stage, units, work):
-    """Each unit in this process: what Prefect and Dask do for it, but for their start."""
+    """Compute each unit in this process, as a Prefect task on a Dask worker would."""
     task = task_of(stage)
     for unit, each in zip(units, work, strict=True):
         task.fn(each)
@@ -68,7 +68,7 @@ def loop(project, folder, at_commit_point):
 
 
 def loop_and_die(project, folder, skip):
-    """The loop in a copy of this process that is killed at a commit point, after so many."""
+    """Run the loop in a fork that is killed at the commit point after `skip` others."""
     visits = []
 
     def strike(point):
@@ -97,7 +97,7 @@ def short(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def undisturbed(short, tmp_path_factory):
-    """A project in which nothing went wrong, and the commit points it came to."""
+    """A project without faults, and the commit points that its loop passed."""
     project = tmp_path_factory.mktemp("undisturbed") / "project"
     visits = []
     # Here, so that copies of this process find every kernel loaded.

@@ -131,7 +131,7 @@ class MortalServer:
 
 
 def free_port():
-    """One that no client's own end can take while the server is away: below those given out."""
+    """Return a free port below the ephemeral range, so that no client takes it meanwhile."""
     for port in random.sample(range(20_000, 32_000), 100):
         with socket.socket() as end, contextlib.suppress(OSError):
             end.bind(("127.0.0.1", port))

@@ -107,7 +107,7 @@ def start_run(match, project, environment):
 
 
 def files_of(project):
-    """All files of a project but Prefect's own; those that vanish meanwhile count or not."""
+    """Return one entry per file of a project, without Prefect's; files may vanish meanwhile."""
     return [
         path
         for path, _, names in os.walk(project)

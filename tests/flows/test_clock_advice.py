@@ -19,7 +19,7 @@ def match(cameras, offset=0, clips=("clip",)):
 
 
 def figures(late, error=0.06):
-    """As filtering says them, against the mean; the errors are from another stage."""
+    """Metrics with clock offsets relative to their mean, and their standard errors [frame]."""
     mean = sum(late) / len(late)
     return {
         "triangulation/clip": {f"clock_error_frames.cam{c}": error for c in range(len(late))},

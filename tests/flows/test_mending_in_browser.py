@@ -30,7 +30,10 @@ def say(store, *edits):
 
 
 def swap(store):
-    """Two people change places from the middle of the clip on; their ids, and that frame."""
+    """Swap the tracks of two people from the middle of the clip on.
+
+    Returns the two ids, the id of the second half of the first, and the frame of the swap.
+    """
     found = identities_now(store, open_match(store, TINY), "clip").identities
     whole = [
         track.person
@@ -52,7 +55,7 @@ def swap(store):
 
 
 def misplace(store):
-    """A keypoint that several cameras see lies 60 px off in one; where, and where it was."""
+    """Move a keypoint 60 px in one of several cameras; return which one, and its old position."""
     found = identities_now(store, open_match(store, TINY), "clip").identities
     row = len(found.frame) // 3
     frame = int(found.frame[row])
@@ -69,7 +72,7 @@ def misplace(store):
 
 
 def ways(identities):
-    """Everybody's detections in all cameras and frames, whatever their ids."""
+    """Return each person's detections in all cameras and frames, regardless of ids."""
     index = identities.detection_index
     return {index[:, :, k].tobytes() for k in range(index.shape[2]) if (index[:, :, k] >= 0).any()}
 

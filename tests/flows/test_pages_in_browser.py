@@ -72,7 +72,7 @@ def served(rendered, tmp_path):
 
 
 def ground_errors(found, truth, pitch):
-    """How far off a camera puts what the true one sees on the pitch [m]."""
+    """Return a camera's ground errors at the pitch points that the true camera sees [m]."""
     x, y = np.meshgrid(np.arange(-50.0, 51.0, 2.0), np.arange(-32.0, 33.0, 2.0))
     places = np.stack([x, y, pitch.height(x, y)], axis=-1).reshape(-1, 3)
     pixels = truth.project(places)

@@ -105,7 +105,7 @@ def test_new_code_makes_what_is_computed_with_it_stale(store, monkeypatch):
 
 
 def finish(store, **changes):
-    """A later run that stands, as the first but for some of its fields."""
+    """Record a later finished run: a copy of the latest with some fields changed."""
     before = store.run(TINY)
     changes = {"run_id": store.reserve_run(TINY), "parent": before.run_id, **changes}
     store.finish_run(before.model_copy(update=changes))

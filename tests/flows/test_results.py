@@ -87,7 +87,7 @@ def test_the_example_in_the_docs_gives_labelled_joints_with_units(tiny_run, tmp_
 
 
 class Outside(HTMLParser):
-    """Collects what a page would ask others for."""
+    """Collects the links and sources of a page that point to other files."""
 
     def __init__(self):
         super().__init__()

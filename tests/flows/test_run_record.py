@@ -25,7 +25,7 @@ def store(project_copy):
 
 
 def merge(store):
-    """Somebody says that two people are one."""
+    """Record the correction that two tracks are one person."""
     edit = MergedTracks(clip="clip", kept=0, merged=1)
     correct(store, open_match(store, TINY), [edit], who="Ada", why="one person")
 

@@ -1,4 +1,4 @@
-"""How long units may be at work, as people say it."""
+"""Time limits of units, parsed from the form in which people write them."""
 
 import pytest
 

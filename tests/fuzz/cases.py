@@ -199,7 +199,7 @@ def _has_group(names, group):
 
 
 def _names_store(names, text):
-    """A spoilt store may be what a page cannot show; it says which file."""
+    """Return whether the case damaged the store and the page reports an error."""
     return _has_group(names, "store") and '"error"' in text
 
 

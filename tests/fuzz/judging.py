@@ -1,4 +1,4 @@
-"""One case in a process of its own, and what its outcome is called."""
+"""Runs one case in its own process, and classifies its outcome."""
 
 import contextlib
 import faulthandler
@@ -48,7 +48,7 @@ nothing tells of, or that only `--gates auto` would; leftovers in the store."""
 
 
 def forked(work, *arguments):
-    """The dict that `work` returns in a forked process; class hang or crash where it does not."""
+    """Return the dict of `work` in a forked process, or one of class hang or crash."""
     read, write = os.pipe()
     started = time.monotonic()
     child = os.fork()

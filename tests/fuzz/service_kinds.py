@@ -508,7 +508,7 @@ kinds(
 
 
 def ask_all(project):
-    """Answers of the pages to what is asked: method, path, status and the answer's beginning."""
+    """Return the pages' answers to a project's requests: method, path, status, start of body."""
     from fastapi.testclient import TestClient
 
     from flows.web.access import access_for

@@ -109,7 +109,7 @@ def dask():
 
 @pytest.fixture
 def webhook():
-    """A server: what was posted to it, and the codes that it answers next (204 after them)."""
+    """A server that records posts and answers with the status codes in `codes`, then with 204."""
 
     class Server(HTTPServer):
         posted: list = []

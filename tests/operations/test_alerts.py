@@ -75,7 +75,7 @@ def test_what_the_webhook_did_not_take_is_posted_again(webhook, tmp_path, caplog
 
 @pytest.fixture
 def silent():
-    """The address of a server that takes connections and says nothing, ever."""
+    """The address of a server that accepts connections and never answers."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield f"http://127.0.0.1:{server.getsockname()[1]}/secret"
 

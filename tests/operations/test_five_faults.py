@@ -96,7 +96,7 @@ def press(ports, is_over):
 
 
 def measure(asked, seconds):
-    """Seconds that each of some requests took, asked by turns."""
+    """Send the requests in turn for `seconds`; return the response times [s] of each."""
     took = {name: [] for name in asked}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -109,7 +109,7 @@ def measure(asked, seconds):
 
 
 def refused(ask):
-    """Asks for what a full disk does not allow; gives the answer."""
+    """Send a request that a full disk must refuse; return the status code and the error."""
     try:
         ask()
     except urllib.error.HTTPError as error:
@@ -118,7 +118,7 @@ def refused(ask):
 
 
 def status_of(project):
-    """What `worldpose status` says, and the processor time that it takes [s]."""
+    """Return the output of `worldpose status` and its processor time [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         [*UNPRIVILEGED, *WORLDPOSE, "status", "--project", str(project)],
@@ -159,7 +159,7 @@ def test_others_are_served_under_five_faults_at_once(disk, matches, tmp_path, we
 
 
 def under_faults(lines, served, disk, matches, corrected, locked):
-    """Does it all, and adds what was measured to the lines."""
+    """Cause the five faults, check the service, and add the measurements to `lines`."""
     began = time.monotonic()
     served.begin()
     browser = Browser(served)
@@ -238,7 +238,7 @@ def under_faults(lines, served, disk, matches, corrected, locked):
 
 
 def fill(file):
-    """Write until nothing more fits, to the last byte."""
+    """Write zeros until the disk is full, to the last byte."""
     for size in (1 << 20, 4096, 1):
         try:
             while True:

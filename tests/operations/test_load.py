@@ -137,7 +137,7 @@ def processor_seconds():
 
 
 def many_cameras(folder, count):
-    """A match of so many cameras, all of which saw and are what one of a small match did and is."""
+    """Write a match of `count` cameras, all copies of one camera and its detections."""
     small = folder.with_name("small")
     options = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
     simulate_match(SCENARIOS["tiny"], 0, small, MatchOptions(calibrated=True, **options))

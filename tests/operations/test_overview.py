@@ -63,7 +63,7 @@ def verdict(word):
 
 
 class Told:
-    """A store of one match: its latest run, its journal, and the runs that have begun."""
+    """A fake store of one match: its latest run, its journal, and its unfinished runs."""
 
     def __init__(self, latest, journal=(), begun=()):
         self.latest, self.journal, self.begun = latest, journal, begun
@@ -80,7 +80,7 @@ class Told:
 
 @pytest.fixture
 def glance(monkeypatch):
-    """A function that gives the match of such a store at a glance."""
+    """A function that returns the overview's entry for the match of such a store."""
     monkeypatch.setattr(overview, "latest_run", lambda store, match: store.latest)
     journal = lambda store, match: SimpleNamespace(questions=store.journal)  # noqa: E731
     monkeypatch.setattr(overview, "read_journal", journal)

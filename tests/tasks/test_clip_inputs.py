@@ -1,4 +1,4 @@
-"""Detections of a clip as an iteration takes them: less what the one before said of them."""
+"""A clip's detections as input of an iteration, corrected by the previous iteration's results."""
 
 import numpy as np
 import xarray as xr

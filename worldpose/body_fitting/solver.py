@@ -114,7 +114,7 @@ class Solver:
         return pose, track
 
     def find_standing_ankles(self, track: Track, pose: Pose) -> Track:
-        """Return the track with the ankles that stand in a pose."""
+        """Return the track with the ground contacts of its ankles in a pose."""
         assert self.ground is not None
         joints = self.chained.differentiate(pose.parameters()).keypoints
         height = ankle_height(self.chained.model, pose.betas)
@@ -122,7 +122,7 @@ class Solver:
         return replace(track, contacts=contacts)
 
     def plant_feet(self, pose: Pose) -> BodyParameters:
-        """Return the bodies of a pose, with feet on the ground where they are near it."""
+        """Return the bodies of a pose, with feet that are near the ground turned level with it."""
         parameters = pose.parameters()
         if self.ground is None:
             return parameters

@@ -199,7 +199,7 @@ class CropEstimates:
         return CropEstimates(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def update(self, which: Flags, other: CropEstimates) -> None:
-        """Overwrite the output of some people with that of another look."""
+        """Overwrite the estimates of some people with those of another crop."""
         for field in fields(self):
             getattr(self, field.name)[which] = getattr(other, field.name)
 

@@ -257,7 +257,7 @@ class _OnnxDetector:
 
 
 def _above_min_score(boxes: Floats, scores: Floats) -> People:
-    """Return those above the least score; boxes are edges, whose pixel centres lie 0.5 px less."""
+    """Return the people with a score of at least `MIN_SCORE`, boxes shifted to pixel centres."""
     kept = (scores >= MIN_SCORE) & np.isfinite(boxes).all(axis=1)
     return People(boxes[kept] - 0.5, np.minimum(scores[kept], 1.0))
 

@@ -291,7 +291,7 @@ class Crowd:
         return joints
 
     def poses(self, times: Floats) -> BodyParameters:
-        """Return the bodies (persons, frames) whose keypoints the joints are."""
+        """Return the bodies (persons, frames), whose keypoints are the people's joints."""
         shape = (len(self.paths), len(times))
         betas, orient, transl = np.empty((*shape, 10)), np.empty((*shape, 3)), np.empty((*shape, 3))
         angles = np.empty((*shape, BODY_POSE))

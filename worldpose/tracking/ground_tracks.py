@@ -111,7 +111,7 @@ class _Track:
         self.steps.append((self.state, self.covariance, self.state, self.covariance))
 
     def correct(self, sight: _Sight, clock: float) -> None:
-        """Take a detection by a camera whose image is `clock` [s] later than the frame."""
+        """Update the state with a detection in an image `clock` [s] after the frame."""
         look = _look(clock)
         gain = self.covariance @ look.T
         gain = gain @ np.linalg.inv(look @ gain + sight.noise)
@@ -121,7 +121,7 @@ class _Track:
         self.steps[-1] = (before[0], before[1], self.state, self.covariance)
 
     def note(self, frame: int, camera: int, detection: int) -> None:
-        """Remember whose detection it was."""
+        """Assign a detection of a camera to this person."""
         seen = self.index.setdefault(frame, {})
         self.seen += not seen
         seen[camera] = detection
@@ -129,7 +129,7 @@ class _Track:
 
 
 def _look(clock: float) -> Floats:
-    """Return the place (2, 4) of a state `clock` [s] later."""
+    """Return the matrix (2, 4) that maps a state to the position `clock` [s] later."""
     return np.concatenate([np.eye(2), clock * np.eye(2)], axis=1)
 
 

@@ -172,7 +172,7 @@ def is_shadow(chain: list[LocatedFrames], others: list[LocatedFrames], distance:
 
 
 def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distance: float) -> Flags:
-    """Return the frames (frames,) in which a person seen by far more cameras is so near."""
+    """Return the frames (frames,) in which a person seen by far more cameras is this close."""
     beside = np.zeros(len(track.frame), dtype=np.bool_)
     for other in others:
         _, mine, theirs = np.intersect1d(

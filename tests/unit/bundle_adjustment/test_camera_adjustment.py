@@ -20,7 +20,7 @@ QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(mi
 
 
 def errors(cameras, true):
-    """Mean distance [px] by which cameras put people's places beside the true ones."""
+    """Return the mean reprojection error [px] of people's positions per camera."""
     places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
     off = np.linalg.norm(cameras.project(places) - true.project(places), axis=-1)
     return off.mean(axis=-1)

@@ -71,7 +71,7 @@ WRONG = 2
 
 
 def errors(cameras, true):
-    """Mean distance [px] by which cameras put people's places beside the true ones."""
+    """Return the mean reprojection error [px] of people's positions per camera."""
     places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
     return np.linalg.norm(cameras.project(places) - true.project(places), axis=-1).mean(axis=-1)
 

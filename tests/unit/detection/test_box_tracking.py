@@ -114,7 +114,7 @@ def scene(people=22, frames=200, seed=3):
 
 
 def agreement(first, second):
-    """Share of boxes that both put into tracks which correspond one to one."""
+    """Return the share of boxes with equal tracks, after matching tracks one to one."""
     both = np.zeros((first.max() + 1, second.max() + 1))
     known = (first >= 0) & (second >= 0)
     np.add.at(both, (first[known], second[known]), 1.0)

@@ -119,7 +119,7 @@ def test_people_and_poses_do_not_depend_on_the_batch():
 
 
 def looks(monkeypatch, seen_of):
-    """A pose estimator that sees what `seen_of` makes of boxes, and what it was asked."""
+    """A pose estimator that returns `seen_of(boxes)` as boxes, and a list of what it received."""
     pose, asked = BundledPoseEstimator(shaken(KeypointNet())), []
 
     def look(picture, boxes, others):

@@ -74,7 +74,7 @@ def test_whose_feet_the_border_cuts_off_is_told_by_the_head(camera):
 
 
 class Knowing:
-    """Boxes and keypoints as they are, from the number that an image carries."""
+    """Detector and estimator that return the truth of the frame whose number the image holds."""
 
     view_size = None
 

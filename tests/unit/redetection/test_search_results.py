@@ -30,7 +30,7 @@ def seek(bodies, *persons):
 
 
 def answer(bodies, *persons, off=(0.0, 0.0), confidence=0.9):
-    """As if the net saw these bodies, so far off."""
+    """Return detections of these bodies with an offset [px]."""
     keypoints = bodies.image[0, list(persons)] + off
     count = len(persons)
     return KeypointDetections(

@@ -66,7 +66,7 @@ def test_the_course_is_drawn_also_where_frames_have_no_camera():
 
 
 def people(*places):
-    """Somebody still at each place (x, y) [m], in two frames, whose joints go from 0 to 1.7 m."""
+    """A still person at each position (x, y) [m] in two frames, joints between 0 and 1.7 m."""
     joints = np.empty((2, len(places), 17, 3))
     joints[..., :2] = np.array(places)[None, :, None]
     joints[..., 2] = np.linspace(-0.8, 0.9, 17)

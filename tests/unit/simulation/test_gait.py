@@ -191,7 +191,7 @@ ACTIONS = {
 
 
 def way(motion, speed, left):
-    """A path along x that does what the motion asks for: comes to rest, or goes sideward."""
+    """A path along x that fits the motion: it stops and, for a flight, moves sideways."""
     time = np.arange(round((6.0 + 2 * MARGIN) / STEP) + 1) * STEP - MARGIN
     speeds, aside = np.full(len(time), speed), np.zeros(len(time))
     if motion.stops is not None:

@@ -50,7 +50,7 @@ def cv_pixels(view, points):
 
 
 def standing(x, y):
-    """Somebody upright at a place of the pitch (17, 3)."""
+    """Return the joints (17, 3) [m] of an upright person at a pitch position."""
     up = [1.6, 1.63, 1.63, 1.6, 1.6, 1.4, 1.4, 1.1, 1.1, 0.85, 0.85, 0.9, 0.9, 0.5, 0.5, 0.08, 0.08]
     side = [0.0, 0.03, -0.03, 0.07, -0.07, 0.18, -0.18, 0.2, -0.2, 0.2, -0.2] + [0.1, -0.1] * 3
     joints = np.stack([np.full(17, x) + side, np.full(17, y), np.array(up)], axis=-1)
@@ -58,7 +58,7 @@ def standing(x, y):
 
 
 def paint_middle(pixel, normal, fresh, bare):
-    """Where the paint's middle lies along a normal through a pixel, from what paint added."""
+    """Return the offset [px] of the paint's centre from a pixel, along the normal."""
     t = np.arange(-4.0, 4.01, 0.25)
     at = pixel + t[:, None] * normal
     added = (fresh[..., 1].astype(np.float32) - bare[..., 1].astype(np.float32))[None]
@@ -315,7 +315,7 @@ BEND = 0.2 / 34.0**2
 
 
 def look(start, at):
-    """Colour and distance [m] of what is seen from a place in the direction of another."""
+    """Return colour and distance [m] of the surface seen from `start` in the direction of `at`."""
     way = np.array(at, dtype=float) - start
     *color, steps = scenery(np.array(start, dtype=float), *way, HALF, BEND, 3)
     return color, steps * np.linalg.norm(way)

@@ -60,7 +60,7 @@ def picture(people=0, light="sun", paint=1.0, focal=1000.0):
 
 
 def start(seed, factor=1.0, true=None):
-    """The true camera some way off, by as much as its covariance says."""
+    """Return the true camera with a random error drawn from the returned covariance."""
     spread = factor * SPREAD
     step = spread * np.random.default_rng(seed).standard_normal(12)
     return CameraEstimate(step_camera(true or camera(), step), np.diag(spread**2))

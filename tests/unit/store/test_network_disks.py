@@ -33,7 +33,7 @@ def without_links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture
 def losing_replies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """NFS repeats a request whose reply was lost: the first one did what the second one finds."""
+    """Execute every link and rename twice, as NFS does when the first reply is lost."""
     link, rename = os.link, Path.rename
 
     def link_twice(source: Any, target: Any) -> None:

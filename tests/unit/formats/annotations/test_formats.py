@@ -24,7 +24,7 @@ SIZE = (1920, 1080)
 
 
 def person(rng, **known):
-    """Somebody in places of single precision, as detections are stored."""
+    """A random person with coordinates in single precision, as detections are stored."""
     keypoints = rng.uniform(-0.5, 1079.5, (17, 2)).astype(np.float32).astype(np.float64)
     visible = rng.integers(0, 3, 17).astype(np.int8)
     keypoints[visible == 0] = np.nan
