@@ -164,8 +164,8 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     static = find_ray_constraints(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
-    def fit(views: list, glimpses: object = None) -> BodyFit:
-        evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, glimpses)
+    def fit(views: list, monocular: object = None) -> BodyFit:
+        evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, monocular)
         return fit_bodies(BODY, evidence, SETTINGS, ground)
 
     first = fit([static])
@@ -180,12 +180,12 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     rng = np.random.default_rng(seed)
     drawn = estimate_bodies(BODY, bodies, scene.broadcast, fps, MonocularErrors(), rng)
     estimates = parse_monocular(drawn, Path("estimates"))
-    glimpses = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
+    monocular = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
     fits = {
         "static cameras alone": first,
-        "+ estimates": fit([static], glimpses),
+        "+ estimates": fit([static], monocular),
         "+ broadcast keypoints": fit([static, moving]),
-        "+ both": fit([static, moving], glimpses),
+        "+ both": fit([static, moving], monocular),
     }
     counted = dark & np.isfinite(own[..., 0]).any(axis=-1) & np.isfinite(first.joints[..., 0, 0])
     truth = scene.truth.joints[:, who]

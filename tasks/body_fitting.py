@@ -90,7 +90,7 @@ def fit_people(
     recipe: Recipe,
     *,
     views: Sequence[RayConstraints] = (),
-    glimpses: MonocularPoses | None = None,
+    monocular_poses: MonocularPoses | None = None,
     known: Mapping[int, Shape] | None = None,
 ) -> tuple[BodyModel, BodyFit]:
     """Fit a clip's bodies.
@@ -99,7 +99,7 @@ def fit_people(
         people: people of the clip.
         recipe: of this stage: its settings, body model and pitch.
         views: ray constraints of further cameras.
-        glimpses: monocular poses (S4).
+        monocular_poses: monocular poses (S4).
         known: shapes from other clips, by person index.
     """
     sources: dict[str, Any] = recipe.sources
@@ -117,7 +117,7 @@ def fit_people(
             people.covariance,
             people.clip.fps,
             ray_constraints=[alone, *views],
-            monocular_poses=glimpses,
+            monocular_poses=monocular_poses,
             common_bias=people.common_bias,
         ),
         settings,

@@ -47,14 +47,16 @@ def refitting(work: Work) -> str:
         people = open_people(store, work)
         joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
         views: list[RayConstraints] = []
-        glimpses: MonocularPoses | None = None
+        monocular_poses: MonocularPoses | None = None
         if f"broadcast_calibration/{unit}" in work.recipe.inputs:
             pictures = _pictures(store, work, people.clip.frame)
             views = [_view(store, work, pictures, joints)]
-            glimpses = _glimpses(work, pictures, joints)
+            monocular_poses = _read_monocular_poses(work, pictures, joints)
         weight = BodyFittingSettings.model_validate(before.settings).shape_weight
         known = _known_shapes(store, work, people.person, weight)
-        model, fit = fit_people(people, before, views=views, glimpses=glimpses, known=known)
+        model, fit = fit_people(
+            people, before, views=views, monocular_poses=monocular_poses, known=known
+        )
         recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
         pooled = np.isin(np.arange(len(people.person)), list(known))
         further = {"recognised": recognised, "pooled": pooled}
@@ -123,7 +125,7 @@ def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> RayC
     )
 
 
-def _glimpses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses | None:
+def _read_monocular_poses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses | None:
     """Return the monocular poses of the images, if there are any."""
     sources: dict[str, Any] = work.recipe.sources
     if sources["estimates"] is None:

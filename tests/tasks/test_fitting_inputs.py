@@ -150,7 +150,7 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, l
     monkeypatch.setattr(refitting, "require_registered", lambda *_: None)
     work = of_clip(estimates="bodies.npz", estimates_sha256="")
     pictures = refitting._Pictures(104 + frame, camera, late)
-    found = refitting._glimpses(work, pictures, runner(frame))
+    found = refitting._read_monocular_poses(work, pictures, runner(frame))
     there = np.isfinite(found.orient).all(axis=(-2, -1))[:, 0]
     assert there.sum() >= 10
     np.testing.assert_allclose(found.orient[there, 0], turned(frame[there]), atol=1e-9)

@@ -277,7 +277,7 @@ class MonocularPrior:
 
 
 def learn_precision(
-    glimpses: MonocularPoses,
+    monocular: MonocularPoses,
     orient: Floats,
     angles: Floats,
     sure: NDArray[np.bool_],
@@ -286,14 +286,16 @@ def learn_precision(
     """Return the precision (33, 33) [1/rad^2] of a monocular pose.
 
     Args:
-        glimpses: monocular poses of one clip.
+        monocular: monocular poses of one clip.
         orient: (frames, persons, 3) [rad], of bodies fitted without monocular poses.
         angles: (frames, persons, 30) [rad], of the same.
         sure: (frames, persons), bodies much more accurate than monocular poses.
         correlated_frames: frames with correlated errors, which count as one.
     """
-    there = sure & np.isfinite(glimpses.angles[..., 0]) & np.isfinite(angles[..., 0])
-    away = deviations(glimpses.orient[there], glimpses.angles[there], orient[there], angles[there])
+    there = sure & np.isfinite(monocular.angles[..., 0]) & np.isfinite(angles[..., 0])
+    away = deviations(
+        monocular.orient[there], monocular.angles[there], orient[there], angles[there]
+    )
     square = PRIOR_WEIGHT * PRIOR_SPREAD**2 + (away**2).sum(axis=0) / correlated_frames
     return np.diag((PRIOR_WEIGHT + len(away) / correlated_frames) / square).astype(np.float64)
 

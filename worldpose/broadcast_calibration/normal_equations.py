@@ -166,7 +166,11 @@ def direction_row(
 
 @compile_kernel
 def add_points(
-    cameras: Cameras, bounds: Integers, points: Points, beside: Floats, equations: NormalEquations
+    cameras: Cameras,
+    bounds: Integers,
+    points: Points,
+    paint_offsets: Floats,
+    equations: NormalEquations,
 ) -> float:
     """Add points to the normal equations and return their cost, half a sum of losses.
 
@@ -174,7 +178,7 @@ def add_points(
         cameras: of all frames.
         bounds: (frames + 1,) of the points.
         points: sorted by frame.
-        beside: (painted, 3) paint errors of the template's points [standard deviations].
+        paint_offsets: (painted, 3) paint errors of the template's points [standard deviations].
         equations: added to.
     """
     center, rotation = cameras.center, cameras.rotation
@@ -197,7 +201,7 @@ def add_points(
             for end in range(2):
                 if ends[i, end] >= 0:
                     for j in range(3):
-                        place[j] += shares[i, end] * beside[ends[i, end], j]
+                        place[j] += shares[i, end] * paint_offsets[ends[i, end], j]
             if not point_row(rotation[t], center, lens, place, pixel, rows):
                 # The maximum of the loss.
                 cost += 0.5 * weight[i] * min(limit, 1e12)

@@ -95,7 +95,7 @@ class Solution:
 
     Attributes:
         camera: camera of least cost.
-        beside: (painted, 3) offsets of painted template points from the survey [standard
+        paint_offsets: (painted, 3) offsets of painted template points from the survey [standard
             deviations].
         cost: final cost.
         costs: cost after every iteration.
@@ -103,35 +103,35 @@ class Solution:
     """
 
     camera: MovingCamera
-    beside: Floats
+    paint_offsets: Floats
     cost: float
     costs: tuple[float, ...]
     equations: Equations
 
 
-def equations_at(camera: MovingCamera, beside: Floats, problem: Problem) -> Equations:
+def equations_at(camera: MovingCamera, paint_offsets: Floats, problem: Problem) -> Equations:
     """Return cost, gradient and Gauss-Newton matrix of a problem, linearized at `camera`.
 
     Args:
         camera: all frames.
-        beside: (painted, 3) offsets of painted template points [standard deviations].
+        paint_offsets: (painted, 3) offsets of painted template points [standard deviations].
         problem: evidence, smoothness and priors.
     """
     frames = len(camera)
-    shared = CLIP_SIZE + beside.size
+    shared = CLIP_SIZE + paint_offsets.size
     system = empty_equations(frames, shared)
     # Prior of the paint errors, in standard deviations.
     system.corner[range(CLIP_SIZE, shared), range(CLIP_SIZE, shared)] = 1.0
-    system.right_corner[CLIP_SIZE:] = beside.ravel()
+    system.right_corner[CLIP_SIZE:] = paint_offsets.ravel()
     points, flow = problem.points, problem.flow
     edges = bounds(points.frame, frames)
-    cost = add_points(camera.arrays, edges, points.arrays(problem.ends), beside, system)
+    cost = add_points(camera.arrays, edges, points.arrays(problem.ends), paint_offsets, system)
     if len(flow) and problem.flow_weight > 0.0:
         followed = Flow(
             flow.start, flow.end, flow.deviation, problem.flow_weight, problem.flow_loss
         )
         cost += add_flow(camera.arrays, bounds(flow.frame, frames), followed, system)
-    cost += 0.5 * float((beside**2).sum())
+    cost += 0.5 * float((paint_offsets**2).sum())
     cost += add_smoothness(camera, problem.smoothness, system.blocks, system.right)
     cost += _add_prior(camera, problem.prior, system)
     _remove_fixed(problem, system)
@@ -153,11 +153,11 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     def step(state: _State, damping: float) -> _State:
         frame, shared = _solve_step(state.equations.system, damping)
         camera = state.camera.take_step(frame, shared[:CLIP_SIZE])
-        beside = state.beside + shared[CLIP_SIZE:].reshape(state.beside.shape)
-        return _State(camera, beside, equations_at(camera, beside, problem))
+        paint_offsets = state.paint_offsets + shared[CLIP_SIZE:].reshape(state.paint_offsets.shape)
+        return _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
 
-    beside = np.zeros((len(problem.painted), 3))
-    start = _State(camera, beside, equations_at(camera, beside, problem))
+    paint_offsets = np.zeros((len(problem.painted), 3))
+    start = _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
     schedule = Schedule(
         damping=_START_DAMPING,
         decrease=6.0,
@@ -168,7 +168,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     )
     found = minimize(start, step, schedule)
     last = found.state
-    return Solution(last.camera, last.beside, last.cost, found.costs, last.equations)
+    return Solution(last.camera, last.paint_offsets, last.cost, found.costs, last.equations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class _State:
     """A camera and paint errors (painted, 3), with the equations there."""
 
     camera: MovingCamera
-    beside: Floats
+    paint_offsets: Floats
     equations: Equations
 
     @property
@@ -264,12 +264,12 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         iterations: number of iterations.
     """
     frames = len(camera) * FRAME_SIZE
-    beside = np.zeros((len(problem.painted), 3))
-    size = frames + CLIP_SIZE + beside.size
+    paint_offsets = np.zeros((len(problem.painted), 3))
+    size = frames + CLIP_SIZE + paint_offsets.size
     unit = np.ones(size)
     unit[frames + 3 : frames + CLIP_SIZE] = 1e3
     mean, square = np.zeros(size), np.zeros(size)
-    here = equations_at(camera, beside, problem)
+    here = equations_at(camera, paint_offsets, problem)
     costs = [here.cost]
     for iteration in range(1, iterations + 1):
         gradient = unit * np.concatenate([here.system.right.ravel(), here.system.right_corner])
@@ -280,7 +280,7 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         step = -RATE * unit * first / (np.sqrt(second) + _SMALL)
         shared = step[frames:]
         camera = camera.take_step(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
-        beside = beside + shared[CLIP_SIZE:].reshape(beside.shape)
-        here = equations_at(camera, beside, problem)
+        paint_offsets = paint_offsets + shared[CLIP_SIZE:].reshape(paint_offsets.shape)
+        here = equations_at(camera, paint_offsets, problem)
         costs.append(here.cost)
-    return Solution(camera, beside, here.cost, tuple(costs), here)
+    return Solution(camera, paint_offsets, here.cost, tuple(costs), here)

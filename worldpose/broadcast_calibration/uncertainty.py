@@ -133,7 +133,7 @@ def _lasting_gradients(
         len(sources) + 2 * people.astype(np.int64),
     )
     evidence = points[chosen].arrays(problem.ends[chosen])
-    _add_gradients(camera.arrays, evidence, solution.beside, clusters, by_frame, by_shared)
+    _add_gradients(camera.arrays, evidence, solution.paint_offsets, clusters, by_frame, by_shared)
     together = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
         np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
@@ -186,7 +186,7 @@ class _Clusters(NamedTuple):
 def _add_gradients(
     cameras: Cameras,
     points: Points,
-    beside: Floats,
+    paint_offsets: Floats,
     clusters: _Clusters,
     by_frame: Floats,
     by_shared: Floats,
@@ -201,7 +201,7 @@ def _add_gradients(
         place[:] = world[i]
         for end in range(2):
             if ends[i, end] >= 0:
-                place += shares[i, end] * beside[ends[i, end]]
+                place += shares[i, end] * paint_offsets[ends[i, end]]
         lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
         if not point_row(cameras.rotation[t], cameras.center, lens, place, pixel, rows):
             continue

@@ -70,18 +70,18 @@ class Expected:
     depth: Floats
 
     @classmethod
-    def of(cls, views: BodyViews, beside: Floats, focal: float) -> Expected:
+    def of(cls, views: BodyViews, offset: Floats, focal: float) -> Expected:
         """Return the expected image of the bodies in the only camera of `views`.
 
         Args:
             views: bodies in the frames of one camera.
-            beside: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
+            offset: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
             focal: of the camera [px].
         """
         scale = views.scale[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(scale > 0.0, focal / scale, np.nan)
-        return cls(views.image[:, 0] + np.nan_to_num(beside), views.variance[:, 0], scale, depth)
+        return cls(views.image[:, 0] + np.nan_to_num(offset), views.variance[:, 0], scale, depth)
 
     @property
     def boxes(self) -> Floats:
@@ -252,10 +252,10 @@ def search_missing_people(
         if picture is None or not len(rows):
             continue
         people = People(sought.boxes[rows], np.ones(len(rows)))
-        beside = np.empty((0, 4)) if detected is None else detected[frame].astype(np.float64)
-        beside = beside[np.isfinite(beside).all(axis=1)]
-        beside = beside[(box_iou(people.boxes, beside) > 0.0).any(axis=0)]
-        estimated = estimator.estimate(picture, np.concatenate([people.boxes, beside]))
+        neighbours = np.empty((0, 4)) if detected is None else detected[frame].astype(np.float64)
+        neighbours = neighbours[np.isfinite(neighbours).all(axis=1)]
+        neighbours = neighbours[(box_iou(people.boxes, neighbours) > 0.0).any(axis=0)]
+        estimated = estimator.estimate(picture, np.concatenate([people.boxes, neighbours]))
         poses = combine_boxes(people, estimated.select(slice(len(rows))))
         with np.errstate(invalid="ignore"):
             there = (poses.confidence >= least_keypoint) & np.isfinite(poses.keypoints).all(axis=2)
