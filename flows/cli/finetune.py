@@ -47,7 +47,7 @@ def label(
     pose: Annotated[str, typer.Option(help="Value of detection.pose.")] = "embedded",
     as_json: JsonOption = False,
 ) -> None:
-    """Propose labels for every `--every`-th frame, for people to correct.
+    """Propose labels for evenly spaced frames, for people to correct.
 
     Example: worldpose label cam00.mp4 cam01.mp4 --out labels
     """
