@@ -64,7 +64,7 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
         (tmp_path / "inbox").mkdir()
         found = by_part(check(state))
         assert "Start the Prefect server" in found["prefect"].mend
-        assert found["deployments"].mend == "Mend prefect first."
+        assert found["deployments"].mend == "Fix prefect first."
         assert found["inbox"].is_well
 
 

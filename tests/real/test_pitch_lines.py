@@ -31,7 +31,7 @@ def bench():
 
 
 @pytest.mark.parametrize(
-    ("name", "least"),
+    ("name", "minimum"),
     [
         # Seen on this half: 98.7, 98.9, 98.9.
         ("wc14", (98.4, 98.6, 98.6)),
@@ -39,14 +39,14 @@ def bench():
         ("sn22", (94.6, 96.0, 96.2)),
     ],
 )
-def test_drawn_lines_give_cameras_that_hit_them(bench, name, least):
+def test_drawn_lines_give_cameras_that_hit_them(bench, name, minimum):
     scorer = bench.load_scorer(DATA)
     _, size = bench.SETS[name]
     lines = bench.load_lines(DATA, name, half=1, every=1)
     fits = {key: bench.fit(drawn, size, bench.BROADCAST) for key, drawn in lines.items()}
-    scores = bench.scored(scorer, lines, fits, size)
+    scores = bench.score_images(scorer, lines, fits, size)
     assert len(scores) >= 0.988 * len(lines)
-    assert (100.0 * np.mean(list(scores.values()), axis=0) >= least).all()
+    assert (100.0 * np.mean(list(scores.values()), axis=0) >= minimum).all()
 
 
 def test_the_camera_of_the_other_markings_predicts_one(bench):

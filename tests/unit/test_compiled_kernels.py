@@ -7,10 +7,10 @@ import sys
 import worldpose.compiled
 
 CALLER = """
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 from worldpose.callees.callee import callee
 
-@compiled
+@compile_kernel
 def caller():
     return callee() + 1
 
@@ -18,9 +18,9 @@ print(caller())
 """
 
 CALLEE = """
-from worldpose.compiled import compiled
+from worldpose.compiled import compile_kernel
 
-@compiled
+@compile_kernel
 def callee():
     return {value}
 """
