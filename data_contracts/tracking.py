@@ -57,7 +57,8 @@ TRACKING = GroupLayout(
             dtype="float32",
             unit="m",
             missing="nan",
-            about="place of people of the kind `plane` on the pitch, from their feet, smoothed",
+            about="place on the pitch from the feet, smoothed; finite exactly in the frames in "
+            "which the person is not triangulated but placed by the feet (kind `plane`)",
             chunk_dim="frame",
         ),
         ArrayLayout(
@@ -84,7 +85,7 @@ TRACKING = GroupLayout(
             dtype="float32",
             unit="m",
             missing="nan",
-            about="height of people of the kind `plane`, by their boxes",
+            about="height of people who are placed by their feet, by their boxes",
         ),
     ),
     labels={
@@ -115,8 +116,11 @@ class Track(Record):
     """Mean number of cameras in those frames."""
     name: Name | None = None
     """Roster id, where known."""
-    kind: Literal["triangulated", "plane"] = "triangulated"
-    """Whether views triangulate the person, or the feet alone give a place on the pitch."""
+    kind: Literal["triangulated", "mixed", "plane"] = "triangulated"
+    """Whether views triangulate the person in all frames, in some, or in none, where the feet alone
+    give a place on the pitch."""
+    plane_frames: Count = 0
+    """Frames in which the feet alone place the person."""
 
 
 class Join(Record):

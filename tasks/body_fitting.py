@@ -31,6 +31,7 @@ from worldpose.body_fitting import (
 )
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
+from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import unswap
 
@@ -73,7 +74,8 @@ def open_people(store: Store, work: Work) -> ClipPeople:
     """Read the tracked and triangulated people of the clip of `work`."""
     clip = open_clip(store, work)
     placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
-    index = open_input(store, work, f"tracking/{work.recipe.unit}")["detection_index"].values
+    tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
+    index = tracks["detection_index"].values
     return ClipPeople(
         clip,
         unswap(clip.keypoints[:], index, placed["exchanged"].values),

@@ -24,6 +24,7 @@ from worldpose.bundle_adjustment import (
     adjustment_arrays,
 )
 from worldpose.pitch import PitchTemplate
+from worldpose.review.identities import select_triangulated
 from worldpose.static_calibration import PARAMETERS
 from worldpose.store import Store
 
@@ -79,7 +80,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
         for clip, every in sorted(whole.items(), key=lambda item: item[1][0])
     }
     tracked = [
-        open_input(store, work, f"tracking/{clip}").sel(frame=frame)
+        select_triangulated(open_input(store, work, f"tracking/{clip}").sel(frame=frame))
         for clip, frame in frames.items()
     ]
     placed = [

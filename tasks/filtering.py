@@ -30,6 +30,7 @@ from worldpose.filtering import (
     view_bodies,
     watch_motion,
 )
+from worldpose.review.identities import select_triangulated
 from worldpose.store import Store
 from worldpose.triangulation import ClipDetections, TriangulationSettings
 
@@ -154,7 +155,7 @@ class _Case:
 
 def _open(store: Store, work: Work) -> _Case:
     unit = work.recipe.unit
-    tracks = open_input(store, work, f"tracking/{unit}")
+    tracks = select_triangulated(open_input(store, work, f"tracking/{unit}"))
     (bodies,) = (
         open_input(store, work, name)
         for name in (f"refitting/{unit}", f"body_fitting/{unit}")

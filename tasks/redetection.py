@@ -46,6 +46,7 @@ from worldpose.redetection import (
     search_missing_people,
     select_missing_people,
 )
+from worldpose.review.identities import select_triangulated
 from worldpose.store import Store
 from worldpose.video import open_video
 from worldpose.video.folder import some_pictures
@@ -134,7 +135,7 @@ def _open(store: Store, work: Work) -> _Case:
     unit, inputs = work.recipe.unit, work.recipe.inputs
     detected = KeypointDetections.from_arrays(open_input(store, work, f"detection/{unit}"))
     manifest = store.manifest(work.recipe.match_id, "detection", unit, inputs[f"detection/{unit}"])
-    tracks = open_input(store, work, f"tracking/{clip}")
+    tracks = select_triangulated(open_input(store, work, f"tracking/{clip}"))
     place = tracks["camera"].values.tolist().index(name)
     camera = camera_from_arrays(open_input(store, work, ADJUSTED).data_vars)[place]
     one = Camera.stack([camera])

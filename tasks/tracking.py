@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from data_contracts.arrays import Singles
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
 from data_contracts.work import Work
@@ -17,6 +18,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import (
     Identities,
     IdentityEdit,
+    add_plane_tracks,
     replay_identities,
     stored_identities,
 )
@@ -25,6 +27,8 @@ from worldpose.tracking import (
     GroundPositions,
     PlaneClocks,
     TrackingSettings,
+    TriangulatedPeople,
+    count_covering_cameras,
     describe_doubts,
     diagnose_no_people,
     estimate_plane_clocks,
@@ -32,7 +36,11 @@ from worldpose.tracking import (
     locate_tracks,
     track_on_plane,
     track_people,
+    triangulated_places,
 )
+
+BLOCK: Final = 256
+"""Frames of detections in memory at a time."""
 
 
 @unit_task
@@ -72,20 +80,22 @@ def tracking(work: Work) -> str:
 def _ground_arrays(store: Store, work: Work, people: Identities) -> dict[str, NDArray[Any]]:
     """Return the stored places of people on the pitch; empty if all are triangulated."""
     pitch = _pitch(work)
-    on_plane = [track.kind == "plane" for track in people.tracks]
-    if pitch is None or not any(on_plane):
+    if pitch is None or not people.on_plane.any():
         return {}
     clip = open_clip(store, work)
-    positions, clocks = _feet(store, work, clip, pitch)
-    tracks = locate_tracks(positions, people.detection_index, clip.fps, clocks.seconds)
+    positions = _locate_feet(store, work, clip, pitch)
+    index = np.where(people.on_plane[:, None], people.detection_index, -1)
+    middle = triangulated_places(people.joints)
+    clocks = _estimate_clocks(positions, clip, pitch, people.joints)
+    tracks = locate_tracks(positions, index, clip.fps, clocks.seconds, middle)
     arrays = {
         "ground": tracks.xy,
         "ground_velocity": tracks.velocity,
         "ground_covariance": tracks.covariance,
     }
     for array in arrays.values():
-        array[:, ~np.array(on_plane)] = np.nan
-    arrays["ground_height"] = np.where(on_plane, tracks.height, np.nan)
+        array[~people.on_plane] = np.nan
+    arrays["ground_height"] = tracks.height
     return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
@@ -123,11 +133,12 @@ def _track_people(store: Store, work: Work) -> Tracked:
         detection_index=tracks.detection_index,
         ray_distance=tracks.ray_distance,
         joints=tracks.joints,
+        on_plane=np.zeros(tracks.joints.shape[:2], dtype=np.bool_),
         names={},
         joins=tracks.joins,
     )
     figures = figures_of(tracks.report, clip.camera_ids)
-    warnings: tuple[str, ...] = ()
+    said = ""
     if not len(tracks.person):
         reason = diagnose_no_people(
             clip.cameras,
@@ -139,17 +150,20 @@ def _track_people(store: Store, work: Work) -> Tracked:
             ground=pitch is not None,
             births=tracks.report.births,
         )
-        plane = None if pitch is None else _track_on_plane(store, work, clip, pitch)
-        if plane is None:
-            warnings = (f"{work.recipe.name} found no person: {reason.message}",)
-        else:
-            found, further, clocks = plane
+        said = f"{work.recipe.name} found no person: {reason.message}"
+    plane = None if pitch is None else _track_on_plane(store, work, clip, pitch, found)
+    if plane is not None:
+        found, further, clocks = plane
+        if not len(tracks.person):
             figures |= further
-            warnings = (
+            said = (
                 f"{work.recipe.name} could not triangulate any person: {reason.message} "
                 f"{len(found.person)} people are placed on the pitch from their feet, without "
-                f"joints and bodies.{clocks}",
+                f"joints and bodies.{clocks}"
             )
+        elif found.on_plane.any():
+            figures |= {name: number for name, number in further.items() if "plane" in name}
+    warnings: tuple[str, ...] = (said,) if said else ()
     doubts = describe_doubts(
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )
@@ -164,48 +178,78 @@ def _pitch(work: Work) -> PitchTemplate | None:
     return None if given is None else PitchTemplate.from_spec(PitchSpec(any_size=True, **given))
 
 
-def _feet(
+def _locate_feet(
     store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate
-) -> tuple[GroundPositions, PlaneClocks]:
-    """Return people's foot positions by camera, and the clock offsets estimated from them."""
-    positions = locate_feet(
-        clip.cameras,
-        clip.keypoints[:],
-        clip.confidence[:],
-        pitch,
-        boxes=open_boxes(store, work)[:],
-        camera_covariance=clip.camera_covariance,
+) -> GroundPositions:
+    """Return people's foot positions by camera."""
+    boxes = open_boxes(store, work)
+    parts = [slice(start, start + BLOCK) for start in range(0, len(clip.frame), BLOCK)]
+    return GroundPositions.concatenate(
+        [
+            locate_feet(
+                clip.cameras,
+                clip.keypoints[part],
+                clip.confidence[part],
+                pitch,
+                boxes=boxes[part],
+                camera_covariance=clip.camera_covariance,
+            )
+            for part in parts
+        ]
     )
+
+
+def _estimate_clocks(
+    positions: GroundPositions, clip: ClipInputs, pitch: PitchTemplate, joints: Singles
+) -> PlaneClocks:
+    """Return the cameras' clock offsets by running people; none beside triangulated people.
+
+    Triangulation estimates the clocks itself, and its people are at the times of the frames.
+    """
+    if np.isfinite(joints).any():
+        count = len(clip.camera_ids)
+        return PlaneClocks(np.zeros(count), np.full(count, np.inf), 0)
     size = (pitch.length, pitch.width)
-    return positions, estimate_plane_clocks(positions, clip.fps, pitch_size=size)
+    return estimate_plane_clocks(positions, clip.fps, pitch_size=size)
 
 
 def _track_on_plane(
-    store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate
+    store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate, found: Identities
 ) -> tuple[Identities, dict[str, float], str] | None:
-    """Return people tracked by their feet, metrics, and a sentence on clocks; None without any."""
-    positions, clocks = _feet(store, work, clip, pitch)
-    size = (pitch.length, pitch.width)
-    tracks = track_on_plane(positions, clip.fps, clocks.seconds, pitch_size=size)
-    index = tracks.detection_index
-    if not index.shape[2]:
-        return None
-    found = Identities(
-        frame=np.asarray(clip.frame),
-        cameras=tuple(clip.camera_ids),
-        person=np.arange(index.shape[2], dtype=np.int32),
-        detection_index=index,
-        ray_distance=np.full(index.shape, np.nan, dtype=np.float32),
-        joints=np.full((len(index), index.shape[2], 17, 3), np.nan, dtype=np.float32),
-        names={},
-        joins=(),
-    )
-    variance = np.trace(tracks.covariance, axis1=-2, axis2=-1)
+    """Add the people who are not triangulated, tracked by their feet.
+
+    Returns:
+        The people, metrics, and a sentence on clocks; None without any of them.
+    """
+    positions = _locate_feet(store, work, clip, pitch)
+    clocks = _estimate_clocks(positions, clip, pitch, found.joints)
     detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]))
+    frame, camera, person = np.nonzero(found.detection_index >= 0)
+    taken = found.detection_index[frame, camera, person]
+    positions.xy[frame, camera, taken] = np.nan
+    if not np.isfinite(positions.xy).any():
+        return None
+    tracks = track_on_plane(
+        positions,
+        clip.fps,
+        clocks.seconds,
+        pitch_size=(pitch.length, pitch.width),
+        triangulated=TriangulatedPeople(
+            triangulated_places(found.joints), np.asarray((found.detection_index >= 0).any(axis=1))
+        ),
+        covering=count_covering_cameras(clip.cameras, positions),
+    )
+    if not tracks.detection_index.shape[2]:
+        return None
+    is_placed = np.asarray(np.isfinite(tracks.xy).all(axis=-1))
+    added = add_plane_tracks(found, tracks.detection_index, is_placed, tracks.continues)
+    variance = np.trace(tracks.covariance, axis1=-2, axis2=-1)
     figures = {
-        "people": float(index.shape[2]),
+        "people": float(len(added.person)),
+        "plane_people": float(sum(track.kind == "plane" for track in added.tracks)),
+        "plane_poses": float(np.count_nonzero(added.on_plane)),
         "plane_std_m": float(np.sqrt(np.nanmedian(variance))),
-        "unmatched_share": 1.0 - np.count_nonzero(index >= 0) / detections,
+        "unmatched_share": 1.0 - np.count_nonzero(added.detection_index >= 0) / detections,
     }
     # A video that is late shows an earlier time: its frames lie behind those of the others.
     offsets = (clocks.seconds.max() - clocks.seconds) * clip.fps
@@ -221,4 +265,4 @@ def _track_on_plane(
         if late
         else ""
     )
-    return found, figures, said
+    return added, figures, said

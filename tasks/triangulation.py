@@ -15,6 +15,7 @@ from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.spool import open_spool
 from tasks.unit import figures_of, open_input, unit_task
+from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import (
     CameraClocks,
@@ -53,7 +54,7 @@ def write_joints(
 ) -> None:
     """Triangulate the clip of `work` in chunks of frames, and write the joints."""
     clip = open_clip(store, work)
-    tracks = open_input(store, work, f"tracking/{work.recipe.unit}")
+    tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
     index = tracks["detection_index"].values
     detections = ClipDetections(clip.keypoints, clip.confidence, index)
     covariance = camera_errors(work, clip)
@@ -74,8 +75,7 @@ def write_joints(
             attributes={"camera": list(clip.camera_ids)},
         )
     agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)
-    on_plane = all(track.get("kind") == "plane" for track in tracks.attrs["tracks"])
-    if agreement.joints == 0 and index.shape[2] and not on_plane:
+    if agreement.joints == 0 and index.shape[2]:
         most = int(np.count_nonzero(index >= 0, axis=1).max())
         reason = (
             f"no person is seen by more than {most} cameras at once and min_views asks for "

@@ -8,6 +8,7 @@ import numpy as np
 
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
+from data_contracts.tracking import Track
 from worldpose.body import BodyParameters, find_body
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.formats import JointTracks
@@ -82,21 +83,23 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet."""
     tracks, tracking = joint_tracks(run, clip), run[f"tracking/{clip}"]
-    known = {int(track["person"]): track for track in tracking.attrs["tracks"]}
-    xy = tracks.joints[:, :, MID_HIP, :2].mean(axis=2)
+    known = {track.person: track for track in map(Track.model_validate, tracking.attrs["tracks"])}
+    person = tracking["person"].values.astype(np.int64)
+    xy = np.full((len(tracks.frames), len(person), 2), np.nan)
     covariance = np.full((*xy.shape, 2), np.nan)
+    column = np.searchsorted(person, tracks.person_ids)
+    xy[:, column] = tracks.joints[:, :, MID_HIP, :2].mean(axis=2)
     if tracks.covariance is not None:  # the errors of both hips are nearly the same
-        covariance = tracks.covariance[:, :, MID_HIP, :2, :2].mean(axis=2)
-    kinds = [str(known[int(person)].get("kind", "triangulated")) for person in tracks.person_ids]
-    height = np.full(len(kinds), np.nan)
+        covariance[:, column] = tracks.covariance[:, :, MID_HIP, :2, :2].mean(axis=2)
+    height, on_plane = np.full(len(person), np.nan), np.zeros(xy.shape[:2], dtype=np.bool_)
     if "ground" in tracking:
-        ground = tracking.sel(person=tracks.person_ids)
-        plane = np.array(kinds) == "plane"
-        xy[:, plane] = ground["ground"].values[:, plane]
-        covariance[:, plane] = ground["ground_covariance"].values[:, plane]
-        height[plane] = ground["ground_height"].values[plane]
-    names = [known[int(person)].get("name") or "" for person in tracks.person_ids]
-    return Positions(tracks.frames, tracks.person_ids, names, kinds, xy, covariance, height)
+        feet = tracking.sel(frame=tracks.frames)
+        on_plane = np.isnan(xy[..., 0]) & np.isfinite(feet["ground"].values[..., 0])
+        xy[on_plane] = feet["ground"].values[on_plane]
+        covariance[on_plane] = feet["ground_covariance"].values[on_plane]
+        height = feet["ground_height"].values.astype(np.float64)
+    names = [known[one].name or "" for one in person.tolist()]
+    return Positions(tracks.frames, person, names, on_plane, xy, covariance, height)
 
 
 def bodies_unit(run: Run, clip: str) -> str:

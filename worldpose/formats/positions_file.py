@@ -40,7 +40,8 @@ class Positions:
         frames: (frames,) match frames.
         person: (persons,) ids.
         names: (persons,) roster id; empty where not known.
-        kinds: (persons,) `triangulated`: the mid-hip of the joints; `plane`: by the feet alone.
+        on_plane: (frames, persons), whether the place is that of the feet alone, else the mid-hip
+            of triangulated joints.
         xy: (frames, persons, 2) [m], world; NaN where missing.
         covariance: (frames, persons, 2, 2) [m^2].
         height: (persons,) [m]; NaN where not known.
@@ -49,7 +50,7 @@ class Positions:
     frames: NDArray[np.integer]
     person: NDArray[np.integer]
     names: Sequence[str]
-    kinds: Sequence[str]
+    on_plane: NDArray[np.bool_]
     xy: Floats
     covariance: Floats
     height: Floats
@@ -58,9 +59,9 @@ class Positions:
 def write_positions(path: Path, positions: Positions, fps: float) -> None:
     """Write a line per person and frame, frame by frame; missing people have none.
 
-    Columns: frame, time_s (frame / fps), person, name, kind, x_m and y_m (world), x_std_m, y_std_m
-    and xy_correlation of their covariance, speed_m_s over `SPEED_WINDOW_S` (empty at a track's
-    ends), height_m of people placed by their feet.
+    Columns: frame, time_s (frame / fps), person, name, kind in this frame (triangulated or plane),
+    x_m and y_m (world), x_std_m, y_std_m and xy_correlation of their covariance, speed_m_s over
+    `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed by their feet.
     """
     speed = _speeds(positions.xy, fps)
     variance = np.diagonal(positions.covariance, axis1=-2, axis2=-1)
@@ -79,7 +80,7 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
                         f"{frame / fps:.4f}",
                         int(positions.person[p]),
                         positions.names[p],
-                        positions.kinds[p],
+                        "plane" if positions.on_plane[row, p] else "triangulated",
                         *(f"{number:.3f}" for number in numbers),
                         f"{correlation[row, p]:.3f}",
                         f"{speed[row, p]:.2f}" if np.isfinite(speed[row, p]) else "",

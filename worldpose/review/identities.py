@@ -31,6 +31,8 @@ class Identities:
         detection_index: (frames, cameras, persons), -1 = not seen.
         ray_distance: (frames, cameras, persons) [m]; NaN = not seen.
         joints: (frames, persons, 17, 3) [m], world; NaN where missing.
+        on_plane: (frames, persons), whether the person is not triangulated there, and placed by
+            the feet.
         names: roster id by person, of named people.
         joins: certain and possible continuations of one track as another.
     """
@@ -41,6 +43,7 @@ class Identities:
     detection_index: NDArray[np.int16]
     ray_distance: NDArray[np.float32]
     joints: NDArray[np.float32]
+    on_plane: NDArray[np.bool_]
     names: dict[int, str]
     joins: tuple[Join, ...]
 
@@ -51,6 +54,8 @@ class Identities:
         for k, person in enumerate(self.person.tolist()):
             views = np.count_nonzero(self.detection_index[:, :, k] >= 0, axis=1)
             present = np.flatnonzero(views)
+            plane_frames = int(np.count_nonzero(self.on_plane[:, k]))
+            is_plane = not (views[~self.on_plane[:, k]] > 0).any()
             found.append(
                 Track(
                     person=person,
@@ -59,7 +64,8 @@ class Identities:
                     frames_seen=len(present),
                     views=float(views[present].mean()),
                     name=self.names.get(person),
-                    kind="triangulated" if np.isfinite(self.joints[:, k]).any() else "plane",
+                    kind="triangulated" if not plane_frames else "plane" if is_plane else "mixed",
+                    plane_frames=plane_frames,
                 )
             )
         return tuple(found)
@@ -88,8 +94,72 @@ def stored_identities(result: xr.Dataset) -> Identities:
         detection_index=result["detection_index"].values,
         ray_distance=result["ray_distance"].values,
         joints=result["joints"].values,
+        on_plane=find_plane_frames(result),
         names={track.person: track.name for track in tracks if track.name is not None},
         joins=tuple(Join.model_validate(join) for join in result.attrs["joins"]),
+    )
+
+
+def find_plane_frames(tracks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return in which frames the feet alone place a person (frames, persons).
+
+    Args:
+        tracks: result of stage `tracking`, or some frames of it.
+    """
+    if "ground" not in tracks:
+        return np.zeros((tracks.sizes["frame"], tracks.sizes["person"]), dtype=np.bool_)
+    return np.asarray(np.isfinite(tracks["ground"].values).all(axis=-1))
+
+
+def select_triangulated(tracks: xr.Dataset) -> xr.Dataset:
+    """Return tracks without the people, and the detections, that the feet alone place.
+
+    Args:
+        tracks: result of stage `tracking`, or some frames of it.
+    """
+    if "ground" not in tracks:
+        return tracks
+    kinds = [Track.model_validate(track).kind for track in tracks.attrs["tracks"]]
+    chosen = tracks.isel(person=[k for k, kind in enumerate(kinds) if kind != "plane"])
+    index = chosen["detection_index"]
+    values = np.where(find_plane_frames(chosen)[:, None], np.int16(-1), index.values)
+    return chosen.assign(detection_index=(index.dims, values))
+
+
+def add_plane_tracks(
+    found: Identities,
+    detection_index: NDArray[np.int16],
+    is_placed: NDArray[np.bool_],
+    continues: NDArray[np.integer],
+) -> Identities:
+    """Add people on the plane, and the frames in which the feet place triangulated people.
+
+    Args:
+        found: triangulated people.
+        detection_index: (frames, cameras, tracks), as in `Identities`, of tracks by feet.
+        is_placed: (frames, tracks), whether the track has a place.
+        continues: (tracks,) index in `found.person` of the triangulated person; -1 = none.
+    """
+    index, on_plane = found.detection_index.copy(), found.on_plane.copy()
+    for n in np.flatnonzero(continues >= 0):
+        person = continues[n]
+        index[:, :, person] = np.maximum(index[:, :, person], detection_index[:, :, n])
+        on_plane[:, person] |= is_placed[:, n]
+    new = np.flatnonzero(continues < 0)
+    first = int(found.person.max(initial=-1)) + 1
+
+    def widen(array: NDArray[T], axis: int) -> NDArray[T]:
+        shape = list(array.shape)
+        shape[axis] = len(new)
+        return np.concatenate([array, np.full(shape, np.nan, dtype=array.dtype)], axis=axis)
+
+    return replace(
+        found,
+        person=np.append(found.person, first + np.arange(len(new))).astype(np.int32),
+        detection_index=np.concatenate([index, detection_index[:, :, new]], axis=2),
+        ray_distance=widen(found.ray_distance, 2),
+        joints=widen(found.joints, 1),
+        on_plane=np.concatenate([on_plane, is_placed[:, new]], axis=1),
     )
 
 
@@ -207,6 +277,10 @@ def _merge(found: Identities, kept: int, merged: int) -> Identities:
     index[:, :, a] = np.where(taken, index[:, :, b], index[:, :, a])
     distance[:, :, a] = np.where(taken, distance[:, :, b], distance[:, :, a])
     joints[:, a] = np.where(np.isfinite(joints[:, a]), joints[:, a], joints[:, b])
+    # In a frame where either is tracked in 3D, the kept person is.
+    tracked = (found.detection_index[:, :, [a, b]] >= 0).any(axis=1) & ~found.on_plane[:, [a, b]]
+    on_plane = found.on_plane.copy()
+    on_plane[:, a] = found.on_plane[:, [a, b]].any(axis=1) & ~tracked.any(axis=1)
     left = [k for k in range(len(ids)) if k != b]
     names = {n: name for n, name in found.names.items() if n != merged}
     if merged in found.names:
@@ -223,6 +297,7 @@ def _merge(found: Identities, kept: int, merged: int) -> Identities:
         detection_index=index[:, :, left],
         ray_distance=distance[:, :, left],
         joints=joints[:, left],
+        on_plane=on_plane[:, left],
         names=names,
         joins=tuple(joins),
     )
@@ -255,5 +330,6 @@ def _split(found: Identities, person: int, first_frame_of_new: int) -> Identitie
         detection_index=halves(found.detection_index, 2, -1),
         ray_distance=halves(found.ray_distance, 2, np.nan),
         joints=halves(found.joints, 1, np.nan),
+        on_plane=halves(found.on_plane, 1, False),
         joins=joins,
     )

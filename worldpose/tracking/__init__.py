@@ -6,8 +6,14 @@ and camera, quick joints [m], and a summary of each track.
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
 from worldpose.tracking.doubts import describe_doubts
-from worldpose.tracking.feet import GroundPositions, locate_feet
-from worldpose.tracking.ground_tracks import GroundTracks, locate_tracks, track_on_plane
+from worldpose.tracking.feet import GroundPositions, count_covering_cameras, locate_feet
+from worldpose.tracking.ground_tracks import (
+    GroundTracks,
+    TriangulatedPeople,
+    locate_tracks,
+    track_on_plane,
+    triangulated_places,
+)
 from worldpose.tracking.people_selection import roster_limit
 from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
 from worldpose.tracking.settings import TrackingSettings
@@ -21,6 +27,8 @@ __all__ = [
     "Tracking",
     "TrackingReport",
     "TrackingSettings",
+    "TriangulatedPeople",
+    "count_covering_cameras",
     "describe_doubts",
     "diagnose_no_people",
     "estimate_plane_clocks",
@@ -29,4 +37,5 @@ __all__ = [
     "roster_limit",
     "track_on_plane",
     "track_people",
+    "triangulated_places",
 ]

@@ -6,12 +6,14 @@ sight, and short across.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
@@ -35,6 +37,15 @@ bundled nets put the same people 0.23 m apart at 0, 0.19 at 0.5, 0.17 at 1; in s
 two kinds errors change by 2 cm between 0 and 0.7."""
 ACROSS_STD: Final = 0.09
 """Standard deviation of the middle of the feet from the mid-hip, across the line of sight [m]."""
+BORDER_SHARE: Final = 0.03
+"""A box so near to the image's border, relative to its height, is cut by it [1]."""
+PART_OVERLAP: Final = 0.3
+"""Share of the smaller box from which two boxes may be of one person [1]. Second boxes of a person
+on the real pair: 0.3 to 1.0; people apart: 0."""
+COVER_HEIGHT_M: Final = 1.7
+"""Height of a person whom a camera should see [m]."""
+MIN_COVER_SIZE: Final = 0.6
+"""Such a camera shows the person at least this large, relative to the camera that does see it."""
 PIXEL_STD: Final = 1.0
 """Standard deviation of a keypoint [px], in addition to `PIXEL_SHARE`."""
 PIXEL_SHARE: Final = 0.02
@@ -52,12 +63,25 @@ class GroundPositions:
             which all detections of a camera nearby share.
         height: (frames, cameras, detections) [m], of the person over the ground, by the upper edge
             of the box; NaN where not known.
+        is_whole: (frames, cameras, detections), False for a part of a person: cut by the image
+            border, or overlapping a surer detection. None = all are whole.
+        boxes: (frames, cameras, detections, 4) [px]; None = not known.
     """
 
     xy: Floats
     noise: Floats
     calibration: Floats
     height: Floats
+    is_whole: Flags | None = None
+    boxes: Floats | None = None
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[GroundPositions]) -> GroundPositions:
+        """Return the frames of several parts, one after the other."""
+        names = ["xy", "noise", "calibration", "height"]
+        if all(part.boxes is not None for part in parts):
+            names += ["is_whole", "boxes"]
+        return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
 def locate_feet(
@@ -88,6 +112,7 @@ def locate_feet(
     noise = np.full((*shape, 2, 2), np.nan)
     calibration = np.zeros((*shape, 2, 2))
     height = np.full(shape, np.nan)
+    is_whole = None if boxes is None else np.zeros(shape, dtype=np.bool_)
     for c in range(shape[1]):
         camera = cameras[c]
         feet = np.array(keypoints[:, c, :, ANKLES, :], dtype=np.float64)  # (2, frames, people, 2)
@@ -113,8 +138,9 @@ def locate_feet(
             box = np.asarray(boxes[:, c], dtype=np.float64)
             bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
             # A person who is cut by the image's border has no known middle or feet.
-            inside = (box[..., 3] < camera.image_size[1] - 2.0) & (box[..., 0] > 1.0)
-            inside &= box[..., 2] < camera.image_size[0] - 2.0
+            inside = _are_inside(box, camera.image_size)
+            assert is_whole is not None
+            is_whole[:, c] = inside & ~_are_parts(box, confidence[:, c])
             lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
             absent = ~np.isfinite(place[..., 0])
             place[absent] = lower[absent]
@@ -133,7 +159,60 @@ def locate_feet(
             calibration[:, c][known] = motion @ camera_covariance[c] @ motion.swapaxes(1, 2)
     xy[~np.isfinite(noise).all(axis=(-1, -2))] = np.nan
     xy[~np.isfinite(calibration).all(axis=(-1, -2))] = np.nan
-    return GroundPositions(xy, noise, calibration, height)
+    kept = None if boxes is None else np.asarray(boxes, dtype=np.float64)
+    return GroundPositions(xy, noise, calibration, height, is_whole, kept)
+
+
+def _are_inside(boxes: Floats, image_size: NDArray[np.int64]) -> Flags:
+    """Return whether boxes (..., 4) [px] do not reach the image's border."""
+    with np.errstate(invalid="ignore"):
+        margin = np.maximum(2.0, BORDER_SHARE * (boxes[..., 3] - boxes[..., 1]))[..., None]
+        low, high = boxes[..., :2] >= margin, boxes[..., 2:] <= image_size - 1.0 - margin
+    low[..., 1] = True  # the feet do not depend on the head
+    return np.asarray(low.all(axis=-1) & high.all(axis=-1))
+
+
+def _are_parts(boxes: Floats, confidence: AnyFloats) -> Flags:
+    """Return which boxes (frames, detections, 4) a surer detection may explain.
+
+    Detectors give a person's upper body, or the legs, a box of their own beside the whole one.
+
+    Args:
+        boxes: (frames, detections, 4) [px].
+        confidence: (frames, detections, 17).
+    """
+    low = np.maximum(boxes[:, :, None, :2], boxes[:, None, :, :2])
+    high = np.minimum(boxes[:, :, None, 2:], boxes[:, None, :, 2:])
+    total = np.nansum(confidence, axis=-1)
+    with np.errstate(invalid="ignore"):
+        common = np.clip(high - low, 0.0, None).prod(axis=-1)
+        area = (boxes[..., 2:] - boxes[..., :2]).prod(axis=-1)
+        overlap = common >= PART_OVERLAP * np.minimum(area[:, :, None], area[:, None])
+    surer = total[:, None] > total[:, :, None]
+    return np.asarray((overlap & surer).any(axis=2))
+
+
+def count_covering_cameras(cameras: Camera, positions: GroundPositions) -> NDArray[np.int64]:
+    """Return how many cameras should see the person of each detection, the own one included.
+
+    A camera should if the whole person is in its image, and not much smaller than in the camera
+    that has the detection. Other people may stand in between.
+
+    Args:
+        cameras: batch (cameras,).
+        positions: places (frames, cameras, detections).
+    """
+    found = np.nonzero(np.isfinite(positions.xy[..., 0]))
+    xy = positions.xy[found]
+    ends = np.stack([np.insert(xy, 2, z, axis=1) for z in (0.0, COVER_HEIGHT_M)])
+    pixels = cameras[:, None].project(ends)  # (cameras, ends, detections, 2)
+    size = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0.0) & (pixels <= cameras.image_size[:, None, None] - 1.0)
+        large = size >= MIN_COVER_SIZE * size[found[1], np.arange(len(xy))]
+    count = np.zeros(positions.xy.shape[:3], dtype=np.int64)
+    count[found] = np.maximum(1, np.count_nonzero(inside.all(axis=(1, -1)) & large, axis=0))
+    return count
 
 
 def _height_above(camera: Camera, pixels: Floats, place: Floats, pitch: PitchTemplate) -> Floats:

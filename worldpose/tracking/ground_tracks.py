@@ -7,16 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Singles
 from worldpose.tracking.feet import GroundPositions
+from worldpose.tracking.plane_paths import (
+    MIN_TRACK_S,
+    PlanePath,
+    drop_doubles,
+    has_odd_height,
+    is_contradicted,
+    is_flag,
+    merge_paths,
+    track_height,
+)
 
+HIPS: Final = [11, 12]
+"""The hips in COCO-17."""
 CORRELATION_S: Final = 0.16
 """Correlation time of the errors of feet [s], about half a step."""
 ACCELERATION: Final = 4.0
@@ -29,22 +40,30 @@ GATE: Final = 13.8
 """Maximum squared Mahalanobis distance of a matched detection [1]: 99.9 % of two dimensions."""
 MAX_LOST_S: Final = 1.0
 """Time after which an unseen person's track ends [s]."""
-MIN_TRACK_S: Final = 0.4
-"""Least time with detections of a track [s]."""
+MAX_NEW_LOST_S: Final = 0.2
+"""Time without a whole detection after which a track ends that has had few so far [s]."""
 MIN_SEEN: Final = 0.4
 """Least share of its frames in which a track is seen [1]."""
-HEIGHTS: Final = (1.1, 2.4)
-"""Range of a track's median height [m]."""
-FLAG_DISTANCE: Final = 1.0
-"""A track that never leaves this distance from a corner is a flag [m]."""
-DOUBLE_DISTANCE: Final = 1.0
-"""A second track of a person stays this near to the first [m]."""
-BODY_DISTANCE: Final = 0.5
-"""Two tracks nearer than this for half of their common time are one person [m]."""
-MAX_DOUBLE: Final = 0.7
-"""Largest length of such a track relative to the first [1]."""
-SAME_PERSON_M: Final = 1.0
-"""Two tracks nearer than this on average, that no camera sees apart, are one person [m]."""
+TRIANGULATED_STD_M: Final = 0.15
+"""Standard deviation of the feet from the mid-hip of a triangulated person, per axis [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriangulatedPeople:
+    """People of a clip who are triangulated in some frames; plane tracks may continue them.
+
+    Attributes:
+        xy: (frames, persons, 2) [m], world, mid-hip; NaN where not triangulated.
+        is_tracked: (frames, persons), whether the tracker in 3D has detections of the person.
+    """
+
+    xy: Floats
+    is_tracked: NDArray[np.bool_]
+
+
+def triangulated_places(joints: Singles) -> Floats:
+    """Return the mid-hips on the ground (frames, persons, 2) [m] of joints (..., 17, 3)."""
+    return np.asarray(joints[:, :, HIPS, :2].mean(axis=2), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +76,8 @@ class GroundTracks:
         velocity: (frames, persons, 2) [m/s].
         covariance: (frames, persons, 2, 2) [m^2], of `xy`: noise of the feet, and calibration.
         height: (persons,) [m], median over the track; NaN where not known.
+        continues: (persons,) index of the triangulated person whose track this is where the person
+            is not triangulated, possibly in several parts; -1 = never triangulated.
     """
 
     detection_index: NDArray[np.int16]
@@ -64,6 +85,7 @@ class GroundTracks:
     velocity: Floats
     covariance: Floats
     height: Floats
+    continues: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +103,11 @@ class _Sight:
         where = (frame, camera, detection)
         return cls(positions.xy[where], colour * positions.noise[where])
 
+    @classmethod
+    def at_place(cls, place: Floats) -> _Sight:
+        """Return the place of a triangulated person."""
+        return cls(place, TRIANGULATED_STD_M**2 * np.eye(2))
+
 
 @dataclass(eq=False)
 class _Track:
@@ -90,7 +117,11 @@ class _Track:
     covariance: Floats
     first: int
     last_seen: int
+    last_whole: int
     seen: int = 0
+    """Frames with a whole detection."""
+    person: int = -1
+    """Triangulated person; -1 = none."""
     steps: list[tuple[Floats, Floats, Floats, Floats]] = field(default_factory=list)
     """By frame: predicted state and covariance, updated state and covariance."""
     index: dict[int, dict[int, int]] = field(default_factory=dict)
@@ -102,7 +133,9 @@ class _Track:
         covariance = np.diag([0.0, 0.0, SPEED**2, SPEED**2])
         covariance[:2, :2] = sight.noise
         state = np.array([*sight.place, 0.0, 0.0])
-        return cls(state, covariance, frame, frame, steps=[(state, covariance, state, covariance)])
+        return cls(
+            state, covariance, frame, frame, frame, steps=[(state, covariance, state, covariance)]
+        )
 
     def predict(self, move: Floats, drift: Floats) -> None:
         """Go to the next frame."""
@@ -120,12 +153,13 @@ class _Track:
         before = self.steps[-1]
         self.steps[-1] = (before[0], before[1], self.state, self.covariance)
 
-    def note(self, frame: int, camera: int, detection: int) -> None:
+    def note(self, frame: int, camera: int, detection: int, *, is_whole: bool) -> None:
         """Assign a detection of a camera to this person."""
-        seen = self.index.setdefault(frame, {})
-        self.seen += not seen
-        seen[camera] = detection
+        self.index.setdefault(frame, {})[camera] = detection
         self.last_seen = frame
+        if is_whole and (self.last_whole < frame or not self.seen):
+            self.seen += 1
+            self.last_whole = frame
 
 
 def _look(clock: float) -> Floats:
@@ -140,6 +174,8 @@ def track_on_plane(
     *,
     pitch_size: tuple[float, float],
     margin_m: float = 2.0,
+    triangulated: TriangulatedPeople | None = None,
+    covering: NDArray[np.integer] | None = None,
 ) -> GroundTracks:
     """Return the tracks of people by their feet (T1, without triangulation).
 
@@ -148,12 +184,19 @@ def track_on_plane(
     start people. A backward pass smooths each track. Tracks of two cameras that stay together are
     one person.
 
+    A triangulated person is a track as well, which takes the detections near it and goes on where
+    triangulation ends. A track by feet that meets a person who begins to be triangulated becomes
+    that person's.
+
     Args:
-        positions: the clip's foot positions.
+        positions: the clip's foot positions; with `triangulated`, NaN where a detection is theirs.
         fps: frames per second [1/s].
         clock_s: by camera, time of its image minus time of the frame [s]; None = in step.
         pitch_size: length and width of the pitch [m].
         margin_m: people always farther outside than this are bystanders [m].
+        triangulated: people who are triangulated in some frames; None = none.
+        covering: (frames, cameras, detections), cameras that should see a person there; None =
+            not known. People whom few of them see are dropped.
     """
     frames, cameras = positions.xy.shape[:2]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
@@ -164,28 +207,70 @@ def track_on_plane(
     for frame in range(frames):
         for track in running:
             track.predict(move, drift)
+        if triangulated is not None:
+            _follow_triangulated(running, triangulated.xy[frame], frame)
         for c in range(cameras):
             _update(running, positions, frame, c, float(clocks[c]), colour)
-        lost = [track for track in running if (frame - track.last_seen) * dt > MAX_LOST_S]
+        lost = [track for track in running if _is_lost(track, frame, dt)]
         ended += lost
         running = [track for track in running if track not in lost]
     kept = [
         track
         for track in ended + running
-        if track.seen * dt >= min(MIN_TRACK_S, frames * dt)
-        and track.seen >= MIN_SEEN * (track.last_seen - track.first + 1)
+        if track.person >= 0
+        or (
+            track.seen * dt >= min(MIN_TRACK_S, frames * dt)
+            and track.seen >= MIN_SEEN * (track.last_seen - track.first + 1)
+        )
     ]
-    paths = _merge_tracks([_smooth(track, move) for track in kept], fps)
+    paths = merge_paths([_smooth(track, move) for track in kept], fps, positions.boxes)
     half = 0.5 * np.asarray(pitch_size) + margin_m
-    paths = [path for path in paths if (np.abs(path.xy) <= half).all(axis=1).any()]
     paths = [
         path
         for path in paths
-        if not _is_flag(path, pitch_size) and not _has_odd_height(path, positions)
+        if path.person >= 0
+        or (
+            (np.abs(path.xy) <= half).all(axis=1).any()
+            and not is_flag(path, pitch_size)
+            and not has_odd_height(path, positions)
+            and not is_contradicted(path, covering)
+        )
     ]
-    paths = _drop_doubles(paths)
+    paths = drop_doubles(paths)
     paths.sort(key=lambda path: path.first)
-    return _collect(paths, positions)
+    if triangulated is None:
+        return _collect(paths, positions)
+    return _without_triangulated(_collect(paths, positions), triangulated)
+
+
+def _without_triangulated(tracks: GroundTracks, triangulated: TriangulatedPeople) -> GroundTracks:
+    """Return the tracks where their people are not tracked in 3D."""
+    index = tracks.detection_index.copy()
+    xy, velocity, covariance = (
+        array.copy() for array in (tracks.xy, tracks.velocity, tracks.covariance)
+    )
+    for n, person in enumerate(tracks.continues.tolist()):
+        if person < 0:
+            continue
+        seen = (index[:, :, n] >= 0).any(axis=1) & ~triangulated.is_tracked[:, person]
+        stays = np.zeros(len(seen), dtype=np.bool_)
+        # Between two sightings, unless the person is tracked in 3D there.
+        stretch = np.cumsum(triangulated.is_tracked[:, person])
+        for part in np.unique(stretch[seen]):
+            inside = np.flatnonzero(seen & (stretch == part))
+            stays[inside[0] : inside[-1] + 1] = True
+        index[~stays, :, n] = -1
+        for array in (xy, velocity, covariance):
+            array[~stays, n] = np.nan
+    kept = (index >= 0).any(axis=(0, 1))
+    return GroundTracks(
+        index[:, :, kept],
+        xy[:, kept],
+        velocity[:, kept],
+        covariance[:, kept],
+        tracks.height[kept],
+        tracks.continues[kept],
+    )
 
 
 def locate_tracks(
@@ -193,6 +278,7 @@ def locate_tracks(
     detection_index: NDArray[np.integer],
     fps: float,
     clock_s: Sequence[float] | Floats | None = None,
+    triangulated_xy: Floats | None = None,
 ) -> GroundTracks:
     """Return smoothed places of people whose detections are known.
 
@@ -201,6 +287,8 @@ def locate_tracks(
         detection_index: (frames, cameras, persons), each person's detection; -1 = not seen.
         fps: frames per second [1/s].
         clock_s: as in `track_on_plane`.
+        triangulated_xy: (frames, persons, 2) [m], where the same people are triangulated; NaN
+            elsewhere. None = nowhere.
     """
     cameras, persons = detection_index.shape[1:]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
@@ -208,11 +296,21 @@ def locate_tracks(
     paths = []
     for person in range(persons):
         index = detection_index[:, :, person]
-        seen = np.flatnonzero((index >= 0).any(axis=1))
+        fixed = np.full((len(index), 2), np.nan)
+        if triangulated_xy is not None and (index >= 0).any():
+            fixed = triangulated_xy[:, person]
+        seen = np.flatnonzero((index >= 0).any(axis=1) | np.isfinite(fixed[:, 0]))
         track: _Track | None = None
         for frame in range(seen[0], seen[-1] + 1) if len(seen) else ():
             if track is not None:
                 track.predict(move, drift)
+            if np.isfinite(fixed[frame, 0]):
+                sight = _Sight.at_place(fixed[frame])
+                if track is None:
+                    track = _Track.start(sight, frame)
+                else:
+                    track.correct(sight, 0.0)
+                track.last_seen = frame
             for camera in np.flatnonzero(index[frame] >= 0).tolist():
                 detection = int(index[frame, camera])
                 if not np.isfinite(positions.xy[frame, camera, detection, 0]):
@@ -222,54 +320,9 @@ def locate_tracks(
                     track = _Track.start(sight, frame)
                 else:
                     track.correct(sight, float(clocks[camera]))
-                track.note(frame, camera, detection)
+                track.note(frame, camera, detection, is_whole=True)
         paths.append(None if track is None else _smooth(track, move))
     return _collect(paths, positions, detection_index)
-
-
-def _is_flag(path: _Path, pitch_size: tuple[float, float]) -> bool:
-    """Return whether a path never leaves a corner: a flag, which nets mistake for people."""
-    corner = np.abs(path.xy) - 0.5 * np.asarray(pitch_size)
-    return bool((np.linalg.norm(corner, axis=1) < FLAG_DISTANCE).all())
-
-
-def _drop_doubles(paths: list[_Path]) -> list[_Path]:
-    """Drop paths that always stay close to a longer one: second boxes of the same person.
-
-    Two players in a tackle have been apart before, or part after it.
-    """
-    kept: list[_Path] = []
-    for path in sorted(paths, key=lambda path: -len(path.xy)):
-        if not any(_is_double(path, other) for other in kept):
-            kept.append(path)
-    return kept
-
-
-def _is_double(path: _Path, other: _Path) -> bool:
-    """Return whether `path` lies in the time of `other`, which is longer, and always near it."""
-    if len(path.xy) > MAX_DOUBLE * len(other.xy):
-        return False
-    if path.first < other.first or path.last > other.last:
-        return False
-    there = other.xy[path.first - other.first : path.last - other.first + 1]
-    return bool((np.linalg.norm(path.xy - there, axis=1) < DOUBLE_DISTANCE).all())
-
-
-def _track_height(path: _Path, positions: GroundPositions) -> float:
-    """Return the median height of a path's person [m]; NaN where not known."""
-    heights = [
-        positions.height[frame, camera, detection]
-        for frame, seen in path.index.items()
-        for camera, detection in seen.items()
-    ]
-    known = np.array(heights)[np.isfinite(heights)]
-    return float(np.median(known)) if len(known) else np.nan
-
-
-def _has_odd_height(path: _Path, positions: GroundPositions) -> bool:
-    """Return whether no person has the path's height: a ball, a mark, two people in one box."""
-    height = _track_height(path, positions)
-    return bool(np.isfinite(height)) and not HEIGHTS[0] <= height <= HEIGHTS[1]
 
 
 def _motion(fps: float) -> tuple[Floats, Floats, float]:
@@ -282,6 +335,13 @@ def _motion(fps: float) -> tuple[Floats, Floats, float]:
     return move, drift, max(1.0, 2.0 * CORRELATION_S * fps)
 
 
+def _is_lost(track: _Track, frame: int, dt: float) -> bool:
+    """Return whether a track ends; a new one soon, because it may be a part of another person."""
+    if track.person < 0 and track.seen * dt < MIN_TRACK_S:
+        return (frame - track.last_whole) * dt > MAX_NEW_LOST_S
+    return (frame - track.last_seen) * dt > MAX_LOST_S
+
+
 def _update(
     tracks: list[_Track],
     positions: GroundPositions,
@@ -290,59 +350,82 @@ def _update(
     clock: float,
     colour: float,
 ) -> None:
-    """Match the detections of one camera with people; the others start people."""
-    here = np.flatnonzero(np.isfinite(positions.xy[frame, camera, :, 0]))
-    look = _look(clock)
-    sights = [_Sight.of(positions, frame, camera, int(d), colour) for d in here]
-    free = np.ones(len(here), dtype=np.bool_)
-    if len(here) and tracks:
-        places = np.stack([sight.place for sight in sights])
-        wide = np.stack([sight.noise for sight in sights])
-        wide += positions.calibration[frame, camera, here]
-        states = np.stack([track.state for track in tracks])
-        spread = look @ np.stack([track.covariance for track in tracks]) @ look.T
-        total = spread[:, None] + wide[None]
-        off = places[None] - (states @ look.T)[:, None]
-        squared = np.einsum("tdi,tdij,tdj->td", off, np.linalg.inv(total), off)
-        size = np.log(np.linalg.det(total))
-        cost = np.where(squared < GATE, squared + size, GATE + size.max() + 1.0)
-        for row, column in zip(*linear_sum_assignment(cost), strict=True):
-            if squared[row, column] < GATE:
-                tracks[row].correct(sights[column], clock)
-                tracks[row].note(frame, camera, int(here[column]))
-                free[column] = False
-    for column in np.flatnonzero(free):
-        track = _Track.start(sights[column], frame)
-        track.note(frame, camera, int(here[column]))
-        tracks.append(track)
+    """Match the detections of one camera with people; the others start people.
 
-
-@dataclass(frozen=True, eq=False)
-class _Path:
-    """A smoothed track.
-
-    Attributes:
-        first: first frame.
-        state: (frames, 4) of the track, place and velocity [m, m/s].
-        covariance: (frames, 4, 4).
-        index: frame to camera to detection.
+    Parts of people come last, and start none: most are second boxes of a person.
     """
+    seen = np.isfinite(positions.xy[frame, camera, :, 0])
+    whole = seen if positions.is_whole is None else seen & positions.is_whole[frame, camera]
+    unseen = tracks
+    for is_whole, chosen in ((True, whole), (False, seen & ~whole)):
+        here = np.flatnonzero(chosen)
+        sights = [_Sight.of(positions, frame, camera, int(d), colour) for d in here]
+        lasting = positions.calibration[frame, camera, here]
+        pairs = {column: row for row, column in _match(unseen, sights, lasting, clock)}
+        taken = set()
+        for column, sight in enumerate(sights):
+            if column in pairs:
+                track = unseen[pairs[column]]
+                track.correct(sight, clock)
+            elif is_whole:
+                track = _Track.start(sight, frame)
+                tracks.append(track)
+            else:
+                continue
+            track.note(frame, camera, int(here[column]), is_whole=is_whole)
+            taken.add(id(track))
+        unseen = [track for track in unseen if id(track) not in taken]
 
-    first: int
-    state: Floats
-    covariance: Floats
-    index: dict[int, dict[int, int]]
 
-    @property
-    def xy(self) -> Floats:
-        return self.state[:, :2]
+def _match(
+    tracks: list[_Track], sights: list[_Sight], lasting: Floats, clock: float
+) -> list[tuple[int, int]]:
+    """Return pairs of track and sight by the Hungarian method, within the gate.
 
-    @property
-    def last(self) -> int:
-        return self.first + len(self.state) - 1
+    Args:
+        tracks: predicted people.
+        sights: detections of one camera.
+        lasting: (sights, 2, 2) [m^2], error that does not change from frame to frame.
+        clock: time of the image minus time of the frame [s].
+    """
+    if not tracks or not sights:
+        return []
+    look = _look(clock)
+    places = np.stack([sight.place for sight in sights])
+    wide = np.stack([sight.noise for sight in sights]) + lasting
+    states = np.stack([track.state for track in tracks])
+    spread = look @ np.stack([track.covariance for track in tracks]) @ look.T
+    total = spread[:, None] + wide[None]
+    off = places[None] - (states @ look.T)[:, None]
+    squared = np.einsum("tdi,tdij,tdj->td", off, np.linalg.inv(total), off)
+    size = np.log(np.linalg.det(total))
+    cost = np.where(squared < GATE, squared + size, GATE + size.max() + 1.0)
+    pairs = zip(*linear_sum_assignment(cost), strict=True)
+    return [(int(row), int(column)) for row, column in pairs if squared[row, column] < GATE]
 
 
-def _smooth(track: _Track, move: Floats) -> _Path:
+def _follow_triangulated(tracks: list[_Track], places: Floats, frame: int) -> None:
+    """Correct the tracks of triangulated people; one who has none takes a track nearby."""
+    followed = {track.person: track for track in tracks if track.person >= 0}
+    here = [int(person) for person in np.flatnonzero(np.isfinite(places[:, 0]))]
+    new = [person for person in here if person not in followed]
+    free = [track for track in tracks if track.person < 0]
+    sights = [_Sight.at_place(places[person]) for person in new]
+    for row, column in _match(free, sights, np.zeros((len(new), 2, 2)), 0.0):
+        free[row].person = new[column]
+        followed[new[column]] = free[row]
+    for person in here:
+        sight = _Sight.at_place(places[person])
+        if person in followed:
+            followed[person].correct(sight, 0.0)
+            followed[person].last_seen = frame
+        else:
+            track = _Track.start(sight, frame)
+            track.person = person
+            tracks.append(track)
+
+
+def _smooth(track: _Track, move: Floats) -> PlanePath:
     """Return the track up to its last sighting, smoothed backwards (Rauch, Tung and Striebel)."""
     steps = track.steps[: track.last_seen - track.first + 1]
     state, covariance = steps[-1][2], steps[-1][3]
@@ -353,76 +436,17 @@ def _smooth(track: _Track, move: Floats) -> _Path:
         covariance = here[3] + gain @ (covariance - after[1]) @ gain.T
         states.append(state)
         covariances.append(covariance)
-    return _Path(track.first, np.stack(states[::-1]), np.stack(covariances[::-1]), track.index)
-
-
-def _merge_tracks(paths: list[_Path], fps: float) -> list[_Path]:
-    """Join paths that are one person's."""
-    merged = True
-    while merged:
-        merged = False
-        for a, b in combinations(range(len(paths)), 2):
-            if _is_same_person(paths[a], paths[b], fps):
-                both = _join(paths[a], paths[b])
-                paths = [path for i, path in enumerate(paths) if i not in (a, b)] + [both]
-                merged = True
-                break
-    return paths
-
-
-def _common(a: _Path, b: _Path) -> tuple[slice, slice]:
-    """Return the common frames of two paths, as rows of each; empty if there are none."""
-    first, last = max(a.first, b.first), max(min(a.last, b.last), max(a.first, b.first) - 1)
-    return (
-        slice(first - a.first, last - a.first + 1),
-        slice(first - b.first, last - b.first + 1),
+    return PlanePath(
+        track.first,
+        np.stack(states[::-1]),
+        np.stack(covariances[::-1]),
+        track.index,
+        track.person,
     )
-
-
-def _is_same_person(a: _Path, b: _Path, fps: float) -> bool:
-    """Return whether two paths are one person's.
-
-    Either they stay near each other and no camera sees both in one frame, or they lie so close for
-    so long that two bodies would be in one place: two boxes of one person.
-    """
-    ours, theirs = _common(a, b)
-    apart = np.linalg.norm(a.xy[ours] - b.xy[theirs], axis=1)
-    if not len(apart):
-        return False
-    inside = len(apart) >= MIN_TRACK_S * fps and np.quantile(apart, 0.9) < DOUBLE_DISTANCE
-    if inside and np.median(apart) < BODY_DISTANCE:
-        return True
-    frames = set(a.index) & set(b.index)
-    return bool(apart.mean() <= SAME_PERSON_M) and not any(
-        set(a.index[frame]) & set(b.index[frame]) for frame in frames
-    )
-
-
-def _join(a: _Path, b: _Path) -> _Path:
-    """Return two paths of one person as one; the longer one's detections count where both have."""
-    if len(b.index) > len(a.index):
-        a, b = b, a
-    ours, theirs = _common(a, b)
-    start, stop = min(a.first, b.first), max(a.last, b.last)
-    state = np.full((stop - start + 1, 4), np.nan)
-    covariance = np.full((stop - start + 1, 4, 4), np.nan)
-    for path in (a, b):
-        rows = slice(path.first - start, path.last - start + 1)
-        state[rows], covariance[rows] = path.state, path.covariance
-    rows = slice(a.first + ours.start - start, a.first + ours.stop - start)
-    inverse_a, inverse_b = (np.linalg.inv(p.covariance[s]) for p, s in ((a, ours), (b, theirs)))
-    covariance[rows] = np.linalg.inv(inverse_a + inverse_b)
-    total = inverse_a @ a.state[ours][..., None] + inverse_b @ b.state[theirs][..., None]
-    state[rows] = (covariance[rows] @ total)[..., 0]
-    index = {
-        frame: {**b.index.get(frame, {}), **a.index.get(frame, {})}
-        for frame in sorted(set(a.index) | set(b.index))
-    }
-    return _Path(start, state, covariance, index)
 
 
 def _collect(
-    paths: Sequence[_Path | None],
+    paths: Sequence[PlanePath | None],
     positions: GroundPositions,
     detection_index: NDArray[np.integer] | None = None,
 ) -> GroundTracks:
@@ -435,7 +459,7 @@ def _collect(
     for n, path in enumerate(paths):
         if path is None:
             continue
-        height[n] = _track_height(path, positions)
+        height[n] = track_height(path, positions)
         rows = slice(path.first, path.last + 1)
         state[rows, n] = path.state
         covariance[rows, n] = path.covariance[:, :2, :2]
@@ -450,4 +474,5 @@ def _collect(
             covariance[frame, n] += lasting
     if detection_index is not None:
         index = detection_index.astype(np.int16)
-    return GroundTracks(index, state[..., :2], state[..., 2:], covariance, height)
+    continues = np.array([-1 if path is None else path.person for path in paths], dtype=np.int64)
+    return GroundTracks(index, state[..., :2], state[..., 2:], covariance, height, continues)

@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given as given_that
 from hypothesis import strategies as st
 
 from data_contracts.review import MergedTracks, NamedTrack, Sighting, SplitTrack
 from data_contracts.tracking import Join
-from worldpose.review.identities import Identities, find_sighting, replay_identities
+from worldpose.review.identities import (
+    Identities,
+    add_plane_tracks,
+    find_sighting,
+    replay_identities,
+    select_triangulated,
+)
 
 FIRST = 100
 """Match frame of the clip's first."""
@@ -32,6 +39,7 @@ def identities():
         detection_index=index,
         ray_distance=distance,
         joints=joints,
+        on_plane=np.zeros((6, 3), dtype=np.bool_),
         names={},
         joins=(join,),
     )
@@ -47,8 +55,10 @@ def split(person, frame, **seen):
 
 def same(a, b):
     return all(
-        np.array_equal(getattr(a, name), getattr(b, name), equal_nan=name != "person")
-        for name in ("person", "detection_index", "ray_distance", "joints")
+        np.array_equal(
+            getattr(a, name), getattr(b, name), equal_nan=name in ("ray_distance", "joints")
+        )
+        for name in ("person", "detection_index", "ray_distance", "joints", "on_plane")
     )
 
 
@@ -152,3 +162,55 @@ def test_every_detection_stays_somebodys_and_replay_gives_the_same(edits):
             assert [n for n in theirs[0] if n >= 0] == [n for n in theirs[1] if n >= 0]
     assert len(set(after.person.tolist())) == len(after.person)
     assert all(track.frames_seen for track in after.tracks)
+
+
+def mixed_identities():
+    """As `identities`; person 0 goes on by the feet for two frames, and 3 is on the plane alone."""
+    index = np.full((6, 2, 2), -1, dtype=np.int16)
+    index[3:5, 1, 0] = 4
+    index[1:, 0, 1] = 5
+    placed = (index >= 0).any(axis=1)
+    return add_plane_tracks(identities(), index, placed, np.array([0, -1]))
+
+
+def test_people_on_the_plane_are_added_and_triangulated_ones_continued():
+    found, before = mixed_identities(), identities()
+    assert found.person.tolist() == [0, 1, 2, 3]
+    assert [track.kind for track in found.tracks] == [
+        "mixed",
+        "triangulated",
+        "triangulated",
+        "plane",
+    ]
+    assert [track.plane_frames for track in found.tracks] == [2, 0, 0, 5]
+    assert (found.tracks[0].first_frame, found.tracks[0].last_frame) == (0, 4)
+    np.testing.assert_array_equal(found.joints[:, :3], before.joints)
+
+
+def test_triangulation_takes_the_detections_that_it_took_without_people_on_the_plane():
+    found, before = mixed_identities(), identities()
+    ground = np.where(found.on_plane[..., None], 1.0, np.nan) * np.ones(2)
+    stored = xr.Dataset(
+        {
+            "detection_index": (("frame", "camera", "person"), found.detection_index),
+            "ground": (("frame", "person", "axis"), ground),
+        },
+        coords={"frame": found.frame, "person": found.person},
+        attrs={"tracks": [track.model_dump(mode="json") for track in found.tracks]},
+    )
+    chosen = select_triangulated(stored)
+    np.testing.assert_array_equal(chosen["person"].values, before.person)
+    np.testing.assert_array_equal(chosen["detection_index"].values, before.detection_index)
+    assert chosen["detection_index"].dtype == np.int16
+    chosen = select_triangulated(stored.sel(frame=found.frame[::2]))
+    np.testing.assert_array_equal(chosen["detection_index"].values, before.detection_index[::2])
+
+
+def test_edits_keep_the_kind_of_every_frame():
+    found = mixed_identities()
+    found.detection_index[3:5, 1, 1] = -1  # else one camera sees both people side by side
+    merged = replay_identities(found, [merge(0, 1)]).identities
+    # Person 1 is tracked in 3D in the frames in which the feet placed person 0.
+    assert merged.tracks[0].kind == "triangulated"
+    parts = replay_identities(found, [split(0, FIRST + 3)]).identities.tracks
+    assert (parts[0].kind, parts[-1].kind) == ("triangulated", "plane")

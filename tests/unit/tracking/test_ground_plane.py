@@ -11,6 +11,8 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import step_camera
 from worldpose.tracking import (
     GroundPositions,
+    TriangulatedPeople,
+    count_covering_cameras,
     estimate_plane_clocks,
     locate_feet,
     locate_tracks,
@@ -228,3 +230,82 @@ def test_people_of_one_camera_tell_no_clock():
     apart = np.concatenate([truth, truth + [30.0, 0.0]], axis=1)
     apart = replace(positions_at(apart))
     assert np.isinf(estimate_plane_clocks(apart, FPS, pitch_size=SIZE).std).all()
+
+
+def mixed_run(frames=100):
+    """A runner whom a camera sees, triangulated in frames 30 to 59, and a neighbour."""
+    rng = np.random.default_rng(6)
+    truth = walkers(frames, [[0.0, 0.0], [2.0, 3.0]], [[4.0, 1.0], [4.0, 1.0]])
+    seen = truth[:, None] + 0.1 * rng.standard_normal((frames, 1, 2, 2))
+    middle = np.full((frames, 1, 2), np.nan)
+    middle[30:60] = truth[30:60, :1]
+    return truth, positions_at(seen), TriangulatedPeople(middle, np.isfinite(middle[..., 0]))
+
+
+def test_a_person_keeps_the_identity_before_and_after_triangulation():
+    truth, positions, people = mixed_run()
+    tracks = track_on_plane(positions, FPS, pitch_size=SIZE, triangulated=people)
+    assert sorted(tracks.continues.tolist()) == [-1, 0]
+    (k,) = np.flatnonzero(tracks.continues == 0)
+    seen = tracks.detection_index[:, 0, k]
+    assert (seen[~people.is_tracked[:, 0]] == 0).all() and (
+        seen[people.is_tracked[:, 0]] == -1
+    ).all()
+    np.testing.assert_array_equal(np.isfinite(tracks.xy[:, k, 0]), ~people.is_tracked[:, 0])
+    off = np.linalg.norm(tracks.xy[:, k] - truth[:, 0], axis=-1)
+    assert np.nanmax(off) < 0.3
+    # The neighbour, 3.6 m away and never triangulated, is another person.
+    assert (tracks.detection_index[:, 0, 1 - k] == 1).all()
+    again = locate_tracks(positions, tracks.detection_index[:, :, [k]], FPS, None, people.xy)
+    assert np.nanmax(np.linalg.norm(again.xy[:, 0] - truth[:, 0], axis=-1)) < 0.3
+
+
+def test_detections_beside_a_triangulated_person_are_no_second_person():
+    truth, positions, _ = mixed_run()
+    everywhere = TriangulatedPeople(truth[:, :1], np.ones((len(truth), 1), dtype=np.bool_))
+    tracks = track_on_plane(positions, FPS, pitch_size=SIZE, triangulated=everywhere)
+    assert tracks.continues.tolist() == [-1]
+    assert (tracks.detection_index[:, 0, 0] == 1).all()
+
+
+def test_a_person_whom_most_cameras_should_see_and_do_not_is_dropped(ring):
+    truth = walkers(60, [[0.0, 0.0]], [[1.0, 0.0]])
+    seen = np.full((60, 8, 1, 2), np.nan)
+    seen[:, 0] = truth
+    positions = positions_at(seen)
+    for count, people in ((8, 0), (2, 1)):
+        few = GroundPositions(
+            *(
+                getattr(positions, name)[:, :count]
+                for name in ("xy", "noise", "calibration", "height")
+            )
+        )
+        covering = count_covering_cameras(ring(8)[:count], few)
+        assert (covering[:, 0, 0] == count).all() and (covering[:, 1:] == 0).all()
+        tracks = track_on_plane(few, FPS, pitch_size=SIZE, covering=covering)
+        assert tracks.xy.shape[1] == people
+
+
+def test_parts_of_a_person_continue_the_track_and_start_none(ring):
+    camera = ring(1)
+    truth = walkers(50, [[0.0, 0.0], [6.0, 2.0]], [[1.0, 0.0], [1.0, 0.0]])
+    ends = [
+        camera[0].project(np.insert(truth.reshape(-1, 2), 2, z, axis=1)).reshape(50, 2, 2)
+        for z in (1.8, 0.0)
+    ]
+    whole = np.concatenate([ends[0] - [18, 0], ends[1] + [18, 0]], axis=-1)
+    boxes = np.full((50, 1, 3, 4), np.nan)
+    boxes[:, 0, :2] = whole
+    boxes[20:, 0, 2] = whole[20:, 0]
+    boxes[20:, 0, 2, 3] -= 0.4 * (whole[20:, 0, 3] - whole[20:, 0, 1])  # an upper body
+    confidence = np.full((50, 1, 3, 17), 0.9)
+    confidence[:, :, 2, 11:] = 0.1
+    keypoints = np.full((*confidence.shape, 2), np.nan)
+    found = locate_feet(camera, keypoints, np.where(confidence > 0.5, 0.0, 0.0), PITCH, boxes=boxes)
+    assert found.is_whole[:, 0, :2].all()  # of equally sure detections none is a part
+    found = locate_feet(camera, keypoints, 0.2 * confidence, PITCH, boxes=boxes)
+    assert found.is_whole[:, 0, :2].all() and not found.is_whole[20:, 0, 2].any()
+    tracks = track_on_plane(found, FPS, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == 2
+    everything = replace(found, is_whole=None)
+    assert track_on_plane(everything, FPS, pitch_size=SIZE).xy.shape[1] >= 2
