@@ -27,8 +27,9 @@ def export(
         list[str],
         typer.Option(
             "--format",
-            help="joints, coco, worldpose, trc, bvh, challenge, challenge-2025, tracks, "
-            "slahmr-cameras or rerun (docs/reference/formats.md); more than one may be given.",
+            help="joints, positions, minimap, coco, worldpose, trc, bvh, challenge, "
+            "challenge-2025, tracks, slahmr-cameras or rerun (docs/reference/formats.md); more "
+            "than one may be given.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Output folder.")],

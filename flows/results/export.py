@@ -59,6 +59,7 @@ from worldpose.ingest import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run, Store, pin_run
+from worldpose.video import write_video
 
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
@@ -290,11 +291,38 @@ def export_positions(origin: Origin, out: Path) -> list[Path]:
     return written
 
 
+def export_minimap(origin: Origin, out: Path) -> list[Path]:
+    """Write `minimap/<clip>.mp4`: the pitch from above with all people and their kind.
+
+    Raises:
+        UsageError: the match has no pitch.
+    """
+    # Imported here: it loads matplotlib's colours, which takes 0.5 s.
+    from worldpose.reports.minimap import minimap_frames
+
+    pitch = read_match(Path(origin.registration.folder)).pitch
+    if pitch is None:
+        raise UsageError(
+            "--format minimap",
+            expected="a match with a pitch",
+            found="a match without one",
+            todo="Choose another format, such as joints.",
+        )
+    written = []
+    for clip in origin.clips:
+        written.append(out / "minimap" / f"{clip}.mp4")
+        written[-1].parent.mkdir(parents=True, exist_ok=True)
+        frames = minimap_frames(clip_positions(origin.run, clip), pitch)
+        write_video(written[-1], frames, origin.spec.fps)
+    return written
+
+
 EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
     "worldpose": export_worldpose,
     "positions": export_positions,
+    "minimap": export_minimap,
     "trc": export_markers,
     "bvh": export_motion,
     "challenge": export_challenge,
