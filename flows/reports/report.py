@@ -115,7 +115,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         ),
         Section(
             "Sample images",
-            tuple(p for clip in clips for p in clip_pictures(run, match, clip, truth)),
+            tuple(p for clip in clips for p in clip_pictures(store, run, match, clip, truth)),
         ),
         extent_section(run, match),
         Section(
@@ -128,7 +128,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             (
                 camera_table(camera_summaries(run, match.folder.spec)),
                 *camera_pictures(store, run, match, cameras),
-                *paint_pictures(run, match, cameras),
+                *paint_pictures(store, run, match, cameras),
             ),
         ),
         Section("Bundle adjustment", tuple(adjustment_tables(run))),

@@ -158,7 +158,7 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
 
 def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     pictures = (
-        *clip_pictures(run, match, clip),
+        *clip_pictures(store, run, match, clip),
         *detection_pictures(store, run, match, clip),
     )
     return Evidence(pictures, tuple(body_tables(run, (clip,))))
