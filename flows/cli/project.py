@@ -137,7 +137,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
         problem = str(failure)
     else:
-        waiting = still_waiting(match, latest)
+        waiting = still_waiting(store, match, latest)
         for unit in planned:
             units[unit_state(unit, latest).value].append(unit.name)
     return {
