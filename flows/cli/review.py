@@ -272,8 +272,8 @@ def serve(
     # A token chosen by the operator is not printed: the output can go to a log.
     where = address(access, host, port)
     shown = where if token is None else where.partition("#")[0]
-    line(f"review pages of {Store.open(project).url}: {shown}")
-    serve_pages(project, access, host=host, port=port, tls=tls)
+    told = f"review pages of {Store.open(project).url}: {shown}"
+    serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: line(told))
 
 
 def _decide(
