@@ -9,13 +9,9 @@ line set is the only key frame of its clip, whose camera depends on the drawn li
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 import pitch_lines
 
 from data_contracts.broadcast_calibration import KeyFrame

@@ -11,17 +11,11 @@ every seed.
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
-
-from data_contracts.arrays import Floats
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from broadcast_accuracy import ANEW, LASTING, SHARES, distances, errors
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings, MovingCamera, People
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
