@@ -57,6 +57,7 @@ def rows_of(
     true = true_camera(folder, (camera.width, camera.height), clip)
     joints = read_joints(folder / "reference" / "joints.npz").joints
     people = people_of(match, joints, clip)
+    assert match.pitch is not None  # of every scenario with a broadcast camera
     pitch = PitchTemplate.from_spec(match.pitch)
 
     def pictures(file: Path = match.videos[clip]) -> Iterator[NDArray[np.uint8]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -50,7 +50,7 @@ def stadium_rig(count: int, rng: np.random.Generator, *, varied_lenses: bool) ->
     return Camera.stack(cameras)
 
 
-def best_seconds(sides: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
     """Return the best wall time [s] of each side.
 
     All sides run in turns, in one round that is not measured and in `rounds` that are.

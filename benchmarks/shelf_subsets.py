@@ -17,7 +17,6 @@ import argparse
 import itertools
 import json
 import re
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -85,7 +84,8 @@ def score(
 ) -> tuple[float, float]:
     """Return PCP3D [%] and the mean error of matched people [mm]."""
     (unit,) = (name for name in keys if name.startswith(f"{stage}/"))
-    stored = store.open_result(match, *unit.split("/"), keys[unit])
+    _, name = unit.split("/")
+    stored = store.open_result(match, stage, name, keys[unit])
     frames = stored["frame"].values
     poses = dict(zip(frames.tolist(), stored["joints"].values, strict=True))
     found, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf", frames=frames)
@@ -184,4 +184,4 @@ def tell_case(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
