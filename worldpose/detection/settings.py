@@ -25,9 +25,9 @@ class DetectionSettings(Record):
     detector: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         default=("embedded",), min_length=1
     )
-    """Detectors of people: `embedded`, `embedded:FILE`, `transformers:FOLDER`, `onnx:FILE`, or
-    `onnx-FORM:FILE` where the net's outputs do not tell its form, for example `onnx-rtmdet:FILE`;
-    several form an ensemble whose boxes are fused."""
+    """Detectors of people: `embedded`, `embedded:FILE`, `model:NAME` (see `worldpose models`),
+    `transformers:FOLDER`, `onnx:FILE`, or `onnx-FORM:FILE` where the net's outputs do not tell its
+    form, for example `onnx-rtmdet:FILE`; several form an ensemble whose boxes are fused."""
     person_classes: tuple[ClassNumber, ...] | None = Field(
         default=None, min_length=1, max_length=100
     )
