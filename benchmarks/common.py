@@ -133,4 +133,5 @@ def distances_to_polyline(
     offset = pixels[:, None] - start
     share = (offset * step).sum(axis=-1) / np.maximum((step**2).sum(axis=-1), 1e-12)
     nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
-    return np.linalg.norm(nearest, axis=-1).min(axis=1)
+    distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
+    return distances

@@ -152,7 +152,10 @@ def mean_error(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the mean error of each of `GROUPS` (4,) [cm]; NaN without people."""
     if not errors:
         return np.full(len(GROUPS), np.nan)
-    return np.nanmean(np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2))
+    means: NDArray[np.float64] = np.nanmean(
+        np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2)
+    )
+    return means
 
 
 def main() -> None:

@@ -32,7 +32,7 @@ import math
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -228,7 +228,7 @@ def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
     index = index_video(videos[0])
     count = len(index) if frames is None else min(frames, len(index))
 
-    def pictures():
+    def pictures() -> Iterator[NDArray[np.uint8]]:
         with open_video(videos[0], index) as video:
             yield from (picture for _, picture in video.frames(0, count, grey=True))
 

@@ -24,7 +24,7 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.ingest import import_clicks, import_match, import_videos
+from worldpose.ingest import import_clicks, import_match, import_videos, unclicked_clips
 from worldpose.store import Store
 
 
@@ -375,6 +375,7 @@ def _tell_unclicked(match: Match) -> None:
     """Print what has to be clicked before the match can run."""
     known = {**match.folder.calibrations, **match.folder.clicked}
     missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
+    missing += unclicked_clips(match.folder)
     if missing and match.folder.pitch is None:
         line(
             f"no calibration of {', '.join(missing)}: add them to calibration.toml (a match "

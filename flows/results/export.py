@@ -99,7 +99,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
 
 
 def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, (frames,).
+    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
 
     Raises:
         WorldposeError: the run has no such camera.
@@ -109,7 +109,9 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
         "choose another format."
     )
     _require_result(run, f"broadcast_calibration/{clip}", todo)
-    return _camera_in(run, clip, run[bodies_unit(run, clip)]["frame"].values)
+    bodies = bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
+    return _camera_in(run, clip, frames)
 
 
 def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:

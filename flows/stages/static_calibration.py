@@ -69,4 +69,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     leaves_out=True,
+    needs_static_cameras=True,
 )

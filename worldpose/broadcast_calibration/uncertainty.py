@@ -43,6 +43,21 @@ class Uncertainty:
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
 
 
+def static_covariance(camera: MovingCamera, uncertainty: Uncertainty) -> Floats:
+    """Return the covariance (frames, 12, 12) of each frame's camera as that of a static camera.
+
+    A static camera's step is in the order of `CAMERA_STEP`, with a shift in its own axes instead
+    of the center's in the world.
+    """
+    size = FRAME_SIZE + CLIP_SIZE
+    chain = np.zeros((len(camera), size, size))
+    chain[:, range(3), range(3)] = 1.0
+    chain[:, 3:6, FRAME_SIZE : FRAME_SIZE + 3] = -camera.rotation
+    order = [3, FRAME_SIZE + 3, FRAME_SIZE + 4, 4, 5, 6]
+    chain[:, range(6, size), order] = 1.0
+    return np.asarray(chain @ uncertainty.frame @ np.swapaxes(chain, -1, -2))
+
+
 def compute_uncertainty(
     solution: Solution,
     problem: Problem,
