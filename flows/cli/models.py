@@ -61,7 +61,7 @@ def list_models(
         [
             (
                 each.name,
-                _setting(each),
+                _setting_for(each),
                 f"{(_size(each) or 0) / 1e6:.0f}" if _size(each) else "-",
                 each.licence,
                 "no" if read_pulled(each.name, place) is None else "yes",
@@ -72,7 +72,7 @@ def list_models(
     )
 
 
-def _setting(checkpoint: Checkpoint) -> str:
+def _setting_for(checkpoint: Checkpoint) -> str:
     return f"{SETTING[checkpoint.task]}=model:{checkpoint.name}"
 
 
@@ -85,7 +85,7 @@ def _size(checkpoint: Checkpoint) -> int | None:
 def _describe(checkpoint: Checkpoint, folder: Path) -> dict[str, object]:
     return {
         "name": checkpoint.name,
-        "setting": _setting(checkpoint),
+        "setting": _setting_for(checkpoint),
         "bytes": _size(checkpoint),
         "licence": checkpoint.licence,
         "pulled": read_pulled(checkpoint.name, folder) is not None,
@@ -124,9 +124,11 @@ def pull_model(
 
         path = pull(checkpoint, place, advance)
     if as_json:
-        print_json({"name": name, "folder": str(path), "setting": _setting(checkpoint)})
+        print_json({"name": name, "folder": str(path), "setting": _setting_for(checkpoint)})
         return
-    line(f"pulled {name} into {path} ({checkpoint.licence}); use it: --set {_setting(checkpoint)}")
+    line(
+        f"pulled {name} into {path} ({checkpoint.licence}); use it: --set {_setting_for(checkpoint)}"
+    )
 
 
 @commands.command(name="verify")

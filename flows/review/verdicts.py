@@ -101,7 +101,7 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
             sources = {} if is_unknown else stages[stage].sources(match, unit)
             now = recipe.model_copy(update={"sources": recipe.sources | sources})
             is_changed[name] = recipe_key(now) != recipe_key(recipe) or any(
-                check(*each) for each in recipe.inputs.items()
+                check(used, used_key) for used, used_key in recipe.inputs.items()
             )
         return is_changed[name]
 
