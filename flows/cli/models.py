@@ -127,7 +127,8 @@ def pull_model(
         print_json({"name": name, "folder": str(path), "setting": _setting_for(checkpoint)})
         return
     line(
-        f"pulled {name} into {path} ({checkpoint.licence}); use it: --set {_setting_for(checkpoint)}"
+        f"pulled {name} into {path} ({checkpoint.licence}); "
+        f"use it: --set {_setting_for(checkpoint)}"
     )
 
 
