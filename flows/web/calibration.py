@@ -166,6 +166,7 @@ def routes(context: PageContext) -> APIRouter:
                 size,
                 picture=seen,
                 settings=StaticCalibrationSettings() if clicked.refine else _POINTS_ALONE,
+                lens=context.match(match_id).folder.lenses.get(owner),
             )
         except InputError as error:
             advice = {"camera": None, "expected": error.expected, "todo": error.todo}

@@ -251,7 +251,7 @@ def _locate_on_marking(
     if marking in pitch.arcs:
         center = pitch.arcs[marking].center
         return (center, center), np.tile([1.0, 0.0], (len(places), 1))
-    line = pitch.lines.get(marking) or pitch.goals[marking]
+    line = {**pitch.lines, **pitch.goals, **pitch.unpainted}[marking]
     start, way = pitch.points[line.start], pitch.points[line.end] - pitch.points[line.start]
     share = np.clip((places - start) @ way / (way @ way), 0.0, 1.0)
     return (line.start, line.end), np.stack([1.0 - share, share], axis=-1)

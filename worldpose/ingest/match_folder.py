@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Final
 
 from data_contracts.broadcast_calibration import KeyFrames
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import read_calibration
 from worldpose.formats.files import read_yaml
+from worldpose.formats.lens_files import read_lens_toml
 from worldpose.ingest.annotations import (
     clicked_file,
     key_frames_file,
@@ -43,6 +44,7 @@ class MatchFolder:
         clicked: clicked markings, by id of a static camera; may lack some.
         stills: one image, by id of a static camera; may lack some.
         key_frames: clicked key frames of the broadcast camera, by id of a clip; may lack some.
+        lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates of the broadcast camera, by id of a clip; may lack
             some.
     """
@@ -56,6 +58,7 @@ class MatchFolder:
     clicked: Mapping[str, ClickedMarkings]
     stills: Mapping[str, Path]
     key_frames: Mapping[str, KeyFrames]
+    lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
 
 
@@ -106,16 +109,18 @@ def _read_match(folder: Path) -> MatchFolder:
     videos = _videos(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
+    calibrations = _calibrations(folder, spec)
     return MatchFolder(
         folder=folder,
         spec=spec,
-        calibrations=_calibrations(folder, spec),
+        calibrations=calibrations,
         detections=detections,
         pitch=pitch,
         videos=videos,
         clicked=read_clicked(folder, spec, pitch),
         stills=_stills(folder, spec),
         key_frames=read_key_frames(folder, spec, pitch),
+        lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec),
     )
 
@@ -203,6 +208,33 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
                 todo="Calibrate at the size of the video, or correct match.yaml.",
             )
     return calibrations
+
+
+LENS_FILE: Final = "lenses.toml"
+"""File of given lenses without a pose, relative to the match folder."""
+
+
+def _lenses(
+    folder: Path, spec: MatchSpec, calibrations: Mapping[str, CameraCalibration]
+) -> dict[str, LensCalibration]:
+    if not (folder / LENS_FILE).exists():
+        return {}
+    file = existing_file(folder, LENS_FILE, str(folder))
+    lenses = read_lens_toml(file, image_sizes(spec))
+    both = [name for name in lenses if name in calibrations]
+    if both:
+        raise InputError(
+            f"{file}: {', '.join(both)}",
+            expected="lenses of cameras without a given pose",
+            found="cameras that calibration.toml gives with their pose",
+            todo="Remove them from one of the two files.",
+        )
+    return lenses
+
+
+def image_sizes(spec: MatchSpec) -> dict[str, tuple[int, int]]:
+    """Return width and height [px] of each static camera's images."""
+    return {camera.id: (camera.width, camera.height) for camera in spec.static_cameras}
 
 
 def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.cameras import LensCalibration
 from data_contracts.review import Acceptance
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry import Camera, Rays, intersect_rays
@@ -340,6 +341,7 @@ def preview(
     *,
     picture: NDArray[np.uint8] | None = None,
     settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
+    lens: LensCalibration | None = None,
 ) -> Preview:
     """Return the camera from the current clicks, and the projected pitch.
 
@@ -350,12 +352,19 @@ def preview(
         picture: (height, width, 3); if given, the calibration refines the camera on the painted
             lines, which takes seconds and not milliseconds.
         settings: as for the stage `static_calibration`.
+        lens: the given lens of a static camera, if there is one.
 
     Raises:
         InputError: the clicks do not determine a camera; the message says which clicks to add.
     """
     found = calibrate_camera(
-        drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
+        drawing.template,
+        clicked,
+        image_size,
+        picture=picture,
+        settings=settings,
+        where="so far",
+        lens=lens,
     )
     camera = found.estimate.camera
     return Preview(
