@@ -224,7 +224,9 @@ class Camera:
         Raises:
             InputError: the shapes do not agree.
         """
-        batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
+        batch, cameras, points = self._flat(
+            "Camera.project_with_jacobians: points_world", points_world, 3
+        )
         shape = points.shape[:-1]
         image = np.empty((*shape, 2))
         jacobian = np.empty((*shape, 2, 18))

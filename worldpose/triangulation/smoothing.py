@@ -44,8 +44,8 @@ from worldpose.triangulation.observations import (
     linearize,
     observe_person,
 )
+from worldpose.triangulation.passes import Triangulation
 from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
-from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
 BAND: Final = 6
