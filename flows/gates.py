@@ -150,7 +150,8 @@ class JointLimits(Record):
     """Metric limits of a clip's triangulated joints."""
 
     standard_deviation_m: float = Field(default=0.10, ge=0)
-    """Of a joint along an axis, median over joints [m]; 0.03 with five views."""
+    """Root of the trace of a joint's covariance, over all three axes, median over joints [m]: with
+    equal errors along all axes, sqrt(3) times the standard deviation along one."""
     filled_share: float = Field(default=0.05, ge=0)
     """Share of joints filled by the motion model alone [1]."""
 

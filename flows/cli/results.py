@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from data_contracts.release import EXPORT_FORMATS
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -27,8 +28,9 @@ def export(
         list[str],
         typer.Option(
             "--format",
-            help="joints, coco, worldpose, trc, bvh, challenge, challenge-2025, tracks, "
-            "slahmr-cameras or rerun (docs/reference/formats.md); more than one may be given.",
+            metavar="NAME",
+            help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]} "
+            "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Output folder.")],

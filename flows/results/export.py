@@ -305,7 +305,7 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "slahmr-cameras": export_slahmr_cameras,
     "rerun": export_recording,
 }
-"""Format name to function, which takes the source and a folder, and returns the files."""
+"""Name in `EXPORT_FORMATS` to function, which takes the source and a folder, returns the files."""
 
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}

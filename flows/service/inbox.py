@@ -53,7 +53,7 @@ class RefusalError(Exception):
 
 
 def entries(inbox: Path) -> Iterator[Entry]:
-    """Yield all arrivals in the inbox; a dot before a name marks an upload in progress."""
+    """Yield all arrivals in the inbox, except names that begin with a dot: incomplete uploads."""
     for priority in PRIORITIES:
         if priority != "normal":
             folder = inbox / priority

@@ -272,7 +272,11 @@ _UNDISTORT: Final = 30
 
 @compile_kernel
 def undistort_point(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
-    """Return the undistorted point on the plane z = 1 of (xd, yd), and whether it exists."""
+    """Undistort the point (xd, yd) of the plane z = 1.
+
+    Returns:
+        x and y of the undistorted point, and whether there is one.
+    """
     far = math.sqrt(xd * xd + yd * yd)
     radius = far
     for _ in range(_UNDISTORT):

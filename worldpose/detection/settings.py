@@ -20,7 +20,7 @@ ClassNumber = Annotated[int, Field(ge=0, le=10_000)]
 
 
 class DetectionSettings(Record):
-    """Settings of `detection` (paper: refinement of 2D detection results; D1-D3)."""
+    """Settings of `detection` (paper: refinement of 2D detection results; D1-D5)."""
 
     detector: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         default=("embedded",), min_length=1
