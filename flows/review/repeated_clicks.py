@@ -36,7 +36,7 @@ def explain_repeated(folder: Path, file: Path, repeated: list[RepeatedClick]) ->
     return [
         f"{each.image}: {each.label!r} is clicked at {_pixel(each.pixels[0])} and at "
         f"{_pixel(each.pixels[1])}. Which one is meant? {_judge(folder, each)} Correct "
-        f"the label of the wrong one in {file.name}, remove {_written(folder, each)} and import "
+        f"the label of the wrong one in {file.name}, remove {_clicks_path(folder, each)} and import "
         "again; or leave both: calibration excludes a click that the others contradict."
         for each in repeated
     ]
@@ -46,7 +46,7 @@ def _pixel(pixel: tuple[float, float]) -> str:
     return f"({pixel[0]:.0f}, {pixel[1]:.0f})"
 
 
-def _written(folder: Path, each: RepeatedClick) -> str:
+def _clicks_path(folder: Path, each: RepeatedClick) -> str:
     return str(folder / clicked_file(each.owner))
 
 

@@ -266,7 +266,7 @@ def _lens_deviations(
     ]
     return {
         "focal length": abs(np.log(focal / lens.focal_px)) * lens.focal_px / lens.focal_std_px,
-        "principal point": float(np.hypot(*middle)) / lens.principal_point_std_px,
+        "principal point": float(np.hypot(middle[0], middle[1])) / lens.principal_point_std_px,
         "distortion": float(np.abs(corner).max()) / lens.distortion_std,
     }
 
