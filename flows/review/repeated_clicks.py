@@ -36,8 +36,8 @@ def explain_repeated(folder: Path, file: Path, repeated: list[RepeatedClick]) ->
     return [
         f"{each.image}: {each.label!r} is clicked at {_pixel(each.pixels[0])} and at "
         f"{_pixel(each.pixels[1])}. Which one is meant? {_judge(folder, each)} Correct "
-        f"the label of the wrong one in {file.name}, remove {_clicks_path(folder, each)} and import "
-        "again; or leave both: calibration excludes a click that the others contradict."
+        f"the label of the wrong one in {file.name}, remove {_clicks_path(folder, each)} and "
+        "import again; or leave both: calibration excludes a click that the others contradict."
         for each in repeated
     ]
 
