@@ -208,7 +208,9 @@ def _of_bodies(figures: Figures) -> Figures:
 
 
 CAMERAS = Gate(
-    "static_calibration", "Do the markings lie on the picture's, all over it?", CameraLimits()
+    "static_calibration",
+    "Do the projected markings match those in the image, in all parts of it?",
+    CameraLimits(),
 )
 PEOPLE = Gate(
     "detection",
@@ -221,13 +223,13 @@ CONSISTENCY = Gate(
 )
 IDENTITIES = Gate(
     "tracking",
-    "Is every person one track, from end to end?",
+    "Is every person one track over the whole clip?",
     IdentityLimits(),
     warned=("unmatched_share", "mean_ray_distance_m"),
 )
 JOINTS = Gate(
     "triangulation",
-    "Are the joints where the pictures show them?",
+    "Are the joints where the images show them?",
     JointLimits(),
     warned=("standard_deviation_m",),
 )
@@ -242,7 +244,7 @@ ACCEPTANCE = Gate(
 )
 BROADCAST = Gate(
     "broadcast_calibration",
-    "Does the drawn pitch stay on the picture's, from the first frame to the last?",
+    "Does the drawn pitch match the pitch in the image in every frame?",
     BroadcastLimits(),
 )
 
