@@ -33,7 +33,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.errors import UsageError, WorldposeError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baselines.inputs import (
     write_baseline_settings,
@@ -88,7 +88,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     """Return body model, poses (persons, frames) and person ids of a clip's fits.
 
     Raises:
-        WorldposeError: the run has no fitted bodies.
+        InputError: the run has no fitted bodies.
     """
     fits = run[_require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
     poses = BodyParameters(
@@ -102,7 +102,7 @@ def broadcast_camera(run: Run, clip: str) -> Camera:
     """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
 
     Raises:
-        WorldposeError: the run has no such camera.
+        InputError: the run has no such camera.
     """
     todo = (
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
@@ -123,9 +123,11 @@ def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
 
 def _require_result(run: Run, unit: str, todo: str) -> str:
     if unit not in run:
-        raise WorldposeError(
-            f"run {run.record.run_id} of {run.record.match_id}: expected results of {unit}, "
-            f"found {', '.join(sorted({name.partition('/')[0] for name in run})) or 'none'}. {todo}"
+        raise InputError(
+            f"run {run.record.run_id} of {run.record.match_id}",
+            expected=f"results of {unit}",
+            found=", ".join(sorted({name.partition("/")[0] for name in run})) or "none",
+            todo=todo,
         )
     return unit
 
