@@ -60,13 +60,13 @@ def routes(context: PageContext) -> APIRouter:
     router = APIRouter(prefix="/api/matches/{match_id}/results")
     files = _Files()
 
-    def opened(match_id: str) -> tuple[Match, Run]:
+    def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
         return match, open_run(context.store.url, match_id, complete=True)
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
-        match, run = opened(match_id)
+        match, run = open_latest(match_id)
         clips = clips_of(run.record)
         return {
             "run": run.record.run_id,
@@ -76,7 +76,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:
-        match, run = opened(match_id)
+        match, run = open_latest(match_id)
 
         def draw(file: Path) -> None:
             run_id = run.record.run_id
@@ -90,7 +90,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/videos/{clip}")
     def video(match_id: str, clip: str) -> FileResponse:
-        match, run = opened(match_id)
+        match, run = open_latest(match_id)
         if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
             raise HTTPException(404, "no camera of such a clip has a video")
 
@@ -100,8 +100,8 @@ def routes(context: PageContext) -> APIRouter:
         return FileResponse(files.get(run, f"{clip}.mp4", draw), media_type="video/mp4")
 
     @router.get("/exports/{form}")
-    def exported(match_id: str, form: str) -> FileResponse:
-        match, run = opened(match_id)
+    def export_zip(match_id: str, form: str) -> FileResponse:
+        match, run = open_latest(match_id)
         if form not in EXPORT_FORMATS:
             raise HTTPException(404, f"no such format; there are {', '.join(EXPORT_FORMATS)}")
 
