@@ -5,10 +5,11 @@ r"""Prints AP50 of person detectors on labelled stills of small people.
 
 DATA holds `panorama_people`: images with a YOLO label file each (`class x_center y_center width
 height` or `class x y x y ...`, all relative; class 0 is a person). Images without any label are
-left out. AP50 is COCO's, of all boxes, with precision integrated at every step of recall; `--set` changes settings of `detection`, and `--detector`
-may come more than once, for an ensemble. `--stills N` takes N images evenly over the names. All
-images look alike, so a split must be by time: `--part train` is the first half of the match, `test`
-the second. The time is processor time of one still, decoding included.
+left out. AP50 is COCO's, of all boxes, with precision integrated at every step of recall instead of
+at 101 points. `--set` changes settings of `detection`, and `--detector` may come more than once,
+for an ensemble. `--stills N` takes N images evenly over the names. All images look alike, so a
+split must be by time: `--part train` is the first half of the match, `test` the second. The time is
+processor time of a still, decoding included.
 """
 
 from __future__ import annotations
