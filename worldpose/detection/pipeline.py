@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
-from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
+from worldpose.detection.interfaces import (
+    Detector,
+    FindsOccludedPeople,
+    People,
+    PoseEstimator,
+    SeesParts,
+)
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
@@ -19,6 +25,9 @@ from worldpose.detection.views import TiledDetector
 from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_areas
 from worldpose.pitch import PitchTemplate
+
+if TYPE_CHECKING:
+    from worldpose.detection.enlargement import Part
 
 HEAD_HEIGHT: Final = 1.75
 """Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""
@@ -165,6 +174,7 @@ class PeopleFinder:
             for detector in detectors
         ]
         self._estimator, self._settings = estimator, settings
+        self._parts: list[Part] | None = None
         self.report = DetectionReport()
 
     def find(
@@ -178,6 +188,13 @@ class PeopleFinder:
         """
         self.report = DetectionReport()
         cleaner = BoxCleaner(self._settings)
+        self._parts = None
+        if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
+            # Late: cv2 takes 0.2 s, and planning a run does not need it.
+            from worldpose.detection.enlargement import expect_small
+
+            margin = self._settings.pitch_margin_m
+            self._parts = expect_small(place.camera, place.pitch, margin)
         detected_frames = detect_strided(
             frames,
             lambda images: self._people(images, place),
@@ -204,7 +221,12 @@ class PeopleFinder:
     def _people(self, images: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
-        found = [detector.detect(images) for detector in self._detectors]
+        found = [
+            detector.detect(images)
+            if self._parts is None or not isinstance(detector, SeesParts)
+            else detector.detect_parts(images, self._parts)
+            for detector in self._detectors
+        ]
         everybody = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":
