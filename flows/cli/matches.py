@@ -391,7 +391,7 @@ def ingest(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate match folders and make them known to the project; doing it twice is harmless.
+    """Validate match folders and register them in the project; repeating it is harmless.
 
     Example: worldpose ingest matches/tiny
     """

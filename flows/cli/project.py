@@ -49,7 +49,7 @@ def status(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Show which results are current, stale or missing, match by match.
+    """Show which results of each match are current, stale or missing.
 
     Example: worldpose status tiny-1
     """
@@ -217,7 +217,7 @@ def gc(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List or remove (--delete) data that no run uses; a pinned run is never forgotten.
+    """List or remove (--delete) data that no run uses; pinned runs are always kept.
 
     Example: worldpose gc --keep-last 3 --delete
     """

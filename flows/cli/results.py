@@ -105,7 +105,7 @@ def report(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one HTML page on a run: what was done, how good it is, what it looks like.
+    """Write one HTML page about a run, with its settings, metrics and images.
 
     Example: worldpose report tiny-1 --out report.html
     """
