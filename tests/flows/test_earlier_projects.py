@@ -80,11 +80,14 @@ def test_all_settings_of_the_run_are_read_under_their_present_names(store):
     for stage in METHOD:
         if stage.name in record.settings:  # else the stage is newer
             stage.settings.model_validate(record.settings[stage.name])
-    assert record.overrides == {"body_fitting": {"max_gap_s": 0.5}, "tracking": {"max_lost_s": 2.5}}
+    assert record.overrides == {
+        "body_fitting": {"max_filled_gap_s": 0.5},
+        "tracking": {"max_lost_s": 2.5},
+    }
     planned = {
         unit.name: unit for unit in plan_run(store, open_match(store, TINY), record.overrides)
     }
-    assert planned["body_fitting/clip"].recipe.settings["max_gap_s"] == 0.5
+    assert planned["body_fitting/clip"].recipe.settings["max_filled_gap_s"] == 0.5
     assert planned["tracking/clip"].recipe.settings["max_lost_s"] == 2.5
 
 
@@ -160,5 +163,5 @@ def test_runs_of_two_versions_are_compared_without_former_names(store):
 def test_the_commands_open_it(store):
     said = succeed("status", "--project", store.url).out
     assert "run 0004 is pinned as first" in said
-    assert "'max_gap_s': 0.5" in said
+    assert "'max_filled_gap_s': 0.5" in said
     assert "applied" in succeed("review", "show", TINY, "--project", store.url).out
