@@ -4,36 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clicking_people import PITCH, SIZE, click, ground_errors, on_the_pitch, seat
+from clicking_people import (
+    DISTORTION,
+    PITCH,
+    SIZE,
+    click,
+    ground_errors,
+    lens_of,
+    on_the_pitch,
+    wide_camera,
+)
 
-from data_contracts.cameras import LensCalibration
 from worldpose.static_calibration import calibrate_camera
-
-DISTORTION = np.array([-0.30, 0.12, 0.002, -0.001, -0.02])
-
-
-def wide_camera(seed):
-    """A camera with a lens that bends its corners, off its middle, and the generator."""
-    camera, rng = seat(seed % 4, seed)
-    focal = 0.6 * camera.focal
-    middle = camera.principal_point + [25.0, -14.0]
-    return replace(camera, focal=focal, principal_point=middle, distortion=DISTORTION), rng
-
-
-def lens_of(camera, rng, focal=1.0):
-    """The lens as a board calibration with a deviation of half a per cent gives it."""
-    f = focal * float(camera.focal[0]) * (1.0 + 0.005 * rng.standard_normal())
-    x, y = camera.principal_point + 3.0 * rng.standard_normal(2)
-    return LensCalibration(
-        id="cam",
-        image_size=SIZE,
-        focal_px=f,
-        principal_point_px=(float(x), float(y)),
-        distortion=tuple(camera.distortion.tolist()),
-        focal_std_px=0.005 * f,
-        principal_point_std_px=3.0,
-        distortion_std=0.001,
-    )
 
 
 def test_a_known_lens_lowers_the_ground_error_of_few_clicks():
