@@ -165,6 +165,11 @@ class PitchTemplate:
     goals: dict[str, LineSpec]
     """`goal_post_{side}_{end}`, `crossbar_{side}`: visible and drawn like markings, but not painted
     on the surface."""
+    surveyed: frozenset[str] = frozenset()
+    """Names of the points with a surveyed position; the others have that of the Laws."""
+    assumed: frozenset[str] = frozenset()
+    """Those of `length`, `width`, `crown` that nobody measured: there is no surveyed point, and
+    they have the values of the standard pitch."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -190,7 +195,20 @@ class PitchTemplate:
         lines = {**law_lines(), **spec.lines}
         arcs = {**law_arcs(), **spec.arcs}
         _check_markings(points, lines, arcs)
-        return cls(spec.length, spec.width, spec.crown, points, lines, arcs, law_goals())
+        usual = PitchSpec()
+        sizes = ("length", "width", "crown")
+        assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
+        return cls(
+            spec.length,
+            spec.width,
+            spec.crown,
+            points,
+            lines,
+            arcs,
+            law_goals(),
+            surveyed=frozenset(spec.points),
+            assumed=frozenset(() if spec.points else assumed),
+        )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Return the height of the surface [m], continued beyond the touch lines.
