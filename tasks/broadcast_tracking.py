@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -18,6 +18,9 @@ from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
 from worldpose.tracking import GroundPositions, locate_feet, track_on_plane
 
+SURFACE: Final = ("length", "width", "crown")
+"""Entries of pitch.json that give the surface under the feet."""
+
 
 @unit_task
 def broadcast_tracking(work: Work) -> str:
@@ -26,11 +29,16 @@ def broadcast_tracking(work: Work) -> str:
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
     inputs = {name.partition("/")[0]: name for name in work.recipe.inputs}
-    camera = next(inputs[name] for name in inputs if name.startswith("broadcast_"))
-    detected = next(inputs[name] for name in inputs if not name.startswith("broadcast_"))
-    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
+    calibrated = open_input(store, work, inputs["broadcast_calibration"])
+    camera = inputs.get("broadcast_pooling")
+    moving = calibrated if camera is None else open_input(store, work, camera)
+    detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
     detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
-    positions = _locate_people(detections, open_input(store, work, camera), pitch)
+    # The surface that the calibration found: people stand on it as the markings lie on it.
+    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SURFACE}
+    known = {name: value for name, value in surface.items() if value is not None}
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"] | known))
+    positions = _locate_people(detections, moving, pitch)
     size = (pitch.length, pitch.width)
     tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
     index = tracks.detection_index[:, 0]
@@ -54,6 +62,11 @@ def broadcast_tracking(work: Work) -> str:
                 "tracks": [_track(number, seen, first) for number, seen in enumerate(index.T)],
             },
         )
+        if sources["has_estimates"]:
+            result.warnings.append(
+                f"{work.recipe.name}: the monocular poses of the clip are not used, as bodies need "
+                "people that static cameras triangulate. Add static cameras, or take the file out."
+            )
         result.figures["people"] = float(index.shape[1])
         if found:
             result.figures["unmatched_share"] = 1.0 - np.count_nonzero(index >= 0) / found

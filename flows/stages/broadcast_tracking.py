@@ -23,20 +23,21 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the clip's detections and its camera."""
-    pooled = unit in broadcast_pooling.units(match)
-    camera = "broadcast_pooling" if pooled else "broadcast_calibration"
-    return (*detection.seen_in_broadcast(match, unit), f"{camera}/{unit}")
+    """Return the clip's detections and its camera, also at the pooled position if there is one."""
+    pooled = (f"broadcast_pooling/{unit}",) if unit in broadcast_pooling.units(match) else ()
+    seen = detection.seen_in_broadcast(match, unit)
+    return (*seen, f"broadcast_calibration/{unit}", *pooled)
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, its clock and the pitch that people stand on."""
+    """Return the clip, its clock, the pitch, and whether there are monocular poses."""
     spec, pitch = match.folder.spec, match.folder.pitch
     clip = spec.clip(unit)
     return {
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "fps": spec.fps,
+        "has_estimates": unit in match.folder.estimates,
         "pitch": None if pitch is None else pitch.model_dump(mode="json"),
     }
 

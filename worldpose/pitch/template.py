@@ -167,6 +167,11 @@ class PitchTemplate:
     on the surface."""
     unpainted: dict[str, LineSpec]
     """Lines on the surface without paint, such as edges of mowing stripes: `stripe_{side}_{n}`."""
+    surveyed: frozenset[str] = frozenset()
+    """Names of the points with a surveyed position; the others have that of the Laws."""
+    assumed: frozenset[str] = frozenset()
+    """Those of `length`, `width`, `crown` that nobody measured: there is no surveyed point, and
+    they have the values of the standard pitch."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -207,8 +212,21 @@ class PitchTemplate:
         unpainted = {name: line for name, line in every.items() if not line.painted}
         arcs = {**law_arcs(), **spec.arcs}
         _check_markings(points, every, arcs)
-        goals = law_goals()
-        return cls(spec.length, spec.width, spec.crown, points, lines, arcs, goals, unpainted)
+        usual = PitchSpec()
+        sizes = ("length", "width", "crown")
+        assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
+        return cls(
+            spec.length,
+            spec.width,
+            spec.crown,
+            points,
+            lines,
+            arcs,
+            law_goals(),
+            unpainted,
+            surveyed=frozenset(spec.points),
+            assumed=frozenset(() if spec.points else assumed),
+        )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Return the height of the surface [m], continued beyond the touch lines.
