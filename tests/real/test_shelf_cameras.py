@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shelf_subsets import load_scorer, run, score, write_case
+from common import run_in_process
+from shelf_subsets import load_scorer, score, write_case
 
 from worldpose.store import Store
 
@@ -25,7 +26,7 @@ def test_adjustment_of_four_given_cameras_harms_no_joints(tmp_path):
     scorer, truth = load_scorer(SHELF), np.load(SHELF / "gt.npz")
     folder = write_case(SHELF / "import", CAMERAS, FRAMES, tmp_path)
     store = Store.create(tmp_path / "project")
-    match, (keys,) = run(store, folder, "retriangulation", 1, {})
+    match, (keys,) = run_in_process(store, folder, "retriangulation", 1, {})
     before, after = (
         score(scorer, truth, store, match, keys, stage)
         for stage in ("triangulation", "retriangulation")
