@@ -7,15 +7,14 @@ replace it for them. Frames of tall people need no such pass.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
-import cv2
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from data_contracts.arrays import Flags, Floats, Image
-from worldpose.detection.interfaces import People
+from worldpose.detection.interfaces import Detector, People
 from worldpose.detection.suppression import suppress
 from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_iou
@@ -70,6 +69,8 @@ class Part:
 
     def crop(self, image: Image) -> Image:
         """Return the enlarged crop of the frame."""
+        import cv2  # late: it takes 0.2 s, and planning a run does not need it
+
         (left, top), (right, bottom) = self.corner, self.end
         part = image[top:bottom, left:right]
         size = (round(self.zoom * (right - left)), round(self.zoom * (bottom - top)))
@@ -98,6 +99,19 @@ class Part:
         """Return whether the centres of boxes lie in `inner` (people,)."""
         middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
         return np.asarray(np.all((middles >= self.inner[:2]) & (middles < self.inner[2:]), axis=1))
+
+
+@runtime_checkable
+class SeesParts(Detector, Protocol):
+    """A detector that looks at parts of frames enlarged, where people are small."""
+
+    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
+        """Return the people in each image, as `detect`.
+
+        Args:
+            images: of one size.
+            parts: where people are expected small, from the camera; empty where they are not.
+        """
 
 
 def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]) -> list[Part]:
@@ -187,6 +201,8 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
         people: detections in the whole frame.
         shape: height, width of the frame [px].
     """
+    from scipy.sparse.csgraph import connected_components  # late, as cv2
+
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
     count, member = connected_components(box_iou(boxes, boxes) > MIN_NEIGHBOUR_IOU, directed=False)

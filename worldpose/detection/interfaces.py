@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
-
-if TYPE_CHECKING:
-    from worldpose.detection.enlargement import Part
 
 MIN_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
@@ -54,19 +51,6 @@ class Detector(Protocol):
         Args:
             images: of one size. The detector chooses its batch size; a result must not depend on
                 the other images of a batch.
-        """
-
-
-@runtime_checkable
-class SeesParts(Detector, Protocol):
-    """A detector that looks at parts of frames enlarged, where people are small."""
-
-    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
-        """Return the people in each image, as `detect`.
-
-        Args:
-            images: of one size.
-            parts: where people are expected small, from the camera; empty where they are not.
         """
 
 

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
-from worldpose.detection.interfaces import (
-    Detector,
-    FindsOccludedPeople,
-    People,
-    PoseEstimator,
-    SeesParts,
-)
+from worldpose.detection.enlargement import Part, SeesParts, expect_small
+from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
@@ -25,9 +20,6 @@ from worldpose.detection.views import TiledDetector
 from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_areas
 from worldpose.pitch import PitchTemplate
-
-if TYPE_CHECKING:
-    from worldpose.detection.enlargement import Part
 
 HEAD_HEIGHT: Final = 1.75
 """Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""
@@ -190,9 +182,6 @@ class PeopleFinder:
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
-            # Late: cv2 takes 0.2 s, and planning a run does not need it.
-            from worldpose.detection.enlargement import expect_small
-
             margin = self._settings.pitch_margin_m
             self._parts = expect_small(place.camera, place.pitch, margin)
         detected_frames = detect_strided(
