@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from data_contracts.arrays import Flags, Floats, Image
 from worldpose.detection.interfaces import Detector, People
@@ -202,6 +201,8 @@ def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
         people: detections in the whole frame.
         shape: height, width of the frame [px].
     """
+    from scipy.sparse.csgraph import connected_components  # late, as cv2
+
     sure = suppress(people, SAME_PERSON_IOU)
     boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
     count, member = connected_components(box_iou(boxes, boxes) > MIN_NEIGHBOUR_IOU, directed=False)

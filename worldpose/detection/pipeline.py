@@ -12,12 +12,7 @@ from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.enlargement import Part, SeesParts, expect_small
-from worldpose.detection.interfaces import (
-    Detector,
-    FindsOccludedPeople,
-    People,
-    PoseEstimator,
-)
+from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
