@@ -40,7 +40,7 @@ def calibrate_static(scene: Scene, scenario: Scenario, seed: int) -> dict[str, S
     found = {}
     for name, camera in scene.cameras.items():
         still = render_pitch(camera, painted, scene.truth.joints[0], seed)
-        grey = cv2.cvtColor(still, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), np.uint8)
         size = (int(camera.image_size[0]), int(camera.image_size[1]))
         found[name] = calibrate_camera(surveyed, scene.clicks[name].markings, size, picture=grey)
     return found

@@ -29,6 +29,8 @@ from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
     ClipEvidence,
+    MonocularPoses,
+    RayConstraints,
     constrain_to_rays,
     find_ray_constraints,
     fit_bodies,
@@ -164,7 +166,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     static = find_ray_constraints(cameras, right, index, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
-    def fit(views: list, monocular: object = None) -> BodyFit:
+    def fit(views: list[RayConstraints], monocular: MonocularPoses | None = None) -> BodyFit:
         evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, monocular)
         return fit_bodies(BODY, evidence, SETTINGS, ground)
 

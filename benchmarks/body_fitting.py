@@ -156,11 +156,11 @@ def _compare(
         search.zero_grad()
         found = keypoints(shape, pose[:, :3], pose[:, 3:], transl)
         value = ((found - wanted) ** 2).sum() + WEIGHT * (pose[:, 3:] ** 2).sum()
-        value.backward()
+        value.backward()  # type: ignore[no-untyped-call]
         return value
 
     start, busy = time.perf_counter(), time.process_time()
-    search.step(loss)
+    search.step(loss)  # type: ignore[no-untyped-call]
     wall, busy = time.perf_counter() - start, time.process_time() - busy
     cost = float(loss().detach())
     with torch.no_grad():

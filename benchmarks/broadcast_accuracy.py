@@ -150,6 +150,7 @@ def main() -> None:
                 with VideoReader(file) as video:
                     yield from (picture for _, picture in video.frames(grey=True))
 
+            assert match.pitch is not None  # of every scenario with a broadcast camera
             begin = time.perf_counter()
             found = calibrate_broadcast(
                 PitchTemplate.from_spec(match.pitch),

@@ -9,13 +9,9 @@ line set is the only key frame of its clip, whose camera depends on the drawn li
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 import pitch_lines
 
 from data_contracts.broadcast_calibration import KeyFrame
@@ -28,7 +24,7 @@ from worldpose.geometry import Camera
 _, SIZE = pitch_lines.SETS["wc14"]
 
 
-def cameras(lines: dict[str, dict]) -> dict[str, Camera | None]:
+def cameras(lines: dict[str, pitch_lines.Lines]) -> dict[str, Camera | None]:
     """Return each line set's camera, that of a clip with this one key frame."""
     settings = BroadcastCalibrationSettings()
     found: dict[str, Camera | None] = {}
@@ -43,7 +39,7 @@ def cameras(lines: dict[str, dict]) -> dict[str, Camera | None]:
     return found
 
 
-def line_sets(folder: Path, count: int = 30) -> dict[str, dict]:
+def line_sets(folder: Path, count: int = 30) -> dict[str, pitch_lines.Lines]:
     """Return line sets of the half that settings were not tuned on."""
     return dict(list(pitch_lines.load_lines(folder, "wc14", 1, 1).items())[:count])
 

@@ -11,17 +11,11 @@ every seed.
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
-
-from data_contracts.arrays import Floats
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from broadcast_accuracy import ANEW, LASTING, SHARES, distances, errors
 
+from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings, MovingCamera, People
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
@@ -129,7 +123,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--fps", type=float, default=10.0)
     options = parser.parse_args()
-    told: dict[str, list[float]] = {}
+    told: dict[str, list[list[float]]] = {}
     for seed in options.seeds:
         for name in ("broadcast-pan", "broadcast-zoom"):
             clip = judge_clip(name, seed, options.seconds, options.fps)
@@ -138,8 +132,8 @@ def main() -> None:
                 told.setdefault(kind, []).append(held)
     wanted = " / ".join(f"{100.0 * share:g}" for share in SHARES)
     for kind, parts in told.items():
-        held = " / ".join(f"{100.0 * each:.1f}" for each in np.mean(parts, axis=0))
-        print(f"{kind} in regions of {wanted} %: {held}")
+        found = " / ".join(f"{100.0 * each:.1f}" for each in np.mean(parts, axis=0))
+        print(f"{kind} in regions of {wanted} %: {found}")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.calibration import BroadcastClip, refine, track
 from worldpose.broadcast_calibration.evidence import together
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.players import match as match_players
 from worldpose.broadcast_calibration.players import player_evidence
 from worldpose.broadcast_calibration.report import median_residuals
@@ -57,6 +58,7 @@ def rows_of(
     true = true_camera(folder, (camera.width, camera.height), clip)
     joints = read_joints(folder / "reference" / "joints.npz").joints
     people = people_of(match, joints, clip)
+    assert match.pitch is not None  # of every scenario with a broadcast camera
     pitch = PitchTemplate.from_spec(match.pitch)
 
     def pictures(file: Path = match.videos[clip]) -> Iterator[NDArray[np.uint8]]:
@@ -76,7 +78,8 @@ def rows_of(
         "true camera": true,
     }
     # The same lines and people for all variants, searched around the true camera.
-    lines = follow_lines(true, FieldSamples.of(pitch), pictures(), people.boxes, whole)
+    samples = FieldSamples.of(pitch, PitchErrors.of(pitch, whole))
+    lines = follow_lines(true, samples, pictures(), people.boxes, whole)
     players, _ = player_evidence(true, people, match_players(true, people), whole)
     evidence = together([lines.evidence, players])
     feet, inside = feet_in_picture(true, joints)

@@ -178,7 +178,7 @@ def pycolmap_side(problem: Problem) -> Run:
     config = pycolmap.BundleAdjustmentConfig()
     for c in range(count):
         config.add_image(c + 1)
-    for p in np.flatnonzero(np.isinf(problem.point_information)):
+    for p in np.flatnonzero(np.isinf(problem.point_information)).tolist():
         if p in ids:
             config.add_constant_point(int(ids[p]))
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, scene)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_FLIP
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
 from worldpose.geometry import Camera, Rigid
@@ -50,9 +50,9 @@ class RandomRig:
 
     cameras: list[Camera]
     true: list[Camera]
-    covariance: NDArray | None
-    keypoints: NDArray
-    confidence: NDArray
+    covariance: Floats | None
+    keypoints: Floats
+    confidence: Floats
     fps: float
     pitch_size: tuple[float, float] | None
     fault: str | None = None
@@ -63,7 +63,7 @@ class RandomRig:
 # --- people ---------------------------------------------------------------------------------
 
 
-def recorded_paths(data: Path | None, rng: np.random.Generator) -> tuple[NDArray, float] | None:
+def recorded_paths(data: Path | None, rng: np.random.Generator) -> tuple[Floats, float] | None:
     """Return paths of real players (frames, persons, 2) [m] and their rate; None without data."""
     if data is None or not (data / "trajectories").is_dir():
         return None
@@ -77,7 +77,7 @@ def recorded_paths(data: Path | None, rng: np.random.Generator) -> tuple[NDArray
     return xy, fps
 
 
-def random_paths(rng: np.random.Generator) -> tuple[NDArray, float]:
+def random_paths(rng: np.random.Generator) -> tuple[Floats, float]:
     """Return random walks (frames, persons, 2) [m] at 20 Hz."""
     count, steps = int(rng.integers(5, 22)), 400
     start = rng.normal([rng.uniform(-25, 25), rng.uniform(-10, 10)], [14.0, 10.0], (count, 2))
@@ -90,7 +90,7 @@ def random_paths(rng: np.random.Generator) -> tuple[NDArray, float]:
     return (start[:, None] + way).swapaxes(0, 1), 20.0
 
 
-def stick_figure(path: NDArray, rate: float, rng: np.random.Generator) -> NDArray:
+def stick_figure(path: Floats, rate: float, rng: np.random.Generator) -> Floats:
     """Return joints (frames, 17, 3) [m] of a person who walks along a path (frames, 2)."""
     velocity = np.gradient(path, axis=0) * rate
     kernel = np.ones(round(0.3 * rate)) / round(0.3 * rate)
@@ -111,8 +111,9 @@ def stick_figure(path: NDArray, rate: float, rng: np.random.Generator) -> NDArra
     neck = root + torso * (np.cos(lean)[:, None] * up + np.sin(lean)[:, None] * forward)
     joints = np.zeros((len(path), 17, 3))
 
-    def along(angle: NDArray) -> NDArray:
-        return np.sin(angle)[:, None] * forward - np.cos(angle)[:, None] * up
+    def along(angle: Floats) -> Floats:
+        swung: Floats = np.sin(angle)[:, None] * forward - np.cos(angle)[:, None] * up
+        return swung
 
     joints[:, 0] = neck + size * (0.2 * up + 0.1 * forward)
     for side, sign in ((0, 1.0), (1, -1.0)):
@@ -132,7 +133,7 @@ def stick_figure(path: NDArray, rate: float, rng: np.random.Generator) -> NDArra
     return joints
 
 
-def captured_figure(path: NDArray, rate: float, data: Path, rng: np.random.Generator) -> NDArray:
+def captured_figure(path: Floats, rate: float, data: Path, rng: np.random.Generator) -> Floats:
     """Return joints (frames, 17, 3) [m] of a motion capture clip moved along a path."""
     name = rng.choice(["cmu_10_01", "cmu_10_03"])
     with np.load(data / "mocap" / f"{name}.npz") as file:
@@ -165,7 +166,7 @@ def captured_figure(path: NDArray, rate: float, data: Path, rng: np.random.Gener
     return out
 
 
-def people(seconds: float, data: Path | None, rng: np.random.Generator) -> NDArray:
+def people(seconds: float, data: Path | None, rng: np.random.Generator) -> Floats:
     """Return joints (frames at 100 Hz, persons, 17, 3) [m] of people on a pitch."""
     found = recorded_paths(data, rng) if rng.random() < 0.7 else None
     xy, fps = found if found is not None else random_paths(rng)
@@ -194,10 +195,10 @@ def people(seconds: float, data: Path | None, rng: np.random.Generator) -> NDArr
 
 
 def look_at(
-    center: NDArray,
-    target: NDArray,
+    center: Floats,
+    target: Floats,
     focal: float,
-    distortion: NDArray,
+    distortion: Floats,
     size: tuple[int, int],
     roll: float = 0.0,
 ) -> Camera:
@@ -216,7 +217,7 @@ def look_at(
     )
 
 
-def random_camera(middle: NDArray, rng: np.random.Generator) -> Camera:
+def random_camera(middle: Floats, rng: np.random.Generator) -> Camera:
     """Return a camera off the pitch that looks at the play around `middle` (2,) [m]."""
     size = [(1920, 1080), (1280, 720), (3840, 2160)][rng.choice(3, p=[0.7, 0.2, 0.1])]
     angle = rng.uniform(0, 2 * np.pi)
@@ -244,7 +245,7 @@ def random_camera(middle: NDArray, rng: np.random.Generator) -> Camera:
     return look_at(center, target, focal, lens, size, rng.normal(0, 0.01))
 
 
-def perturb(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camera:
+def perturb(camera: Camera, sigma: Floats, rng: np.random.Generator) -> Camera:
     """Return the camera with a random calibration error of `sigma` (12,)."""
     step = rng.normal(0, sigma)
     pose = camera.cam_from_world
@@ -263,7 +264,7 @@ def perturb(camera: Camera, sigma: NDArray, rng: np.random.Generator) -> Camera:
 class Detector:
     """A detector with random errors: bias and noise in units of the person's height."""
 
-    bias: NDArray
+    bias: Floats
     noise: float
     tail: float
     misses: float
@@ -284,19 +285,19 @@ class Detector:
 
 
 def detect(
-    camera: Camera, world: NDArray, detector: Detector, rng: np.random.Generator
-) -> tuple[list[list[NDArray]], NDArray]:
+    camera: Camera, world: Floats, detector: Detector, rng: np.random.Generator
+) -> tuple[list[list[Floats]], Flags]:
     """Return the detections of every frame, each (17, 2) [px], and the number of people in view."""
     image = camera.project(world.reshape(-1, 3)).reshape(*world.shape[:3], 2)
     size = camera.image_size
     frames, persons = image.shape[:2]
-    inside = np.isfinite(image).all(-1) & (image >= 0).all(-1) & (image < size).all(-1)
+    inside = np.all(np.isfinite(image) & (image >= 0) & (image < size), axis=-1)
     visible = inside.mean(axis=-1) > 0.6
     height = np.nanmax(image[..., 1], -1) - np.nanmin(image[..., 1], -1)
     # Occluded people: a nearer person covers the same place in the image.
     depth = np.linalg.norm(world.mean(axis=2) - camera.center, axis=-1)
     middle = image.mean(axis=2)
-    found: list[list[NDArray]] = []
+    found: list[list[Floats]] = []
     away = np.zeros(persons)
     drift = rng.normal(0, 1, (persons, 17, 2))
     ghosts = [
@@ -330,7 +331,7 @@ def detect(
     return found, visible
 
 
-def pad(found: list[list[list[NDArray]]]) -> NDArray:
+def pad(found: list[list[list[Floats]]]) -> Floats:
     """Return (frames, cameras, detections, 17, 2) from each camera's people of every frame."""
     frames = max(len(camera) for camera in found)
     most = max(1, *(len(frame) for camera in found for frame in camera))
@@ -348,7 +349,7 @@ LENS_ORDERS = ([0, 1, 3, 4, 2], [0, 1, 4, 2, 3], [2, 3, 0, 1, 4])
 """Positions from which a reader with another order takes k1 k2 p1 p2 k3."""
 
 
-def with_pose(camera: Camera, rotation: NDArray, center: NDArray) -> Camera:
+def with_pose(camera: Camera, rotation: Floats, center: Floats) -> Camera:
     """Return the camera with another pose."""
     return replace(camera, cam_from_world=Rigid(rotation, -rotation @ center))
 
@@ -357,7 +358,7 @@ def plant(
     kind: str,
     rig: RandomRig,
     eligible: list[int],
-    world: NDArray,
+    world: Floats,
     detector: Detector,
     rng: np.random.Generator,
 ) -> bool:
@@ -423,7 +424,7 @@ def plant(
     return True
 
 
-def lens_shift(true: Camera, stated: Camera, world: NDArray) -> float:
+def lens_shift(true: Camera, stated: Camera, world: Floats) -> float:
     """Return the mean image shift of people by a wrong lens [px]."""
     points = world[::25].reshape(-1, 3)
     a, b = true.project(points), stated.project(points)
@@ -502,7 +503,9 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     options = parser.parse_args()
     data = None if options.data is None else Path(options.data)
-    named, planted, others = Counter(), Counter(), Counter()
+    named: Counter[str] = Counter()
+    planted: Counter[str] = Counter()
+    others: Counter[str] = Counter()
     false = 0
     for n in range(options.rigs):
         kind = options.kinds[n % len(options.kinds)]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,13 +52,13 @@ def main() -> None:
     # OpenCV 4 has the form with a stopping rule under its own name.
     iterate = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 
-    def cv_project() -> object:
+    def cv_project() -> Any:
         return cv2.projectPoints(points, rotvec, translation, MATRIX, distortion)
 
-    def cv_normalize() -> object:
+    def cv_normalize() -> Any:
         return cv2.undistortPoints(pixels, MATRIX, distortion)
 
-    def cv_normalize_exactly() -> object:
+    def cv_normalize_exactly() -> Any:
         return iterate(pixels, MATRIX, distortion, None, None, None, TO_THE_LAST_BIT)
 
     print(f"{options.points} points, best of {options.rounds} rounds, one thread")

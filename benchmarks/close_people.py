@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from worldpose.geometry import Camera, Rigid
 
@@ -119,7 +119,7 @@ def _body(rng: np.random.Generator, places: NDArray[np.float64]) -> NDArray[np.f
     )
     zero = np.zeros(frames)
 
-    def local(forward: object, side: object, up: object) -> NDArray[np.float64]:
+    def local(forward: ArrayLike, side: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
         return np.stack(np.broadcast_arrays(forward, side, up, zero)[:3], axis=-1)
 
     out = np.empty((frames, JOINTS, 3))

@@ -1,14 +1,23 @@
-"""Code that several benchmarks share: a rig in a stadium's stands, and timing in turns."""
+"""Code that several benchmarks share: rigs in a stadium, timing in turns, runs, distances."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flows.match import task_of
+from flows.method import METHOD
+from flows.registering import register
+from flows.run_plan import plan_run
 from worldpose.geometry import Camera, Rigid
+from worldpose.store import Store
 
 
 def stadium_rig(count: int, rng: np.random.Generator, *, varied_lenses: bool) -> Camera:
@@ -50,7 +59,7 @@ def stadium_rig(count: int, rng: np.random.Generator, *, varied_lenses: bool) ->
     return Camera.stack(cameras)
 
 
-def best_seconds(sides: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
     """Return the best wall time [s] of each side.
 
     All sides run in turns, in one round that is not measured and in `rounds` that are.
@@ -65,3 +74,64 @@ def best_seconds(sides: dict[str, Callable[[], object]], rounds: int) -> dict[st
         print(f"\r  round {done} of {rounds}", end="", file=sys.stderr, flush=True)
     print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
     return best
+
+
+WORLDPOSE = Path(sys.executable).with_name("worldpose")
+
+
+def run_worldpose(*words: object, accepted: Collection[int] = (0,)) -> str:
+    """Run the command line quietly and return its output; end the program if it fails.
+
+    Args:
+        words: arguments.
+        accepted: exit codes that are no failure.
+    """
+    done = subprocess.run(
+        [WORLDPOSE, *map(str, words)], capture_output=True, text=True, check=False
+    )
+    if done.returncode not in accepted:
+        sys.exit(f"worldpose {' '.join(map(str, words))}:\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def run_in_process(
+    store: Store, folder: Path, until: str, iterations: int, overrides: dict[str, Any]
+) -> tuple[str, list[dict[str, str]]]:
+    """Compute missing results without Prefect and Dask, one unit after another.
+
+    Returns:
+        The match's id, and per iteration `stage/unit` to key.
+    """
+    match, _ = register(store, folder)
+    names = [stage.name for stage in METHOD]
+    stages = dict(zip(names, METHOD, strict=True))
+    found = []
+    for number in range(1, iterations + 1):
+        last = until if number == iterations else names[-1]
+        chosen = METHOD[: names.index(last) + 1]
+        units = plan_run(store, match, overrides, chosen, iteration=number)
+        for unit in units:
+            recipe = unit.recipe
+            if not store.has(match.match_id, recipe.stage, recipe.unit, unit.key):
+                task_of(stages[recipe.stage]).fn(unit.work(store.url, match, "0001"))
+        found.append({unit.name: unit.key for unit in units})
+    return match.match_id, found
+
+
+def distances_to_polyline(
+    pixels: NDArray[np.float64], line: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the distance of each pixel (n, 2) to a polyline (m, 2), NaN in gaps [px].
+
+    Infinite where the polyline has no two finite neighbours.
+    """
+    start, step = line[:-1], np.diff(line, axis=0)
+    whole = np.isfinite(start).all(axis=1) & np.isfinite(step).all(axis=1)
+    start, step = start[whole], step[whole]
+    if not len(start):
+        return np.full(len(pixels), np.inf)
+    offset = pixels[:, None] - start
+    share = (offset * step).sum(axis=-1) / np.maximum((step**2).sum(axis=-1), 1e-12)
+    nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
+    distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
+    return distances

@@ -20,7 +20,7 @@ STEPS = ("write", "check", "count")
 FPS = 50.0
 
 
-def write(folder: Path, clips: int, frames: int, people: int):
+def write(folder: Path, clips: int, frames: int, people: int) -> None:
     """Write clips of people who run in circles at 2.4 m/s before a panning, zooming camera."""
     from worldpose.body import OPEN_BODY, BodyParameters, find_body
     from worldpose.formats.camera_file import write_moving_camera
@@ -61,7 +61,7 @@ def write(folder: Path, clips: int, frames: int, people: int):
         write_moving_camera(folder / "cameras" / f"C_{clip:03d}.npz", camera)
 
 
-def check(folder: Path):
+def check(folder: Path) -> None:
     """Check the data set."""
     from flows.results.dataset import check as check_data_set
 
@@ -70,7 +70,7 @@ def check(folder: Path):
     print(f"  {len(report.clips)} clips checked, findings: {', '.join(faults) or 'none'}")
 
 
-def count(folder: Path):
+def count(folder: Path) -> None:
     """Count the data set."""
     from flows.results.dataset import count as count_data_set
 
@@ -78,7 +78,7 @@ def count(folder: Path):
     print(f"  {found.frames} frames, {found.poses} poses, {found.distance_km:.1f} km")
 
 
-def main():
+def main() -> None:
     """Run one step, or all in separate processes."""
     folder = Path(sys.argv[1])
     if sys.argv[2] in STEPS:

@@ -105,16 +105,22 @@ def count_views(
 def measure(
     cameras: Camera, moments: list[dict[str, Any]], settings: TrackingSettings
 ) -> dict[str, Any]:
-    """Return errors (people, 8) [cm] of found people by views, and counts of all and false ones."""
+    """Return errors (people, 8) [cm] of found people by views, and counts.
+
+    `people` counts annotated people by the cameras that see them, `results` all placed people and
+    `extra` those beyond the annotated ones, both by the cameras whose detections place them.
+    """
     errors: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     people: dict[int, int] = defaultdict(int)
-    extra = 0
+    results: dict[int, int] = defaultdict(int)
+    extra: dict[int, int] = defaultdict(int)
     for moment in moments:
         truth, image = moment["truth"], moment["image"]
         views = count_views(cameras, truth, image)
         given = (cameras, image[..., :2], image[..., 2])
         tracks = track_people(*given, 25.0, settings)
         found = np.empty((0, 8, 3))
+        used = (tracks.detection_index[0] >= 0).sum(axis=0)
         if len(tracks.person):
             detections = TrackedDetections(image[..., :2], image[..., 2], tracks.detection_index)
             placed = reconstruct_joints(cameras, detections, 25.0, TriangulationSettings())
@@ -129,8 +135,27 @@ def measure(
             people[count] += 1
         for row, column in zip(rows[good], columns[good], strict=True):
             errors[int(views[row])].append(100.0 * off[row, column])
-        extra += len(found) - int(good.sum())
-    return {"errors": errors, "people": people, "extra": extra, "moments": len(moments)}
+        for count in used.tolist():
+            results[count] += 1
+        for row in set(range(len(found))) - set(columns[good].tolist()):
+            extra[int(used[row])] += 1
+    return {
+        "errors": errors,
+        "people": people,
+        "results": results,
+        "extra": extra,
+        "moments": len(moments),
+    }
+
+
+def mean_error(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the mean error of each of `GROUPS` (4,) [cm]; NaN without people."""
+    if not errors:
+        return np.full(len(GROUPS), np.nan)
+    means: NDArray[np.float64] = np.nanmean(
+        np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2)
+    )
+    return means
 
 
 def main() -> None:
@@ -143,16 +168,16 @@ def main() -> None:
     settings = TrackingSettings.model_validate(changes)
     result = measure(*load_moments(options.data / "mvor"), settings)
     for views, published in PUBLISHED.items():
-        errors = np.array(result["errors"][views]).reshape(-1, 8)
-        groups = np.nanmean(errors.reshape(-1, 4, 2), axis=(0, 2))
+        errors = result["errors"][views]
+        groups = mean_error(errors)
         parts = ", ".join(f"{name} {value:.1f}" for name, value in zip(GROUPS, groups, strict=True))
         print(
             f"{views} views: found {len(errors)} of {result['people'][views]}, mean error "
             f"{groups.mean():.1f} cm ({parts}); published {published} cm"
         )
     print(
-        f"in {result['moments']} moments {result['extra']} people beyond the annotated ones, which "
-        "are not all who are there"
+        f"in {result['moments']} moments {sum(result['extra'].values())} people beyond the "
+        "annotated ones, which are not all who are there"
     )
 
 

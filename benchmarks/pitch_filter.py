@@ -1,6 +1,6 @@
 """Prints errors of the pitch filter (D2), which removes spectators, in rendered images.
 
-    python benchmarks/pitch_filter.py [--scenario match] [--seeds 3] [--images FOLDER]
+    python benchmarks/pitch_filter.py [--scenario match] [--seeds 3] [--pictures FOLDER]
 
 One image of every static camera, true cameras, embedded nets; boxes of low score count, too. Stage
 `detection` searches for people twice: everywhere, and on the pitch and close to it. A player,

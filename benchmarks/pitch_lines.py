@@ -15,9 +15,11 @@ import argparse
 import importlib.util
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,6 +35,11 @@ from worldpose.static_calibration import (
     StaticCalibrationSettings,
     calibrate_camera,
 )
+
+Lines = dict[str, list[list[float]]]
+"""Drawn points of one image by marking, as shares of its width and height."""
+Size = tuple[int, int]
+"""Width, height [px]."""
 
 # The scorer's template is flat. Broadcast images are crops of a zoom lens with a varying principal
 # point. Main cameras of the even half with seven visible markings or more: focal length 2.6 widths
@@ -58,7 +65,10 @@ BROADCAST = StaticCalibrationSettings(
     ),
     k3_gain=0.9,
 )
-SETS = {"wc14": ("wc14", (1280, 720)), "sn22": ("sn22_lines", (960, 540))}
+SETS: dict[str, tuple[str, Size]] = {
+    "wc14": ("wc14", (1280, 720)),
+    "sn22": ("sn22_lines", (960, 540)),
+}
 PIXELS = (5, 10, 20)
 FAR_OFF = BROADCAST.wrong_marking * BROADCAST.drawn_noise_px
 CLEARLY_SEEN = 40.0  # pixels of a marking in the image that an annotator does not overlook
@@ -83,12 +93,14 @@ class Fitted:
 def load_scorer(folder: Path) -> ModuleType:
     """Return the scorer of the data set."""
     spec = importlib.util.spec_from_file_location("calib_eval", folder / "wc14" / "calib_eval.py")
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(f"no scorer in {folder}")
     scorer = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(scorer)
     return scorer
 
 
-def load_lines(folder: Path, name: str, half: int | None, every: int) -> dict[str, dict]:
+def load_lines(folder: Path, name: str, half: int | None, every: int) -> dict[str, Lines]:
     """Return annotations of one set by image."""
     lines = json.loads((folder / SETS[name][0] / "lines.json").read_text())
     keys = sorted(lines)
@@ -96,7 +108,7 @@ def load_lines(folder: Path, name: str, half: int | None, every: int) -> dict[st
     return {key: lines[key] for key in keys[::every]}
 
 
-def fit(lines: dict, size: tuple[int, int], settings: StaticCalibrationSettings) -> Fitted:
+def fit(lines: Lines, size: Size, settings: StaticCalibrationSettings) -> Fitted:
     """Return the camera of one image."""
     start = time.perf_counter()
     try:
@@ -106,7 +118,7 @@ def fit(lines: dict, size: tuple[int, int], settings: StaticCalibrationSettings)
     return Fitted(found, "", time.perf_counter() - start)
 
 
-def as_json(camera: Camera) -> dict:
+def as_json(camera: Camera) -> dict[str, Any]:
     """Return a camera in the scorer's form."""
     (fx, fy), (cx, cy) = camera.focal, camera.principal_point
     return {
@@ -117,7 +129,7 @@ def as_json(camera: Camera) -> dict:
     }
 
 
-def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, int]) -> list[float]:
+def jaccards(scorer: ModuleType, lines: Lines, camera: Camera, size: Size) -> list[float]:
     """Return JaC at every pixel threshold."""
     shares = []
     for pixels in PIXELS:
@@ -126,7 +138,9 @@ def jaccards(scorer: ModuleType, lines: dict, camera: Camera, size: tuple[int, i
     return shares
 
 
-def score_images(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
+def score_images(
+    scorer: ModuleType, lines: dict[str, Lines], fits: dict[str, Fitted], size: Size
+) -> dict[str, list[float]]:
     """Return the JaC of every calibrated image."""
     return {
         key: jaccards(scorer, lines[key], fitted.calibration.estimate.camera, size)
@@ -136,7 +150,7 @@ def score_images(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size:
 
 
 def left_out(
-    scorer: ModuleType, lines: dict, size: tuple, settings: StaticCalibrationSettings
+    scorer: ModuleType, lines: dict[str, Lines], size: Size, settings: StaticCalibrationSettings
 ) -> np.ndarray:
     """Return shares of markings predicted by the camera of all others, per pixel threshold."""
     hits = []
@@ -153,24 +167,29 @@ def left_out(
                 pixels = np.array(points, float) * size
                 off = scorer.to_polyline(pixels, predicted[name]).max()
             hits.append([off <= limit for limit in PIXELS])
-    return 100.0 * np.mean(hits, axis=0)
+    return np.asarray(100.0 * np.mean(hits, axis=0))
 
 
 def contradictions(
-    scorer: ModuleType, lines: dict, fitted: Fitted, size: tuple, limit: float, seen: float
+    scorer: ModuleType,
+    lines: Lines,
+    calibration: StaticCalibration,
+    size: Size,
+    limit: float,
+    seen: float,
 ) -> list[str]:
     """Return disagreements between camera and annotation, in words.
 
     Args:
         scorer: projects the markings.
         lines: the annotation.
-        fitted: the fit of a calibrated image.
+        calibration: of the image.
         size: width, height [px].
         limit: maximum distance of a drawn pixel [px].
         seen: length in the image from which a marking has to be drawn [px].
     """
     box = np.array(size, float)
-    predicted = scorer.image_lines(as_json(fitted.calibration.estimate.camera), box)
+    predicted = scorer.image_lines(as_json(calibration.estimate.camera), box)
     found = []
     for name, points in lines.items():
         if name not in predicted:
@@ -186,19 +205,25 @@ def contradictions(
     return found
 
 
-def refusal(scorer: ModuleType, lines: dict, fits: dict[str, Fitted], size: tuple) -> dict:
+def refusal(
+    scorer: ModuleType, lines: dict[str, Lines], fits: dict[str, Fitted], size: Size
+) -> dict[str, tuple[float, float]]:
     """Return the share of markings with clear disagreement to the annotation, then the residual."""
     ranks = {}
     for key, fitted in fits.items():
         share = np.inf
         if fitted.calibration is not None:
-            found = contradictions(scorer, lines[key], fitted, size, FAR_OFF, CLEARLY_SEEN)
+            found = contradictions(
+                scorer, lines[key], fitted.calibration, size, FAR_OFF, CLEARLY_SEEN
+            )
             share = len(found) / len(lines[key])
         ranks[key] = (share, fitted.residual)
     return ranks
 
 
-def curve(scores: dict, refusal: dict) -> list[tuple[float, np.ndarray]]:
+def curve(
+    scores: dict[str, list[float]], refusal: Mapping[str, Any]
+) -> list[tuple[float, np.ndarray]]:
     """Return completeness [%] and JaC [%] while images are refused by descending refusal score."""
     order = sorted(scores, key=lambda key: refusal[key])
     points = []
@@ -210,7 +235,9 @@ def curve(scores: dict, refusal: dict) -> list[tuple[float, np.ndarray]]:
     return points
 
 
-def overlap(scorer: ModuleType, folder: Path, lines: dict, size: tuple) -> tuple[float, float]:
+def overlap(
+    scorer: ModuleType, folder: Path, lines: dict[str, Lines], size: Size
+) -> tuple[float, float]:
     """Return mean and median IoU of the seen part [%] of distortion-free fits to homographies."""
     truth = json.loads((folder / "wc14" / "homographies.json").read_text())
     settings = BROADCAST.model_copy(update={"distortion": "none"})
@@ -229,13 +256,15 @@ def overlap(scorer: ModuleType, folder: Path, lines: dict, size: tuple) -> tuple
     return float(np.mean(shares)), float(np.median(shares))
 
 
-def sheet(scorer: ModuleType, lines: dict, fits: dict, keys: list[str], size: tuple) -> np.ndarray:
+def sheet(
+    scorer: ModuleType, lines: dict[str, Lines], found: dict[str, StaticCalibration], size: Size
+) -> np.ndarray:
     """Return images two to a row: green drawn, red only predicted, yellow large residuals."""
     box = np.array(size, float)
     tiles = []
-    for key in keys:
+    for key, calibration in found.items():
         tile = np.full((size[1], size[0], 3), 30, np.uint8)
-        predicted = scorer.image_lines(as_json(fits[key].calibration.estimate.camera), box)
+        predicted = scorer.image_lines(as_json(calibration.estimate.camera), box)
         for name, line in predicted.items():
             color = (90, 200, 90) if name in lines[key] else (60, 60, 255)
             pixels = np.round(np.clip(line, -box, 2 * box)).astype(np.int32)
@@ -245,8 +274,8 @@ def sheet(scorer: ModuleType, lines: dict, fits: dict, keys: list[str], size: tu
             near = name in predicted and scorer.to_polyline(pixels, predicted[name]).max() <= 5.0
             color, filled = ((255, 255, 255), 1) if near else ((0, 200, 255), -1)
             for pixel in np.round(pixels).astype(int):
-                cv2.circle(tile, tuple(map(int, pixel)), 5, color, filled, cv2.LINE_AA)
-        why = contradictions(scorer, lines[key], fits[key], size, 5.0, 0.0)
+                cv2.circle(tile, (int(pixel[0]), int(pixel[1])), 5, color, filled, cv2.LINE_AA)
+        why = contradictions(scorer, lines[key], calibration, size, 5.0, 0.0)
         for row, text in enumerate([key, *why]):
             cv2.putText(tile, text, (10, 28 + 26 * row), 0, 0.7, (220, 220, 220), 1, cv2.LINE_AA)
         tiles.append(cv2.resize(tile, (800, 450), interpolation=cv2.INTER_AREA))
@@ -269,7 +298,7 @@ def main() -> None:
         scores = score_images(scorer, lines, fits, size)
         seconds = np.median([fitted.seconds for fitted in fits.values()])
         print(f"{name}: {len(lines)} pictures, {1e3 * seconds:.0f} ms each (median)")
-        residual = {key: fitted.residual for key, fitted in fits.items()}
+        residual: Mapping[str, Any] = {key: fitted.residual for key, fitted in fits.items()}
         refusals = {"worst pixel": residual, "contradictions": refusal(scorer, lines, fits, size)}
         for by, ranks in refusals.items():
             print(f"  refused by {by}: completeness, JaC@5/10/20 [%]")
@@ -280,12 +309,16 @@ def main() -> None:
         if name == "wc14":
             mean, median = overlap(scorer, given.data, lines, size)
             print(f"  IoU part without distortion: mean {mean:.1f}, median {median:.1f}")
-        worst = sorted(scores, key=lambda key: scores[key][0])[:10]
-        for key in worst:
-            why = contradictions(scorer, lines[key], fits[key], size, PIXELS[0], 0.0)
+        worst = {}
+        for key in sorted(scores, key=lambda key: scores[key][0])[:10]:
+            calibration = fits[key].calibration
+            if calibration is None:
+                continue
+            worst[key] = calibration
+            why = contradictions(scorer, lines[key], calibration, size, PIXELS[0], 0.0)
             print(f"  {key}: JaC@5 {scores[key][0]:.2f}; {'; '.join(why)}")
         if given.sheets:
-            picture = sheet(scorer, lines, fits, worst, size)
+            picture = sheet(scorer, lines, worst, size)
             cv2.imwrite(str(given.sheets / f"worst_{name}.png"), picture)
         for key, fitted in fits.items():
             if fitted.error:

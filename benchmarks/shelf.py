@@ -13,17 +13,14 @@ import argparse
 import importlib.util
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from common import run_worldpose
 
 from worldpose.formats import read_joints
-
-WORLDPOSE = Path(sys.executable).with_name("worldpose")
 
 
 def load_scorer(folder: Path) -> ModuleType:
@@ -34,15 +31,6 @@ def load_scorer(folder: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def command(*words: object) -> None:
-    """Run `worldpose` quietly."""
-    done = subprocess.run(
-        [WORLDPOSE, *map(str, words)], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        sys.exit(f"worldpose {' '.join(map(str, words))}:\n{done.stdout}{done.stderr}")
 
 
 def without(given: Path, camera: str, folder: Path) -> Path:
@@ -62,15 +50,15 @@ def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]
     scorer, truth = load_scorer(data), np.load(data / "gt.npz")
     match, project = folder / "shelf", folder / "project"
     calibration, detections = given / "calibration.toml", given / "detections"
-    command(
+    run_worldpose(
         *("import", "--calibration", calibration, "--detections", detections),
         *("--fps", 25, "--out", match),
     )
-    command("run", match, "--project", project, *settings)
+    run_worldpose("run", match, "--project", project, *settings)
     values = []
     for stage in ("retriangulation", "body_fitting"):
         out = folder / stage
-        command(
+        run_worldpose(
             *("export", "shelf", "--format", "joints", "--stage", stage),
             *("--out", out, "--project", project),
         )

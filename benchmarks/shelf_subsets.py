@@ -17,18 +17,14 @@ import argparse
 import itertools
 import json
 import re
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import run_in_process
 from shelf import load_scorer
 
-from flows.match import task_of
-from flows.method import METHOD
-from flows.registering import register
-from flows.run_plan import plan_run
 from worldpose.errors import WorldposeError
 from worldpose.ingest import import_match
 from worldpose.store import Store
@@ -60,32 +56,13 @@ def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Pat
     return match
 
 
-def run(
-    store: Store, folder: Path, until: str, iterations: int, overrides: dict[str, Any]
-) -> tuple[str, list[dict[str, str]]]:
-    """Compute missing results; return the match's id, and per iteration `stage/unit` to key."""
-    match, _ = register(store, folder)
-    names = [stage.name for stage in METHOD]
-    stages = dict(zip(names, METHOD, strict=True))
-    found = []
-    for number in range(1, iterations + 1):
-        last = until if number == iterations else names[-1]
-        chosen = METHOD[: names.index(last) + 1]
-        units = plan_run(store, match, overrides, chosen, iteration=number)
-        for unit in units:
-            recipe = unit.recipe
-            if not store.has(match.match_id, recipe.stage, recipe.unit, unit.key):
-                task_of(stages[recipe.stage]).fn(unit.work(store.url, match, "0001"))
-        found.append({unit.name: unit.key for unit in units})
-    return match.match_id, found
-
-
 def score(
     scorer: Any, truth: Any, store: Store, match: str, keys: dict[str, str], stage: str
 ) -> tuple[float, float]:
     """Return PCP3D [%] and the mean error of matched people [mm]."""
     (unit,) = (name for name in keys if name.startswith(f"{stage}/"))
-    stored = store.open_result(match, *unit.split("/"), keys[unit])
+    _, name = unit.split("/")
+    stored = store.open_result(match, stage, name, keys[unit])
     frames = stored["frame"].values
     poses = dict(zip(frames.tolist(), stored["joints"].values, strict=True))
     found, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf", frames=frames)
@@ -154,7 +131,7 @@ def tell_case(
     if not np.isfinite(truth["gt"][rows][:, [0, 2], 0, 0]).any():
         return
     try:
-        match, found = run(store, write_case(*case), *how)
+        match, found = run_in_process(store, write_case(*case), *how)
     except WorldposeError as error:
         print(f"{label}: {type(error).__name__}: {str(error).splitlines()[0]}", flush=True)
         return
@@ -184,4 +161,4 @@ def tell_case(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

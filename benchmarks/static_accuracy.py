@@ -69,7 +69,7 @@ def ground_errors(found: Camera, true: Camera, places: Floats, pitch: PitchTempl
     seen = ((pixels > 0.0) & (pixels < true.image_size - 1.0)).all(axis=-1)
     met = surface_points(found.unproject(pixels[seen]), pitch)
     off = np.linalg.norm(met - places[seen], axis=-1)
-    return np.where(np.isfinite(off), off, np.hypot(pitch.length, pitch.width))
+    return np.asarray(np.where(np.isfinite(off), off, np.hypot(pitch.length, pitch.width)))
 
 
 def markings_seen(camera: Camera, pitch: PitchTemplate) -> int:
@@ -77,7 +77,7 @@ def markings_seen(camera: Camera, pitch: PitchTemplate) -> int:
     count = 0
     for name in (*pitch.lines, *pitch.arcs):
         pixels = camera.project(pitch.marking_points(name, 0.25))
-        inside = ((pixels > BORDER) & (pixels < camera.image_size - BORDER)).all(axis=-1)
+        inside = np.all((pixels > BORDER) & (pixels < camera.image_size - BORDER), axis=-1)
         steps = np.linalg.norm(np.diff(pixels, axis=0), axis=-1)[inside[1:] & inside[:-1]]
         count += bool(steps.sum() > SHORT)
     return count
@@ -122,7 +122,10 @@ def outcomes(scenario: str, seeds: range) -> Iterator[Outcome | None]:
             clicks = scene.clicks[name]
             size = (int(true.image_size[0]), int(true.image_size[1]))
             people = scene.truth.joints[0]
-            still = cv2.cvtColor(render_pitch(true, painted, people, seed), cv2.COLOR_RGB2GRAY)
+            still = np.asarray(
+                cv2.cvtColor(render_pitch(true, painted, people, seed), cv2.COLOR_RGB2GRAY),
+                np.uint8,
+            )
             try:
                 found = calibrate_both_ways(surveyed, clicks.markings, size, still)
             except InputError:

@@ -20,10 +20,11 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from cv2.typing import MatLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Image
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
@@ -47,6 +48,7 @@ FREE = SPREAD > 0.0
 START_ERROR = 5.0
 FARTHEST = 30.0
 """Upper limit of the distance map [px]."""
+NO_MAP = np.empty(0, np.float32)
 ROBUST = 3.0
 """Cauchy scale of the peers' residuals on the map [px]: boards and shadows have edges, too."""
 
@@ -56,7 +58,8 @@ def line_points(camera: Camera, count: int) -> Floats:
     points = PITCH.sample_lines(0.1).points_world
     pixels = camera.project(points)
     points = points[((pixels > 3.0) & (pixels < camera.image_size - 4.0)).all(axis=-1)]
-    return points[np.linspace(0, len(points) - 1, count).astype(int)]
+    chosen: Floats = points[np.linspace(0, len(points) - 1, count).astype(int)]
+    return chosen
 
 
 def line_error(camera: Camera, true: Camera) -> float:
@@ -84,16 +87,15 @@ def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float3
     near = np.zeros_like(grey)
     for x, y in np.rint(start.project(line_points(start, 6000))).astype(int):
         cv2.circle(near, (int(x), int(y)), 15, 255, -1)
-    away = cv2.distanceTransform(255 - (edges & near), cv2.DIST_L2, 5)
+    away = cv2.distanceTransform(255 - cv2.bitwise_and(edges, near), cv2.DIST_L2, 5)
     return np.minimum(away, FARTHEST).astype(np.float32)
 
 
-def looked_up(away: NDArray[np.float32], pixels: Floats) -> Floats:
+def looked_up(away: MatLike, pixels: Floats) -> Floats:
     """Return the map interpolated at pixels (n,)."""
     at = pixels.astype(np.float32)[None]
-    return cv2.remap(away, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(
-        np.float64
-    )
+    mapped = cv2.remap(away, at, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(mapped[0], float)
 
 
 def by_scipy(away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats) -> Camera:
@@ -118,8 +120,8 @@ def by_gauss_newton(
     away: NDArray[np.float32], start: Camera, points: Floats, spread: Floats
 ) -> Camera:
     """Return a damped Gauss-Newton result on the map, with its gradient and our Jacobian."""
-    gx = cv2.Sobel(away, cv2.CV_32F, 1, 0, ksize=3) / 8.0
-    gy = cv2.Sobel(away, cv2.CV_32F, 0, 1, ksize=3) / 8.0
+    gx = cv2.Sobel(away / 8.0, cv2.CV_32F, 1, 0, ksize=3)
+    gy = cv2.Sobel(away / 8.0, cv2.CV_32F, 0, 1, ksize=3)
     prior = 9.0 / spread[FREE] ** 2
     best, cost, damping = np.zeros(int(FREE.sum())), np.inf, 1e-2
     trial, camera = best, start
@@ -156,7 +158,7 @@ def clicks_by_opencv(world: Floats, pixels: Floats, size: tuple[int, int]) -> Ca
         )
     except cv2.error:
         return None
-    return _camera(matrix, np.ravel(lens)[:5], np.ravel(rotations[0]), np.ravel(shifts[0]), size)
+    return _camera(matrix, np.ravel(lens)[:5], rotations[0], shifts[0], size)
 
 
 def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Camera:
@@ -165,7 +167,7 @@ def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Cam
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     matrix = np.array([[2200.0, 0.0, middle[0]], [0.0, 2200.0, middle[1]], [0.0, 0.0, 1.0]])
     _, rotvec, shift = cv2.solvePnP(world, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
-    start = _camera(matrix, np.zeros(5), rotvec.ravel(), shift.ravel(), size)
+    start = _camera(matrix, np.zeros(5), rotvec, shift, size)
     scale = np.array([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0, 1e-1, 0.0, 0.0, 0.05, 0.02, 0.0])
     used = scale > 0.0
 
@@ -183,13 +185,14 @@ def clicks_by_scipy(world: Floats, pixels: Floats, size: tuple[int, int]) -> Cam
 
 
 def _camera(
-    matrix: Floats, lens: Floats, rotvec: Floats, shift: Floats, size: tuple[int, int]
+    matrix: ArrayLike, lens: ArrayLike, rotvec: ArrayLike, shift: ArrayLike, size: tuple[int, int]
 ) -> Camera:
+    matrix = np.asarray(matrix)
     return Camera(
         focal=np.array([matrix[0, 0], matrix[1, 1]]),
         principal_point=matrix[:2, 2],
         distortion=np.resize(lens, 5),
-        cam_from_world=Rigid.from_rotvec(rotvec, shift),
+        cam_from_world=Rigid.from_rotvec(np.ravel(rotvec), np.ravel(shift)),
         image_size=np.array(size),
     )
 
@@ -234,6 +237,29 @@ def measure_sides(
     return results
 
 
+def methods(
+    prior: CameraEstimate, spread: Floats, picture: Image, world: Floats, clicked: Floats
+) -> dict[str, Callable[[], Camera | None]]:
+    """Return all methods that start at one camera, by name."""
+    start, size = prior.camera, (picture.shape[1], picture.shape[0])
+    away, points = distance_map(picture, start), line_points(prior.camera, 2000)
+
+    def make_map() -> None:
+        distance_map(picture, start)
+
+    return {
+        "start": lambda: start,
+        "lines: ours, from the picture": lambda: (
+            refine_on_lines(prior, PITCH, picture, survey_error=0.0).estimate.camera
+        ),
+        "lines: Gauss-Newton, from the map": lambda: by_gauss_newton(away, start, points, spread),
+        "lines: SciPy LM, from the map": lambda: by_scipy(away, start, points, spread),
+        "lines: making the map": make_map,
+        "clicks: calibrateCamera": lambda: clicks_by_opencv(world, clicked, size),
+        "clicks: solvePnP + SciPy": lambda: clicks_by_scipy(world, clicked, size),
+    }
+
+
 def main() -> None:
     """Print one line per method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -249,28 +275,13 @@ def main() -> None:
         true = place_camera(scenario.rig, index, np.zeros(3), scenario.pitch, rng)
         picture = render_pitch(true, PITCH, None, index)
         start, spread = some_pixels_off(true, rng)
-        points = line_points(start, 2000)
-        away = distance_map(picture, start)
         prior = CameraEstimate(start, np.diag(spread**2))
         places = PITCH.positions(list(PITCH.points))
         seen = true.project(places)
         inside = ((seen > 4.0) & (seen < true.image_size - 5.0)).all(axis=-1)
         chosen = rng.permutation(np.flatnonzero(inside))[:10]
         world, clicked = places[chosen], seen[chosen] + rng.standard_normal((len(chosen), 2))
-        size = (int(true.image_size[0]), int(true.image_size[1]))
-        sides: dict[str, Callable[[], Camera | None]] = {
-            "start": lambda start=start: start,
-            "lines: ours, from the picture": lambda p=prior, i=picture: (
-                refine_on_lines(p, PITCH, i, survey_error=0.0).estimate.camera
-            ),
-            "lines: Gauss-Newton, from the map": lambda a=(away, start, points, spread): (
-                by_gauss_newton(*a)
-            ),
-            "lines: SciPy LM, from the map": lambda a=(away, start, points, spread): by_scipy(*a),
-            "lines: making the map": lambda i=picture, s=start: (distance_map(i, s), None)[1],
-            "clicks: calibrateCamera": lambda w=world, c=clicked, z=size: clicks_by_opencv(w, c, z),
-            "clicks: solvePnP + SciPy": lambda w=world, c=clicked, z=size: clicks_by_scipy(w, c, z),
-        }
+        sides = methods(prior, spread, picture, world, clicked)
         grey, alone = brightness(picture), []
         for _ in range(options.rounds):
             search = TimedSearch(prior, PITCH, grey, 0.0, LineRefinementSettings())
@@ -278,8 +289,8 @@ def main() -> None:
             alone.append(search.seconds)
         own.append(min(alone))
         for name, (camera, seconds) in measure_sides(sides, options.rounds).items():
-            error = np.nan if camera is None else line_error(camera, true)
-            table.setdefault(name, []).append((seconds, error))
+            off = np.nan if camera is None else line_error(camera, true)
+            table.setdefault(name, []).append((seconds, off))
         print(f"\r  camera {index + 1} of {options.cameras}", end="", file=sys.stderr, flush=True)
     print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
     print(f"{options.cameras} cameras, best of {options.rounds} rounds, one thread; medians")

@@ -97,10 +97,10 @@ def thin(match: Path, seed: int, fps: float) -> tuple[NDArray[np.int64], NDArray
         file = match / "detections" / f"{name}.npz"
         with np.load(file) as stored:
             arrays = {key: stored[key] for key in stored.files}
-        frame, place = np.nonzero(identities[name] >= 0)
-        gone = taken[name][frame, identities[name][frame, place]]
+        rows, place = np.nonzero(identities[name] >= 0)
+        gone = taken[name][rows, identities[name][rows, place]]
         for key in ("keypoints", "confidence", "boxes", "score"):
-            arrays[key][frame[gone], place[gone]] = np.nan
+            arrays[key][rows[gone], place[gone]] = np.nan
         write_archive(file, arrays)
     return left, sees["clip"]
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from common import best_seconds, stadium_rig
@@ -57,7 +59,7 @@ def detections(
     for t in range(frames):
         image = cameras.project(joints[t].reshape(1, -1, 3)).reshape(CAMERAS, people, 17, 2)
         image += rng.normal(0, 1.5, image.shape)
-        inside = ((image > 0) & (image < [1920, 1080])).all(axis=(2, 3))
+        inside = np.all((image > 0) & (image < [1920, 1080]), axis=(2, 3))
         for c in range(CAMERAS):
             who = rng.permutation(np.flatnonzero(inside[c] & (rng.random(people) > 0.15)))
             false = image[c, rng.integers(people)] + rng.uniform(80, 300, 2)
@@ -125,6 +127,11 @@ def numpy_epipolar(centers: np.ndarray, rays: np.ndarray) -> list[np.ndarray]:
     return tables
 
 
+def run_frames(run: Callable[[int], Any], count: int) -> list[Any]:
+    """Return the results of a method in the first frames."""
+    return [run(t) for t in range(count)]
+
+
 def main() -> None:
     """Print one line per method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -153,7 +160,7 @@ def main() -> None:
         "numpy, greedy": lambda t: numpy_greedy(numpy_affinity(joints[t], centers, rays[t])),
         "loops, greedy": lambda t: numpy_greedy(loop_affinity(joints[t], centers, rays[t])),
     }
-    starts: dict[str, Callable[[int], object]] = {
+    starts: dict[str, Callable[[int], Any]] = {
         "ours, ground gate": lambda t: associate(centers, rays[t], weights[t], True, SETTINGS),
         "ours, no ground": lambda t: associate(centers, rays[t], weights[t], False, SETTINGS),
         "numpy, pair distances only": lambda t: numpy_epipolar(centers, rays[t]),
@@ -161,10 +168,7 @@ def main() -> None:
     print(f"{options.people} people, {CAMERAS} cameras, best of {options.rounds}, one thread")
     for title, table in (("association", methods), ("first frame", starts)):
         count = {name: 1 if "loops" in name else len(few) for name in table}
-        sides = {
-            name: lambda run=run, n=count[name]: [run(t) for t in range(n)]
-            for name, run in table.items()
-        }
+        sides = {name: partial(run_frames, run, count[name]) for name, run in table.items()}
         best = best_seconds(sides, options.rounds)
         first = best[next(iter(best))] / len(few)
         for name, run in table.items():
@@ -172,7 +176,7 @@ def main() -> None:
             line = f"{title:12s} {name:28s} {1e3 * seconds:9.3f} ms   ratio {seconds / first:8.1f}"
             if title == "association":
                 line += "   recall {:.4f} precision {:.4f}".format(
-                    *figures([run(t) for t in range(count[name])], owner)
+                    *figures(run_frames(run, count[name]), owner)
                 )
             print(line)
     confidence = np.full(keypoints.shape[:-1], 0.9)

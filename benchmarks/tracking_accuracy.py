@@ -33,7 +33,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
     begin = time.process_time()
     tracks = track_people(cameras, seen.keypoints, seen.confidence, fps, TrackingSettings())
     spent = time.process_time() - begin
-    found = JointTracks(scene.truth.frames, np.asarray(tracks.person), tracks.joints)
+    found = JointTracks(scene.truth.frames, np.asarray(tracks.person), tracks.joints.astype(float))
     scores, _ = evaluate_joints(found, scene.truth, fps=fps)
     frames, persons = scene.truth.joints.shape[:2]
     print(

@@ -98,7 +98,7 @@ def main() -> None:
         return np.concatenate(rows(count)).transpose(1, 0, 2)
 
     def from_null(vectors: np.ndarray) -> np.ndarray:
-        return vectors[..., :3] / vectors[..., 3:]
+        return np.asarray(vectors[..., :3] / vectors[..., 3:])
 
     def normal_equations() -> np.ndarray:
         a, b = rows(many)
@@ -149,7 +149,7 @@ def main() -> None:
             if len(good) < 2:
                 continue
             equations = np.zeros((2 * len(good), 4))
-            for k, c in enumerate(good):
+            for k, c in enumerate(good.tolist()):
                 x, y = flat[c, n]
                 equations[2 * k] = x * poses[c, 2] - poses[c, 0]
                 equations[2 * k + 1] = y * poses[c, 2] - poses[c, 1]

@@ -40,6 +40,29 @@ class CameraCalibration(Record):
     """t in x_cam = R x_world + t [m]."""
 
 
+class LensCalibration(Record):
+    """The lens of a static camera whose pose is not known, with its uncertainty."""
+
+    id: Name
+    image_size: tuple[ImageLength, ImageLength]
+    """Width and height [px]."""
+    focal_px: _Focal
+    """Of square pixels [px]."""
+    principal_point_px: tuple[_Pixels, _Pixels]
+    """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
+    distortion: tuple[_Coefficient, _Coefficient, _Coefficient, _Coefficient, _Coefficient] = (
+        *(0.0, 0.0, 0.0, 0.0, 0.0),
+    )
+    """k1, k2, p1, p2, k3: OpenCV's order [1]. p1 and p2 are kept as they are."""
+    focal_std_px: Annotated[float, Field(gt=0, le=1e6)]
+    """Standard deviation of the focal length [px]."""
+    principal_point_std_px: Annotated[float, Field(gt=0, le=1e6)]
+    """Of the principal point, each axis [px]."""
+    distortion_std: Annotated[float, Field(gt=0, le=1)]
+    """Of the displacement of the image corner by each of k1, k2 and k3, relative to its distance
+    from the centre [1]."""
+
+
 CAMERA_LABELS: dict[str, tuple[str, ...]] = {
     "axis": ("x", "y"),
     "coefficient": DISTORTION,

@@ -1,4 +1,4 @@
-"""Result of stage `detection`: the people that nets find in one camera's images (D1-D3)."""
+"""Result of stage `detection`: the people that nets find in one camera's images (D1-D5)."""
 
 from __future__ import annotations
 

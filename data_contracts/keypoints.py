@@ -19,10 +19,11 @@ def _no_frames() -> Integers:
 
 @dataclass(frozen=True, eq=False)
 class KeypointDetections:
-    """Detected people, the one record from a detector to the release.
+    """Detected people, the record from a detector to the store.
 
     The leading dimensions `...` are (frames, detections) for one camera, (frames, cameras,
     detections) for several cameras, and (detections,) for one image. Missing entries are NaN.
+    After tracking, `TrackedDetections` also holds which detection is which person.
 
     Attributes:
         keypoints: (..., 17, 2) [px], COCO-17; NaN where not found.
@@ -155,22 +156,22 @@ class TrackedDetections:
         keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
         confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
             out.
-        index: (frames, cameras, persons), index of each person's detection; -1 = not seen.
+        detection_index: (frames, cameras, persons), each person's detection; -1 = not seen.
     """
 
     keypoints: AnyFloats
     confidence: AnyFloats
-    index: NDArray[np.integer]
+    detection_index: NDArray[np.integer]
 
     def __getitem__(self, frames: slice | NDArray[np.integer]) -> TrackedDetections:
         """Return some frames."""
         return TrackedDetections(
-            self.keypoints[frames], self.confidence[frames], self.index[frames]
+            self.keypoints[frames], self.confidence[frames], self.detection_index[frames]
         )
 
     def select_person(self, person: int) -> TrackedDetections:
         """Return the same detections with one person alone."""
-        return replace(self, index=self.index[:, :, person : person + 1])
+        return replace(self, detection_index=self.detection_index[:, :, person : person + 1])
 
 
 KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {

@@ -10,16 +10,34 @@ from data_contracts.records import CONTRACT_VERSION, Name, Record
 
 Coordinate = Annotated[float, Field(ge=-300, le=300)]
 """[m], world."""
-Point = tuple[Coordinate, Coordinate, Coordinate]
+Point = tuple[Coordinate, Coordinate, Coordinate] | tuple[Coordinate, Coordinate]
+"""x, y and z, which contains the crown; without z, the point lies on the crowned surface."""
 Angle = Annotated[float, Field(ge=-13, le=13)]
 """[rad], at most two turns."""
 
 
 class LineSpec(Record):
-    """A straight painted line between two named points."""
+    """A straight line between two named points."""
 
     start: Name
     end: Name
+    painted: bool = True
+    """False for the edge of a mowing stripe and the like: it can be drawn, and no white paint is
+    expected there."""
+
+
+class StripesSpec(Record):
+    """Mowing stripes across the pitch: their edges are lines that can be clicked and drawn.
+
+    Edges are counted from either goal line to the halfway line: edge 1 of the left half has the
+    name `stripe_left_1` and the ends `stripe_left_1_near` and `stripe_left_1_far` on the touch
+    lines.
+    """
+
+    spacing: float = Field(ge=1, le=50)
+    """Distance between edges [m]: 5.5 where three stripes fill a penalty area."""
+    first: float | None = Field(default=None, gt=0, le=50)
+    """Distance of edge 1 from its goal line [m]; absent = the spacing."""
 
 
 class ArcSpec(Record):
@@ -57,3 +75,5 @@ class PitchSpec(Record):
     """Further lines, or replacements of standard ones, by name."""
     arcs: dict[Name, ArcSpec] = {}
     """Further arcs, or replacements of standard ones, by name."""
+    stripes: StripesSpec | None = None
+    """Mowing stripes, if their edges are clicked."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field, JsonValue
 
@@ -22,6 +22,22 @@ from data_contracts.records import (
     Record,
     Share,
 )
+
+EXPORT_FORMATS: Final = (
+    "joints",
+    "coco",
+    "worldpose",
+    "positions",
+    "minimap",
+    "trc",
+    "bvh",
+    "challenge",
+    "challenge-2025",
+    "tracks",
+    "slahmr-cameras",
+    "rerun",
+)
+"""Names that `worldpose export --format` accepts."""
 
 
 class ReleasedFile(Record):

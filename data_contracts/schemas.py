@@ -11,6 +11,7 @@ from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
 from data_contracts.broadcast_pooling import BROADCAST_POOLING
+from data_contracts.broadcast_tracking import BROADCAST_TRACKING
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.camera_consistency import CAMERA_CONSISTENCY, CameraFault
 from data_contracts.cameras import CameraCalibration
@@ -82,6 +83,7 @@ LAYOUTS: tuple[GroupLayout, ...] = (
     BODY_FITTING,
     BROADCAST_CALIBRATION,
     BROADCAST_POOLING,
+    BROADCAST_TRACKING,
     REFITTING,
     FILTERING,
 )

@@ -59,8 +59,8 @@ def main() -> None:
         cameras, people, fps, camera_covariance=adjusted.covariance
     ).triangulation
 
-    keypoints = wp.unswap(seen.keypoints, people.index, joints.exchanged)
-    rays = wp.find_ray_constraints(cameras, keypoints, people.index, joints.joints)
+    keypoints = wp.unswap(seen.keypoints, people.detection_index, joints.exchanged)
+    rays = wp.find_ray_constraints(cameras, keypoints, people.detection_index, joints.joints)
     evidence = wp.ClipEvidence(joints.joints, joints.covariance, fps, joints.common_bias, [rays])
     bodies = wp.fit_bodies(wp.find_body(), evidence, ground=pitch.height)
     tracked = wp.JointTracks(seen.frame, tracks.person, bodies.joints, bodies.covariance)

@@ -150,7 +150,8 @@ class JointLimits(Record):
     """Metric limits of a clip's triangulated joints."""
 
     standard_deviation_m: float = Field(default=0.10, ge=0)
-    """Of a joint along an axis, median over joints [m]; 0.03 with five views."""
+    """Root of the trace of a joint's covariance, over all three axes, median over joints [m]: with
+    equal errors along all axes, sqrt(3) times the standard deviation along one."""
     filled_share: float = Field(default=0.05, ge=0)
     """Share of joints filled by the motion model alone [1]."""
 
@@ -207,7 +208,9 @@ def _of_bodies(figures: Figures) -> Figures:
 
 
 CAMERAS = Gate(
-    "static_calibration", "Do the markings lie on the picture's, all over it?", CameraLimits()
+    "static_calibration",
+    "Do the projected markings match those in the image, in all parts of it?",
+    CameraLimits(),
 )
 PEOPLE = Gate(
     "detection",
@@ -220,13 +223,13 @@ CONSISTENCY = Gate(
 )
 IDENTITIES = Gate(
     "tracking",
-    "Is every person one track, from end to end?",
+    "Is every person one track over the whole clip?",
     IdentityLimits(),
     warned=("unmatched_share", "mean_ray_distance_m"),
 )
 JOINTS = Gate(
     "triangulation",
-    "Are the joints where the pictures show them?",
+    "Are the joints where the images show them?",
     JointLimits(),
     warned=("standard_deviation_m",),
 )
@@ -241,7 +244,7 @@ ACCEPTANCE = Gate(
 )
 BROADCAST = Gate(
     "broadcast_calibration",
-    "Does the drawn pitch stay on the picture's, from the first frame to the last?",
+    "Does the drawn pitch match the pitch in the image in every frame?",
     BroadcastLimits(),
 )
 

@@ -118,6 +118,9 @@ def _run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
     def compute_missing(
         stage: Stage, units: list[PlannedUnit]
     ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+        if stage.needs_static_cameras and not log.match.has_static_cameras:
+            reporter().say(f"{stage.name}: no units, as the match has no static cameras")
+            return
         missing = [unit for unit in units if not unit.published]
         reporter().stage_started(stage.name, stage.about, units=len(units), missing=len(missing))
         seconds = seconds_of(stage.name, time_limits)

@@ -11,6 +11,7 @@ from flows.stages import (
     body_fitting,
     broadcast_calibration,
     broadcast_pooling,
+    broadcast_tracking,
     bundle_adjustment,
     camera_consistency,
     detection,
@@ -37,6 +38,7 @@ METHOD: tuple[Stage, ...] = (
     body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
     broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
     broadcast_pooling.STAGE,  # [clip]  M1
+    broadcast_tracking.STAGE,  # [clip], without static cameras
     refitting.STAGE,  # [clip]          S1, S4
     filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iterate.py)
     # release, evaluation               X1-X3, E1-E6

@@ -18,7 +18,7 @@ from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from flows.stages import body_fitting, tracking, triangulation
+from flows.stages import body_fitting, broadcast_tracking, tracking, triangulation
 from worldpose.store import Store, libraries
 
 ComputeUnits = Callable[
@@ -247,7 +247,12 @@ class RunLog:
 
     def _lacks_people(self) -> bool:
         """Return whether a stage of this run found no person, or no joint, in any clip."""
-        for stage, figure in ((tracking.STAGE, "people"), (triangulation.STAGE, "joints")):
+        wanted = (
+            (tracking.STAGE, "people"),
+            (triangulation.STAGE, "joints"),
+            (broadcast_tracking.STAGE, "people"),
+        )
+        for stage, figure in wanted:
             clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]
             found = [self.figures.get(clip, {}).get(figure) for clip in clips]
             if stage in self.plan.stages and found and all(count == 0 for count in found):

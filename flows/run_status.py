@@ -163,12 +163,17 @@ def recorded_differences(
 
 
 def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None:
-    """Return the recipe of a run's result; None if the result was withdrawn or removed."""
+    """Return the recipe of a run's result; None if the result was withdrawn or removed.
+
+    Its settings have their present names, so that no difference is a former name.
+    """
     stage, _, name = unit.partition("/")
     key = record.results[unit]
     if not store.has(record.match_id, stage, name, key):
         return None
-    return store.manifest(record.match_id, stage, name, key).recipe
+    recipe = store.manifest(record.match_id, stage, name, key).recipe
+    settings = rename_settings({stage: recipe.settings})[stage]
+    return recipe.model_copy(update={"settings": settings})
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,11 @@ class Match:
         """The match's id."""
         return self.registration.spec.match_id
 
+    @property
+    def has_static_cameras(self) -> bool:
+        """Whether match.yaml has static cameras, left out or not."""
+        return bool(self.registration.spec.static_cameras)
+
     def without(self, cameras: Container[str]) -> Match:
         """Return the match without these static cameras; see `flows.left_out`."""
         spec = self.folder.spec
@@ -101,6 +106,7 @@ class Stage:
         worker_tag: tag of the workers that compute it, if the cluster has any.
         leaves_out: whether its results can leave static cameras out of all later stages.
         min_cameras: static cameras that it needs after some are left out.
+        needs_static_cameras: whether it has no units in a match of broadcast cameras alone.
     """
 
     name: str
@@ -116,3 +122,4 @@ class Stage:
     worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0
+    needs_static_cameras: bool = False

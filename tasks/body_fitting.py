@@ -54,7 +54,7 @@ class ClipPeople:
         clip: cameras, frames and clock.
         keypoints: (frames, cameras, detections, 17, 2) [px], as triangulated: left-right swaps are
             corrected.
-        index: (frames, cameras, persons), index among the detections; -1 = not seen.
+        detection_index: (frames, cameras, persons), index among the detections; -1 = not seen.
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
@@ -63,7 +63,7 @@ class ClipPeople:
 
     clip: ClipInputs
     keypoints: NDArray[np.floating]
-    index: NDArray[np.integer]
+    detection_index: NDArray[np.integer]
     person: NDArray[np.integer]
     joints: Floats
     covariance: Floats
@@ -111,7 +111,9 @@ def fit_people(
         ground = PitchTemplate.from_spec(PitchSpec.model_validate(pitch)).height
     settings = BodyFittingSettings.model_validate(recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
-    alone = find_ray_constraints(people.clip.cameras, people.keypoints, people.index, people.joints)
+    alone = find_ray_constraints(
+        people.clip.cameras, people.keypoints, people.detection_index, people.joints
+    )
     fit = fit_bodies(
         model,
         ClipEvidence(
@@ -167,7 +169,7 @@ def publish_fit(
             f"{joints}. One of the two is wrong there: compare both with the images, or export "
             "--stage retriangulation."
         )
-    pictures = Pictures(people.clip.cameras, people.keypoints, people.index)
+    pictures = Pictures(people.clip.cameras, people.keypoints, people.detection_index)
     report = report_fit(fit, people.joints, people.clip.fps, pictures)
     result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))
 

@@ -42,6 +42,7 @@ def broadcast_calibration(work: Work) -> str:
         with open_video(path) as video:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
+    people, boxes = _people(store, work)
     with store.publish(work) as result:
         calibration = calibrate_broadcast(
             PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
@@ -53,7 +54,8 @@ def broadcast_calibration(work: Work) -> str:
                 ],
                 pictures,
                 float(sources["fps"]),
-                people=_people(store, work),
+                people=people,
+                boxes=boxes,
                 where=file,
                 first=start,
             ),
@@ -70,20 +72,23 @@ def broadcast_calibration(work: Work) -> str:
     return work.key
 
 
-def _people(store: Store, work: Work) -> People | None:
-    """Return fitted people at the time of each image, and their detections, where known."""
+def _people(store: Store, work: Work) -> tuple[People | None, NDArray[np.float64] | None]:
+    """Return people fitted to static cameras at the time of each image, and detected boxes."""
     sources: dict[str, Any] = work.recipe.sources
     unit = work.recipe.unit
     seen_names = [f"{stage}/{unit}" for stage in ("ingest", "detection")]
     names = [name for name in seen_names if name in work.recipe.inputs]
     if not names:
-        return None
+        return None, None
     first, count, fps = (sources[name] for name in ("first_frame", "frame_count", "fps"))
     offset = float(sources["broadcast_offset_frames"])
     seen = open_input(store, work, names[0]).sel(frame=np.arange(first, first + count))
+    boxes = seen["boxes"].values.astype(np.float64)
+    if f"body_fitting/{unit}" not in work.recipe.inputs:
+        return None, boxes
     joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
     people = People(joints, seen["keypoints"].values.astype(np.float64), float(fps))
-    return people.later(round(offset) - offset)
+    return people.later(round(offset) - offset), None
 
 
 def _figures(report: BroadcastReport) -> dict[str, float]:
@@ -101,4 +106,9 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
     offset = report.feed_offset
     if offset is not None and offset.determined:
         figures["feed_offset_frames"] = offset.frames
+    for name, value, std in zip(
+        ("length", "width", "crown"), report.pitch.size, report.pitch.size_std, strict=True
+    ):
+        if std > 0.0:
+            figures |= {f"{name}_m": float(value), f"{name}_std_m": float(std)}
     return figures | {"weak": float(bool(report.reasons))}

@@ -144,7 +144,7 @@ class _Case:
         suspects = TriangulatedDetections(
             detections.keypoints,
             detections.confidence,
-            detections.index,
+            detections.detection_index,
             placed["offsets"].values.astype(np.float64),
             placed["exchanged"].values,
             before,
@@ -178,9 +178,9 @@ def _open(store: Store, work: Work) -> _Case:
 
 def _counts(judged: Judgement, suspects: TriangulatedDetections) -> list[float]:
     """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned."""
-    frame, camera, person = np.nonzero(suspects.index >= 0)
+    frame, camera, person = np.nonzero(suspects.detection_index >= 0)
     taken = np.full(judged.fits.shape, -1)
-    taken[frame, camera, suspects.index[frame, camera, person]] = person
+    taken[frame, camera, suspects.detection_index[frame, camera, person]] = person
     moved = (judged.fits >= 0) & (judged.fits != taken)
     return [
         float(np.isfinite(judged.mahalanobis_distance).sum()),

@@ -188,7 +188,7 @@ def _open(store: Store, work: Work) -> _Case:
 
 def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
     """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
-    if np.count_nonzero(suspects.index >= 0) * len(COCO17) < FEW:
+    if np.count_nonzero(suspects.detection_index >= 0) * len(COCO17) < FEW:
         return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
     return learn_keypoint_spread(views, suspects)
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import (
     STATIC_CALIBRATION,
@@ -63,6 +63,7 @@ def static_calibration(work: Work) -> str:
         pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
         settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
         picture = _still(work)
+        lens = sources.get("lens")
         try:
             calibration = calibrate_camera(
                 pitch,
@@ -71,6 +72,7 @@ def static_calibration(work: Work) -> str:
                 picture=picture,
                 settings=settings,
                 where=file,
+                lens=None if lens is None else LensCalibration.model_validate(lens),
             )
         except InputError as error:  # a failed calibration of one camera must not end the match
             reason = str(error)

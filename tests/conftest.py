@@ -1,5 +1,6 @@
 """Fixtures that tests of the whole system share: one match, one project, one Prefect server."""
 
+import fcntl
 import os
 import shutil
 import threading
@@ -29,29 +30,46 @@ def server(tmp_path_factory):
     os.environ.update(before)
 
 
+def make_once(tmp_path_factory, name, make):
+    """A folder that `make` fills, which the processes of one test run share; read only."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / f"shared-{name}"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
+        if not (folder / "made").exists():
+            make(folder / name)
+            (folder / "made").touch()
+    return folder / name
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """A small synthetic match folder with truth; read only."""
-    folder = tmp_path_factory.mktemp("matches") / "tiny"
     tiny = ("--scenario", "tiny", "--seed", 3, "--duration", 1.2, "--no-stills")
-    succeed("simulate", *tiny, "--out", folder)
-    return folder
+    return make_once(
+        tmp_path_factory, "tiny", lambda folder: succeed("simulate", *tiny, "--out", folder)
+    )
 
 
 @pytest.fixture(scope="session")
 def tiny_run(server, tiny, tmp_path_factory):
     """A project in which `tiny` has been run once; read only."""
-    project = tmp_path_factory.mktemp("project") / "worldpose-data"
-    succeed("run", tiny, "--project", project)
-    return project
+    return make_once(
+        tmp_path_factory,
+        "worldpose-data",
+        lambda project: succeed("run", tiny, "--project", project),
+    )
 
 
 @pytest.fixture(scope="session")
 def ingested(server, tiny, tmp_path_factory):
     """A project whose only run of `tiny` ended after its first stage; read only."""
-    project = tmp_path_factory.mktemp("ingested") / "worldpose-data"
-    succeed("run", tiny, "--project", project, "--until", "ingest")
-    return project
+    return make_once(
+        tmp_path_factory,
+        "ingested",
+        lambda project: succeed("run", tiny, "--project", project, "--until", "ingest"),
+    )
 
 
 @pytest.fixture

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from worldpose.formats import write_joints as write_joints
     from worldpose.formats.calibration_files import read_cameras as read_cameras
     from worldpose.geometry import Camera as Camera
+    from worldpose.geometry import Rigid as Rigid
     from worldpose.ingest import MatchFolder as MatchFolder
     from worldpose.ingest import read_match as read_match
     from worldpose.ingest import read_observations as read_observations
@@ -87,6 +88,7 @@ _MODULES: Final = {
     "MatchFolder": "worldpose.ingest",
     "PitchSpec": "data_contracts.pitch",
     "PitchTemplate": "worldpose.pitch",
+    "Rigid": "worldpose.geometry",
     "StaticCalibrationSettings": "worldpose.static_calibration",
     "TrackedDetections": "data_contracts.keypoints",
     "TrackingSettings": "worldpose.tracking",
@@ -134,6 +136,7 @@ __all__ = [
     "MatchFolder",
     "PitchSpec",
     "PitchTemplate",
+    "Rigid",
     "StaticCalibrationSettings",
     "TrackedDetections",
     "TrackingSettings",

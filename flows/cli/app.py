@@ -45,6 +45,7 @@ COMMANDS: Final = {
     "label": "finetune:label",
     "finetune": "finetune:finetune",
     "review": "review",
+    "models": "models",
     "body": "body",
 }
 """Command to `module:function` in flows.cli; a module alone is a group with `commands`."""

@@ -1,4 +1,4 @@
-"""Body models: bring your own."""
+"""Install a body model of your own, such as SMPL."""
 
 from __future__ import annotations
 

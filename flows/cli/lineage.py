@@ -33,7 +33,7 @@ def diff(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what changed between two runs: keys, reasons and metrics, and whether it is better.
+    """Show what changed between two runs: keys, reasons and metrics, and which parts improved.
 
     Only metrics where lower is better count. A metric is better or worse if it changed by more than
     1 % and by more than its minimum relevant change (flows/results/comparison.py). A camera, clip
@@ -118,8 +118,9 @@ def why(
 ) -> None:
     """Show whether a unit's result is current, and if not, what made it stale.
 
-    current: the latest run has what a run would give now; ready: the store has it, the latest
-    run has not; stale: the latest run has another; missing: there is none.
+    current: the latest run has the result that a run would use now; ready: the store has that
+    result, but the latest run does not; stale: the latest run has another result; missing: there
+    is no result.
 
     Example: worldpose why tiny-1/triangulation/clip
     """

@@ -24,7 +24,13 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.ingest import import_clicks, import_match, import_videos
+from worldpose.ingest import (
+    import_clicks,
+    import_lenses,
+    import_match,
+    import_videos,
+    unclicked_clips,
+)
 from worldpose.store import Store
 
 
@@ -210,8 +216,15 @@ def import_command(
     camera: Annotated[
         str | None,
         typer.Option(
-            help="With --clicks: the camera, or the clip of the broadcast camera; by default, "
-            "images are named after cameras."
+            help="With --clicks or --lens: the camera, or the clip of the broadcast camera; by "
+            "default, images and lenses are named after cameras."
+        ),
+    ] = None,
+    lens: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Lens without a pose: OpenCV XML or YAML, npz, matrix and distortion as two .npy "
+            "files, or TOML."
         ),
     ] = None,
     left_handed: Annotated[
@@ -219,10 +232,20 @@ def import_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring calibration and 2D poses or videos, clicks, or a surveyed pitch, into a match folder.
+    """Bring calibration and 2D poses or videos, clicks, lenses or a pitch into a match folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
+    if lens:
+        if calibration or detections or videos or fps or match_id or pitch or left_handed or clicks:
+            raise UsageError(
+                "--lens",
+                expected="--lens with --out, and --camera if the file does not name its camera",
+                found="options of a match, of clicks or of a pitch",
+                todo="Import the match first, then the lens into its folder.",
+            )
+        _import_lenses(lens, out, camera, as_json=as_json)
+        return
     if clicks is not None:
         if calibration or detections or videos or fps or match_id or pitch or left_handed:
             raise UsageError(
@@ -235,7 +258,10 @@ def import_command(
         return
     if camera is not None:
         raise UsageError(
-            "--camera", expected="--camera with --clicks", found="no --clicks", todo="Add --clicks."
+            "--camera",
+            expected="--camera with --clicks or --lens",
+            found="neither",
+            todo="Add one of them.",
         )
     if pitch is not None:
         if calibration or detections or videos or fps or match_id:
@@ -268,11 +294,34 @@ def import_command(
         )
 
 
+def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:
+    """Write lenses without a pose into a match folder, and print them with their deviations."""
+    lenses = import_lenses(files, out, camera)
+    if as_json:
+        cameras = {name: lens.model_dump(mode="json") for name, lens in lenses.items()}
+        print_json({"folder": str(out), "lenses": cameras})
+        return
+    line(f"wrote {out / 'lenses.toml'}; the deviations can be edited there")
+    for name, lens in lenses.items():
+        x, y = lens.principal_point_px
+        line(
+            f"{name}: focal length {lens.focal_px:.1f} px (standard deviation "
+            f"{lens.focal_std_px:.1f}), principal point {x:.1f}, {y:.1f} "
+            f"({lens.principal_point_std_px:.1f}), the image's corner "
+            f"{100 * lens.distortion_std:.2g} % of its distance; its pose comes from clicks"
+        )
+
+
 def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) -> None:
     """Write clicks and own points into a match folder, and print what was read."""
     found = import_clicks(file, out, camera)
+    questions = []
+    if found.repeated:
+        from flows.review.repeated_clicks import explain_repeated  # late: it loads the estimators
+
+        questions = explain_repeated(out, file, found.repeated)
     if as_json:
-        print_json({"folder": str(out), **asdict(found)})
+        print_json({"folder": str(out), **asdict(found), "questions": questions})
         return
     for name in found.files:
         line(f"wrote {out / name}")
@@ -283,12 +332,8 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
         line(f"places: y points to the {side} side, as the clicks show")
     if found.own_points:
         line(f"{len(found.own_points)} points that the Laws do not name are in pitch.json")
-    for image, label in found.repeated:
-        line(
-            f"warning: {image}: {label!r} is clicked more than once. Which one is meant? "
-            "Calibration tells the wrong one if the other clicks decide; else remove it.",
-            to=errors,
-        )
+    for text in questions:
+        line(f"warning: {text}", to=errors)
 
 
 def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
@@ -346,7 +391,7 @@ def ingest(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate match folders and make them known to the project; doing it twice is harmless.
+    """Validate match folders and register them in the project; repeating it is harmless.
 
     Example: worldpose ingest matches/tiny
     """
@@ -375,6 +420,7 @@ def _tell_unclicked(match: Match) -> None:
     """Print what has to be clicked before the match can run."""
     known = {**match.folder.calibrations, **match.folder.clicked}
     missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
+    missing += unclicked_clips(match.folder)
     if missing and match.folder.pitch is None:
         line(
             f"no calibration of {', '.join(missing)}: add them to calibration.toml (a match "

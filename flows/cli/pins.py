@@ -25,7 +25,7 @@ def pin(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Give a run a name and keep it: gc never forgets it; --run takes the name too.
+    """Name a run and keep it: gc never forgets a named run, and --run accepts the name.
 
     Example: worldpose pin tiny-1/0002 paper --who Ada --why "figures of the paper"
     """
@@ -50,7 +50,7 @@ def unpin(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Take a run's name back; gc may then forget it as any other.
+    """Remove the name of a run; gc may then forget the run like any other.
 
     Example: worldpose unpin tiny-1/paper
     """

@@ -32,7 +32,7 @@ def clips(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Propose clips of a programme: shots of the main camera, without a cut, with a pan.
+    """Propose clips of a programme: shots of the main camera without a cut and with a pan.
 
     Check the sheet and take the right ones; images are not encoded again.
 

@@ -49,7 +49,7 @@ def status(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Show which results are current, stale or missing, match by match.
+    """Show which results of each match are current, stale or missing.
 
     Example: worldpose status tiny-1
     """
@@ -137,7 +137,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
         problem = str(failure)
     else:
-        waiting = still_waiting(match, latest)
+        waiting = still_waiting(store, match, latest)
         for unit in planned:
             units[unit_state(unit, latest).value].append(unit.name)
     return {
@@ -217,7 +217,7 @@ def gc(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """List or remove (--delete) data that no run uses; a pinned run is never forgotten.
+    """List or remove (--delete) data that no run uses; pinned runs are always kept.
 
     Example: worldpose gc --keep-last 3 --delete
     """

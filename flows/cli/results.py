@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from data_contracts.release import EXPORT_FORMATS
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -27,9 +28,9 @@ def export(
         list[str],
         typer.Option(
             "--format",
-            help="joints, positions, minimap, coco, worldpose, trc, bvh, challenge, "
-            "challenge-2025, tracks, slahmr-cameras or rerun (docs/reference/formats.md); more "
-            "than one may be given.",
+            metavar="NAME",
+            help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]} "
+            "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Output folder.")],
@@ -104,7 +105,7 @@ def report(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one HTML page on a run: what was done, how good it is, what it looks like.
+    """Write one HTML page about a run, with its settings, metrics and images.
 
     Example: worldpose report tiny-1 --out report.html
     """

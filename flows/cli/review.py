@@ -85,7 +85,7 @@ def list_reviews(
     for name in names:
         try:
             opened = open_for_review(store, name)
-            found += reviews_of(opened, latest_run(store, name))
+            found += reviews_of(store, opened, latest_run(store, name))
         except (OSError, WorldposeError) as failure:
             problems[name] = str(failure)
             line(f"{name}: {failure}", to=errors)
@@ -116,7 +116,7 @@ def show(
     _tell_damage(opened)
     latest = latest_run(store, match)
     if request is not None:
-        known = {each.request.id: each for each in reviews_of(opened, latest)}
+        known = {each.request.id: each for each in reviews_of(store, opened, latest)}
         if request not in known:
             raise InputError(
                 f"review {request}",
@@ -272,8 +272,8 @@ def serve(
     # A token chosen by the operator is not printed: the output can go to a log.
     where = address(access, host, port)
     shown = where if token is None else where.partition("#")[0]
-    line(f"review pages of {Store.open(project).url}: {shown}")
-    serve_pages(project, access, host=host, port=port, tls=tls)
+    told = f"review pages of {Store.open(project).url}: {shown}"
+    serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: line(told))
 
 
 def _decide(

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
+from flows.reports.match_pictures import background_image
 from flows.stage import Match
 from worldpose.geometry import Camera
-from worldpose.ingest.footage import read_still
 from worldpose.reports import CameraSummary, CaptionedImage
 from worldpose.reports.static_cameras import (
     NEAR,
@@ -85,20 +85,23 @@ def camera_pictures(
     ]
 
 
-def paint_pictures(run: Run, match: Match, cameras: Mapping[str, Camera]) -> list[CaptionedImage]:
-    """Draw painted lines in the still of the camera with most of them, and the distance map."""
+def paint_pictures(
+    store: Store, run: Run, match: Match, cameras: Mapping[str, Camera]
+) -> list[CaptionedImage]:
+    """Draw painted lines in the image of the camera with most clicks, and the distance map."""
     if match.folder.pitch is None:
         return []
     counts = {
         name: run.record.figures.get(f"static_calibration/{name}", {}).get("clicks_used", 0.0)
         for name in cameras
-        if name in match.folder.stills
+        if name in match.folder.stills or name in match.folder.videos
     }
     if not counts:
         return []
     name = max(counts, key=lambda each: counts[each])
-    still = still_of(match, name)
-    assert still is not None, "only cameras with a still are counted"
+    still = background_image(store, match, name)
+    if still is None:  # no image of the video's clips can be read
+        return []
     png, share = plot_paint(cameras[name], still, match.folder.pitch)
     return [
         CaptionedImage(
@@ -124,20 +127,11 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
             Click(point, place, inlier[point])
             for point, place in _clicked_places(store, run, name).items()
         ],
-        still=still_of(match, name),
+        still=background_image(store, match, name),
         error_map=ErrorMap(
             result["ground_x"].values, result["ground_y"].values, result["ground_error"].values
         ),
     )
-
-
-def still_of(match: Match, camera_id: str) -> NDArray[np.uint8] | None:
-    """Return the camera's still, if the match folder has one."""
-    still = match.folder.stills.get(camera_id)
-    if still is None:
-        return None
-    camera = match.folder.spec.camera(camera_id)
-    return read_still(still, (camera.width, camera.height))
 
 
 def _names(run: Run, camera_id: str) -> list[str]:

@@ -42,6 +42,8 @@ def clip_view(run: Run, match: Match, clip: str) -> str | None:
 
 def static_view(run: Run, match: Match, clip: str) -> str | None:
     """Return the static camera with a video and most people in a clip; None if none has a video."""
+    if not match.has_static_cameras:
+        return None
     seen = placed_joints(run, clip)["inliers"].any("joint").sum(("frame", "person")).values
     order = [list(static_cameras(run, match.folder.spec))[c] for c in np.argsort(-seen)]
     return next((camera for camera in order if camera in match.folder.videos), None)

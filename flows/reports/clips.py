@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flows.reports.cameras import still_of
-from flows.reports.match_pictures import frame_picture
+from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
@@ -32,7 +32,7 @@ from worldpose.store import Run, Store
 
 
 def clip_pictures(
-    run: Run, match: Match, clip: str, truth: JointTracks | None = None
+    store: Store, run: Run, match: Match, clip: str, truth: JointTracks | None = None
 ) -> list[CaptionedImage]:
     """Draw the stadium from a camera and from above, the bodies, and all trajectories."""
     cameras = static_cameras(run, match.folder.spec)
@@ -43,15 +43,15 @@ def clip_pictures(
     if len(tracks.frames):
         first = int(tracks.frames[0])
         widest = list(cameras)[int(seen[0].argmax())]
-        still = still_of(match, widest)
+        image = _image_with_people(store, match, widest, first)
         here = f"{clip_title(clip)}, frame {first}"
-        beneath = "" if still is None else ", over its still"
+        beneath = "" if image is None else ", over its image"
         pictures = [
             CaptionedImage(
                 f"{here}, from camera {widest}: markings and reconstructed people, "
                 f"projected by the estimated camera{beneath}.",
                 plot_camera_view(
-                    cameras[widest], f"camera {widest}", tracks, 0, still=still, pitch=pitch
+                    cameras[widest], f"camera {widest}", tracks, 0, still=image, pitch=pitch
                 ),
             ),
             CaptionedImage(
@@ -61,29 +61,38 @@ def clip_pictures(
         ]
         bodies = body_tracks(run, clip)
         if bodies is not None:
-            pictures.append(_bodies(bodies, match, clip, widest, cameras[widest]))
+            pictures.append(_bodies(store, bodies, match, clip, widest, cameras[widest]))
     above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(CaptionedImage(f"{clip_title(clip)}: the paths of all people.", above))
     return pictures
 
 
+def _image_with_people(
+    store: Store, match: Match, camera_id: str, frame: int
+) -> NDArray[np.uint8] | None:
+    """Return a camera's image in a clip's first frame, else the still, which was taken then."""
+    image = frame_picture(store, match, camera_id, frame)
+    return background_image(store, match, camera_id) if image is None else image
+
+
 def _bodies(
-    bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera
+    store: Store, bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera
 ) -> CaptionedImage:
-    """Draw the bodies of a clip's first frame on a camera's still."""
-    frame, still = int(bodies.frames[0]), still_of(match, camera_id)
+    """Draw the bodies of a clip's first frame on a camera's image."""
+    frame = int(bodies.frames[0])
+    image = _image_with_people(store, match, camera_id, frame)
     png = plot_bodies(
         camera,
         f"camera {camera_id}, frame {frame}",
         bodies.model.vertices(bodies.poses[0]),
         bodies.model.faces,
         bodies.person_ids,
-        still=still,
+        still=image,
         pitch=match.folder.pitch,
     )
     return CaptionedImage(
         f"{clip_title(clip)}, frame {frame}: fitted bodies ({bodies.model.name}) where camera "
-        f"{camera_id} shows most people{'' if still is None else ', over its still'}.",
+        f"{camera_id} shows most people{'' if image is None else ', over its image'}.",
         png,
     )
 
@@ -101,9 +110,9 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
     number = int(tracks.frames[frame])
     detected = run[seen_in(run, match, name, clip)].sel(frame=number)
     tracked = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[index]
-    still = frame_picture(store, match, name, number)
-    if still is None and frame == 0:
-        still = still_of(match, name)
+    image = frame_picture(store, match, name, number)
+    if image is None and frame == 0:
+        image = background_image(store, match, name)
     png = plot_detections(
         cameras[name],
         ImageDetections(
@@ -114,7 +123,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
             tracks.person_ids,
             placed["inliers"].values[frame, index].any(-1),
         ),
-        still=still,
+        still=image,
         pitch=match.folder.pitch,
     )
     return [

@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from flows.reports.cameras import still_of
-from flows.reports.match_pictures import frame_picture
+from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import clip_title, joint_tracks, static_cameras
 from flows.stage import Match
 from flows.stages.redetection import seen_in
@@ -70,7 +69,7 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
         index = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[place]
         still = frame_picture(store, match, name, number)
         if still is None and number == int(tracks.frames[0]):
-            still = still_of(match, name)
+            still = background_image(store, match, name)
         pixels = camera.project(tracks.joints[row, person])
         side = _AROUND * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
         png = plot_detections(

@@ -9,8 +9,35 @@ from numpy.typing import NDArray
 
 from flows.stage import Match
 from worldpose.ingest import unit_frames
+from worldpose.ingest.footage import read_still
 from worldpose.store import Store
 from worldpose.video import open_video
+
+
+def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.uint8] | None:
+    """Return an image (height, width, 3) RGB that shows what a static camera sees.
+
+    It is the still of the match folder or, without one, the first readable image of the camera's
+    video in the clips; None if the match has neither.
+
+    Args:
+        store: its latest run maps match frames to video frames.
+        match: the match, which names stills and videos.
+        camera_id: a static camera.
+
+    Raises:
+        InputError: the still or an image of the video is damaged.
+    """
+    still = match.folder.stills.get(camera_id)
+    if still is not None:
+        camera = match.folder.spec.camera(camera_id)
+        return read_still(still, (camera.width, camera.height))
+    for first, count in unit_frames(match.folder.spec, camera_id).ranges:
+        images = frame_pictures(store, match, camera_id, range(first, first + count))
+        for image in images:
+            if image is not None:
+                return image
+    return None
 
 
 def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:

@@ -105,6 +105,7 @@ def _write_videos(
 def _sections(store: Store, run: Run, match: Match, reference: str | None) -> list[Section]:
     """Return all sections of the report, in the order of a reader's questions."""
     clips = clips_of(run.record)
+    filmed = clips if match.has_static_cameras else ()
     truth = None if reference is None else load_reference(reference)
     cameras = static_cameras(run, match.folder.spec)
     return [
@@ -115,12 +116,12 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         ),
         Section(
             "Sample images",
-            tuple(p for clip in clips for p in clip_pictures(run, match, clip, truth)),
+            tuple(p for clip in filmed for p in clip_pictures(store, run, match, clip, truth)),
         ),
         extent_section(run, match),
         Section(
             "Detections",
-            tuple(p for clip in clips for p in detection_pictures(store, run, match, clip)),
+            tuple(p for clip in filmed for p in detection_pictures(store, run, match, clip)),
             "Detections of one camera, and the people that all cameras together find.",
         ),
         Section(
@@ -128,7 +129,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             (
                 camera_table(camera_summaries(run, match.folder.spec)),
                 *camera_pictures(store, run, match, cameras),
-                *paint_pictures(run, match, cameras),
+                *paint_pictures(store, run, match, cameras),
             ),
         ),
         Section("Bundle adjustment", tuple(adjustment_tables(run))),
@@ -139,7 +140,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             "Bodies",
             (
                 *body_tables(run, clips),
-                *(p for clip in clips for p in disagreement_pictures(store, run, match, clip)),
+                *(p for clip in filmed for p in disagreement_pictures(store, run, match, clip)),
             ),
         ),
         Section("Who reviewed what", tuple(review_table(match))),

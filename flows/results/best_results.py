@@ -26,6 +26,8 @@ BODY_STAGES = ("body_fitting", "refitting")
 """Stages that produce bodies, the best last."""
 JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
 """Stages that produce 3D joints, the best last."""
+PLANE = "broadcast_tracking"
+"""Stage that places people on the pitch in clips without static cameras."""
 MID_HIP = [11, 12]
 """The hips in COCO-17."""
 ADJUSTED = "bundle_adjustment/cameras"
@@ -33,13 +35,13 @@ ADJUSTED = "bundle_adjustment/cameras"
 
 
 def clips_of(record: RunRecord) -> tuple[str, ...]:
-    """Return the clips for which a run has joints.
+    """Return the clips for which a run has joints, or people on the pitch.
 
     Raises:
         WorldposeError: there are none.
     """
     units = [unit.partition("/") for unit in record.results]
-    clips = tuple(sorted({unit for stage, _, unit in units if stage in JOINT_STAGES}))
+    clips = tuple(sorted({unit for stage, _, unit in units if stage in (*JOINT_STAGES, PLANE)}))
     if not clips:
         raise WorldposeError(
             f"run {record.run_id} of {record.match_id}: expected results of {JOINT_STAGES[0]}, "
@@ -56,10 +58,20 @@ def clip_title(clip: str) -> str:
 def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
+    All joints are NaN of people that only a broadcast camera films.
+
     Raises:
         UsageError: the run has no such result.
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
+    if stage is None and not stages and f"{PLANE}/{clip}" in run:
+        tracked = run[f"{PLANE}/{clip}"]
+        index = tracked["detection_index"].values
+        return JointTracks(
+            frames=tracked["frame"].values,
+            person_ids=tracked["person"].values.astype(np.int64),
+            joints=np.full((*index.shape, 17, 3), np.nan),
+        )
     if stage in stages:
         stages = stages[stages.index(stage) :]
     elif stage is not None or not stages:
@@ -82,7 +94,8 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
 
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet."""
-    tracks, tracking = joint_tracks(run, clip), run[f"tracking/{clip}"]
+    plane = f"{PLANE}/{clip}"
+    tracks, tracking = joint_tracks(run, clip), run[plane if plane in run else f"tracking/{clip}"]
     known = {track.person: track for track in map(Track.model_validate, tracking.attrs["tracks"])}
     person = tracking["person"].values.astype(np.int64)
     xy = np.full((len(tracks.frames), len(person), 2), np.nan)

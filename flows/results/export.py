@@ -33,7 +33,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.errors import UsageError, WorldposeError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baselines.inputs import (
     write_baseline_settings,
@@ -89,7 +89,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
     """Return body model, poses (persons, frames) and person ids of a clip's fits.
 
     Raises:
-        WorldposeError: the run has no fitted bodies.
+        InputError: the run has no fitted bodies.
     """
     fits = run[_require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
     poses = BodyParameters(
@@ -100,17 +100,19 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
 
 
 def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, (frames,).
+    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
 
     Raises:
-        WorldposeError: the run has no such camera.
+        InputError: the run has no such camera.
     """
     todo = (
         "This format is about the broadcast camera's picture: calibrate that camera first, or "
         "choose another format."
     )
     _require_result(run, f"broadcast_calibration/{clip}", todo)
-    return _camera_in(run, clip, run[bodies_unit(run, clip)]["frame"].values)
+    bodies = bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
+    return _camera_in(run, clip, frames)
 
 
 def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
@@ -122,9 +124,11 @@ def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
 
 def _require_result(run: Run, unit: str, todo: str) -> str:
     if unit not in run:
-        raise WorldposeError(
-            f"run {run.record.run_id} of {run.record.match_id}: expected results of {unit}, "
-            f"found {', '.join(sorted({name.partition('/')[0] for name in run})) or 'none'}. {todo}"
+        raise InputError(
+            f"run {run.record.run_id} of {run.record.match_id}",
+            expected=f"results of {unit}",
+            found=", ".join(sorted({name.partition("/")[0] for name in run})) or "none",
+            todo=todo,
         )
     return unit
 
@@ -331,7 +335,7 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "slahmr-cameras": export_slahmr_cameras,
     "rerun": export_recording,
 }
-"""Format name to function, which takes the source and a folder, and returns the files."""
+"""Name in `EXPORT_FORMATS` to function, which takes the source and a folder, returns the files."""
 
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}

@@ -10,16 +10,18 @@ from typing import Literal
 from data_contracts.review import Correction, Edit, Origin, ReviewDecision, ReviewRequest
 from data_contracts.run import RunRecord, WaitingUnit
 from flows.gates import GATES
+from flows.left_out import left_out_cameras
+from flows.method import METHOD
 from flows.orchestration.prefect_environment import has_server
 from flows.review.corrections import new_corrections, withdrawal
 from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
-from worldpose.errors import InputError
+from worldpose.errors import InputError, StoreError
 from worldpose.review import Journal, last_decision, requests_by_id, say, unit_origins
-from worldpose.store import Store
+from worldpose.store import Store, recipe_key
 
-State = Literal["waits", "approve", "reject", "superseded"]
+State = Literal["waits", "corrected", "approve", "reject", "superseded"]
 
 
 @dataclass(frozen=True)
@@ -30,15 +32,23 @@ class Review:
         request: the review request.
         decision: the last verdict on exactly these bytes.
         is_current: whether it refers to the latest run's result.
+        is_corrected: whether corrections since then make the next run compute that result again.
     """
 
     request: ReviewRequest
     decision: ReviewDecision | None
     is_current: bool
+    is_corrected: bool = False
 
     @property
     def state(self) -> State:
-        """The verdict; without one, whether it is pending or superseded."""
+        """The verdict; without one, whether it is pending, corrected or superseded.
+
+        A rejected result that was corrected needs no other verdict: it is computed again.
+        """
+        is_approved = self.decision is not None and self.decision.verdict == "approve"
+        if self.is_current and self.is_corrected and not is_approved:
+            return "corrected"
         if self.decision is not None:
             return self.decision.verdict
         return "waits" if self.is_current else "superseded"
@@ -50,17 +60,56 @@ class Review:
         return gates.get(self.request.gate, "Is it good enough to be built upon?")
 
 
-def reviews_of(match: Match, latest: RunRecord | None) -> list[Review]:
+def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Review]:
     """Return all of a match's review requests, first to last.
 
     Args:
+        store: with the results that they refer to.
         match: with its journal.
         latest: its latest run.
     """
-    return _reviews(match.journal, latest)
+    return _reviews(match.journal, latest, corrected_units(store, match, latest))
 
 
-def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
+def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> frozenset[str]:
+    """Return the units waiting for review that the next run will compute from corrected data.
+
+    A unit counts if the data of the match folder, with all corrections, differ from those that the
+    unit or one of its inputs was computed from. Other code or libraries do not count.
+
+    Args:
+        store: with the results.
+        match: with all corrections applied.
+        latest: the match's latest run.
+    """
+    if latest is None or not latest.waiting:
+        return frozenset()
+    results = latest.results
+    match = match.without(left_out_cameras(store, match, METHOD, results))
+    stages = {stage.name: stage for stage in METHOD}
+    is_changed: dict[str, bool] = {}
+
+    def check(name: str, key: str) -> bool:
+        if name not in is_changed:
+            stage, _, unit = name.partition("/")
+            try:
+                manifest = store.manifest(match.match_id, stage, unit, key)
+            except StoreError:  # withdrawn or damaged: the next run reports it
+                return is_changed.setdefault(name, False)
+            recipe = manifest.recipe
+            is_unknown = stage not in stages or unit not in stages[stage].units(match)
+            sources = {} if is_unknown else stages[stage].sources(match, unit)
+            now = recipe.model_copy(update={"sources": recipe.sources | sources})
+            is_changed[name] = recipe_key(now) != recipe_key(recipe) or any(
+                check(used, used_key) for used, used_key in recipe.inputs.items()
+            )
+        return is_changed[name]
+
+    waiting = (unit.unit for unit in latest.waiting if unit.unit in results)
+    return frozenset(name for name in waiting if check(name, results[name]))
+
+
+def _reviews(journal: Journal, latest: RunRecord | None, corrected: frozenset[str]) -> list[Review]:
     results = {} if latest is None else latest.results
     found = []
     for request in requests_by_id(journal.questions).values():
@@ -69,7 +118,8 @@ def _reviews(journal: Journal, latest: RunRecord | None) -> list[Review]:
             for unit, content in request.contents.items()
         ]
         is_current = any(results.get(unit) == key for unit, key in request.keys.items())
-        found.append(Review(request, decisions[0] if decisions else None, is_current))
+        is_corrected = not corrected.isdisjoint(request.keys)
+        found.append(Review(request, decisions[0] if decisions else None, is_current, is_corrected))
     return found
 
 
@@ -84,13 +134,24 @@ def warnings_of(match: Match) -> list[str]:
     ]
 
 
-def still_waiting(match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
-    """Return the units for which the latest run waits, without those approved since."""
+def still_waiting(store: Store, match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
+    """Return the units for which the latest run waits, without those approved or corrected since.
+
+    Args:
+        store: with the results.
+        match: with its journal.
+        latest: its latest run.
+    """
     said = match.journal.questions
     decisions = [each for each in said if isinstance(each, ReviewDecision)]
     verdicts = {decision.request: decision.verdict for decision in decisions}
     waiting = () if latest is None else latest.waiting
-    return [unit for unit in waiting if verdicts.get(unit.request) != "approve"]
+    corrected = corrected_units(store, match, latest)
+    return [
+        unit
+        for unit in waiting
+        if verdicts.get(unit.request) != "approve" and unit.unit not in corrected
+    ]
 
 
 def decide(
@@ -123,9 +184,11 @@ def decide(
     latest = latest_run(store, match.match_id)
     ids: list[str] = []
     corrections: list[Correction] = []
+    corrected = corrected_units(store, match, latest)
 
     def decisions(journal: Journal) -> list[ReviewDecision | Correction]:
-        current = {each.request.id: each for each in _reviews(journal, latest) if each.is_current}
+        current = {each.request.id: each for each in _reviews(journal, latest, corrected)}
+        current = {name: each for name, each in current.items() if each.is_current}
         waiting = [name for name, each in current.items() if each.state == "waits"]
         ids[:] = requests or waiting
         unknown = [name for name in ids if name not in current]
@@ -238,13 +301,14 @@ def resume(store: Store, match: Match) -> list[str]:
             found="none",
             todo=f"Continue a run without a server: worldpose run {match_id}.",
         )
-    waiting = [r for r in reviews_of(match, latest_run(store, match_id)) if r.state == "waits"]
+    reviews = reviews_of(store, match, latest_run(store, match_id))
+    waiting = [each for each in reviews if each.state == "waits"]
     if waiting:
         raise InputError(
             f"resuming {match_id}",
             expected="a verdict on every pending review",
             found=f"none on {', '.join(review.request.id for review in waiting)}",
-            todo="Decide first: worldpose review approve, or worldpose review reject.",
+            todo="Approve or reject each of them first.",
         )
     from flows.orchestration.suspension import (
         resume_suspended,  # imported here: Prefect takes seconds to import

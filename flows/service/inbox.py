@@ -21,6 +21,7 @@ from flows.registering import register
 from flows.service.layout import PRIORITIES, StateFolder
 from flows.stage import Match
 from worldpose.errors import InputError, InternalError, StoreError, WorldposeError
+from worldpose.ingest import unclicked_clips
 from worldpose.ingest.validation import require_local
 from worldpose.store import Store
 
@@ -52,7 +53,7 @@ class RefusalError(Exception):
 
 
 def entries(inbox: Path) -> Iterator[Entry]:
-    """Yield all arrivals in the inbox; a dot before a name marks an upload in progress."""
+    """Yield all arrivals in the inbox, except names that begin with a dot: incomplete uploads."""
     for priority in PRIORITIES:
         if priority != "normal":
             folder = inbox / priority
@@ -351,6 +352,7 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
         return change_state(arrival, "refused", str(InternalError.wrap(arrival.name, error)))
     known = {**match.folder.calibrations, **match.folder.clicked}
     unclicked = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
+    unclicked += unclicked_clips(match.folder)
     if unclicked:
         reason = f"to be clicked on the review pages first: {', '.join(unclicked)}"
         return change_state(arrival, "taken", reason, match_id=match.match_id)

@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Final
+from urllib.parse import urlsplit
 
 from data_contracts.operations import Service, Serving
 from flows.orchestration.prefect_database import begin_database, keep_database
@@ -25,6 +26,7 @@ from flows.service.health import at_prefect
 from flows.service.layout import PRIORITIES
 from flows.service.plan import ServePlan
 from flows.service.service_secrets import Secrets
+from flows.web.http_server import require_free_ports
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store
 
@@ -169,7 +171,8 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
         tell: receives lines for the operator.
 
     Raises:
-        UsageError: the project is already served, or a port is taken.
+        InputError: a port is taken.
+        UsageError: the project is already served.
         WorldposeError: a part does not answer in time.
     """
     Store.create(plan.project)
@@ -184,6 +187,7 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 found=f"another process; see {state.serving}",
                 todo="Read its state with --check, or end it first.",
             )
+        require_free_ports(_ports(plan))
         with _until_told() as told:
             supervisor = _Supervisor(plan, secrets, tell)
             try:
@@ -196,6 +200,18 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 supervisor.end()
                 state.end_orderly()
                 state.serving.unlink(missing_ok=True)
+
+
+def _ports(plan: ServePlan) -> dict[str, tuple[str, int]]:
+    """Return the ports that this service opens, by option."""
+    ports = {
+        "--port": (plan.host, plan.pages_port),
+        "--metrics-port": (plan.host, plan.metrics_port),
+    }
+    if plan.owns_prefect:
+        address = urlsplit(plan.prefect)
+        ports["--prefect-port"] = (address.hostname or "127.0.0.1", address.port or 80)
+    return ports
 
 
 def bound_log(log: Path) -> None:

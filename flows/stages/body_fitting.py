@@ -42,4 +42,5 @@ STAGE = Stage(
     previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
     external_inputs=outside,
+    needs_static_cameras=True,
 )

@@ -20,8 +20,9 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the results with fitted people, and with the broadcast camera's detections."""
-    return (*detection.seen_in_broadcast(match, unit), f"body_fitting/{unit}")
+    """Return the broadcast camera's detections, and people fitted to static cameras, if any."""
+    fitted = (f"body_fitting/{unit}",) if match.has_static_cameras else ()
+    return (*detection.seen_in_broadcast(match, unit), *fitted)
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:

@@ -11,7 +11,7 @@ from worldpose.bundle_adjustment import BundleAdjustmentSettings
 
 def units(match: Match) -> tuple[str, ...]:
     """Return one unit for all cameras: they do not move, so every clip constrains the same ones."""
-    return ("cameras",)
+    return ("cameras",) if match.has_static_cameras else ()
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
@@ -57,4 +57,5 @@ STAGE = Stage(
     sources=sources,
     previous_pass_inputs=again,
     late_inputs=later,
+    needs_static_cameras=True,
 )

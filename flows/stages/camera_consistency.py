@@ -28,4 +28,5 @@ STAGE = Stage(
     sources=sources,
     leaves_out=True,
     min_cameras=tracking.MIN_CAMERAS,
+    needs_static_cameras=True,
 )

@@ -24,4 +24,5 @@ STAGE = Stage(
     sources=tracking.clip_sources,
     previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
+    needs_static_cameras=True,
 )

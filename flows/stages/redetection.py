@@ -73,4 +73,5 @@ STAGE = Stage(
     previous_pass_inputs=again,
     first_pass=2,
     worker_tag="GPU",
+    needs_static_cameras=True,
 )

@@ -16,7 +16,12 @@ class RefittingSettings(Record):
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Return clips with broadcast camera and detections, and those with players of other clips."""
+    """Return clips with broadcast camera and detections, and those with players of other clips.
+
+    Without static cameras there are no bodies to refit.
+    """
+    if not match.has_static_cameras:
+        return ()
     clips = (clip.id for clip in match.folder.spec.clips)
     return tuple(clip for clip in clips if _is_broadcast(match, clip) or _namesakes(match, clip))
 
@@ -79,4 +84,5 @@ STAGE = Stage(
     sources=sources,
     previous_pass_inputs=tracking.filtering_inputs,
     late_inputs=tracking.found_again,
+    needs_static_cameras=True,
 )

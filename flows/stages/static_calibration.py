@@ -22,7 +22,7 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the given calibration alone, or else the clicks, the pitch and an image of the camera.
+    """Return the given calibration alone, or else clicks, pitch, lens and an image of the camera.
 
     Clicks are listed under the file's name, by marking, so that a difference between two runs names
     the file and the point.
@@ -35,8 +35,10 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     clicked = folder.clicked[unit]  # registration ensures one of the two
     still = folder.stills.get(unit)
     path = None if still is None else still.relative_to(folder.folder).as_posix()
+    lens = folder.lenses.get(unit)
     return {
         "calibration": None,
+        **({} if lens is None else {"lens": lens.model_dump(mode="json")}),
         "clicked": {
             clicked_file(unit): {
                 "points": {point.name: list(point.xy) for point in clicked.points},
@@ -69,4 +71,5 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     leaves_out=True,
+    needs_static_cameras=True,
 )

@@ -16,8 +16,9 @@ MIN_CAMERAS: Final = 2
 
 
 def units(match: Match) -> tuple[str, ...]:
-    """Return the clips."""
-    return tuple(clip.id for clip in match.folder.spec.clips)
+    """Return the clips; none without static cameras."""
+    clips = match.folder.spec.clips if match.has_static_cameras else ()
+    return tuple(clip.id for clip in clips)
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
@@ -89,4 +90,5 @@ STAGE = Stage(
     previous_pass_inputs=again,
     late_inputs=found_again,
     min_cameras=MIN_CAMERAS,
+    needs_static_cameras=True,
 )

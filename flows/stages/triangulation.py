@@ -21,4 +21,5 @@ STAGE = Stage(
     sources=tracking.clip_sources,
     previous_pass_inputs=tracking.again,
     late_inputs=tracking.found_again,
+    needs_static_cameras=True,
 )

@@ -30,6 +30,7 @@ from flows.web import (
     identities,
     outliers,
     queue,
+    results,
     views,
 )
 from flows.web.access import NAME_LENGTH, SESSION_SECONDS, Access
@@ -100,6 +101,7 @@ def create_app(project: str, access: Access) -> FastAPI:
         detections,
         views,
         identities,
+        results,
         status_page,
     ):
         app.include_router(module.routes(context))
@@ -329,7 +331,7 @@ def _cookie(headers: Headers, name: str) -> str | None:
 
 
 def _seal(headers: MutableHeaders, path: str) -> None:
-    headers["content-security-policy"] = POLICY
+    headers.setdefault("content-security-policy", POLICY)
     headers["x-content-type-options"] = "nosniff"
     headers["x-frame-options"] = "DENY"
     headers["referrer-policy"] = "no-referrer"

@@ -132,7 +132,7 @@ def routes(context: PageContext) -> APIRouter:
             "figures": {} if latest is None else latest.figures.get(unit, {}),
             "reviews": [
                 {"id": each.request.id, "state": each.state, "reasons": each.request.reasons}
-                for each in reviews_of(match, latest)
+                for each in reviews_of(context.store, match, latest)
                 if unit in each.request.keys and each.is_current
             ],
             "cameras": names,
@@ -166,6 +166,7 @@ def routes(context: PageContext) -> APIRouter:
                 size,
                 picture=seen,
                 settings=StaticCalibrationSettings() if clicked.refine else _POINTS_ALONE,
+                lens=context.match(match_id).folder.lenses.get(owner),
             )
         except InputError as error:
             advice = {"camera": None, "expected": error.expected, "todo": error.todo}

@@ -79,7 +79,7 @@ def routes(context: PageContext) -> APIRouter:
         latest = latest_run(context.store, match_id)
         why, seen = given.why, given.seen
         decide(context.store, match, given.reviews, given.verdict, who=who, why=why, seen=seen)
-        waiting = still_waiting(context.match(match_id), latest)
+        waiting = still_waiting(context.store, context.match(match_id), latest)
         run = context.continuing.go_on(match_id) if given.go_on and not waiting else None
         return {"waiting": len(waiting), "run": run}
 

@@ -127,8 +127,8 @@ def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = camera_evidence(store, run, match, camera, cameras[camera])
     caption = (
-        "The pitch as this camera projects it; clicks as circles, those that it does not rest on "
-        "as crosses; below, the expected error on the ground."
+        "The projected pitch. Circles are inlier clicks, crosses are outliers. Below: the expected "
+        "error on the ground."
     )
     return Evidence((CaptionedImage(caption, png),))
 
@@ -152,13 +152,15 @@ def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
         )
         for join in result.attrs["joins"]
     )
-    columns = (">track that stops", ">that begins", "frames", "", ">cost")
-    return Evidence((CaptionedImage("Everybody's way.", png),), (Table("Joins", columns, rows),))
+    columns = (">track that ends", ">track that begins", "frames", "", ">cost")
+    return Evidence(
+        (CaptionedImage("The paths of all people.", png),), (Table("Joins", columns, rows),)
+    )
 
 
 def _clip(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     pictures = (
-        *clip_pictures(run, match, clip),
+        *clip_pictures(store, run, match, clip),
         *detection_pictures(store, run, match, clip),
     )
     return Evidence(pictures, tuple(body_tables(run, (clip,))))

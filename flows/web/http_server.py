@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import resource
 import socket
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Any, Final
@@ -17,7 +19,7 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from worldpose.errors import UsageError
+from worldpose.errors import InputError
 
 REQUEST_SECONDS: Final = 10.0
 """Deadline for the headers of a request, and again for its body."""
@@ -207,6 +209,7 @@ def serve_http(
     host: str,
     port: int,
     max_connections: int = MAX_CONNECTIONS,
+    announce: Callable[[], None] = lambda: None,
     **options: Any,  # noqa: ANN401
 ) -> None:
     """Serve an ASGI application until this process receives a signal to end.
@@ -217,10 +220,11 @@ def serve_http(
         port: port; 0 = any free one.
         max_connections: open connections, limited to a quarter of the files that this process can
             open.
+        announce: called when the port is ours, and before it is served.
         options: further options of `uvicorn.Config`.
 
     Raises:
-        UsageError: the port is taken, or the host is not an address of this machine.
+        InputError: the port is taken, or the host is not an address of this machine.
     """
     connections = Connections(max_connections)
     protocol = type("Protocol", (_Protocol,), {"connections_open": connections})
@@ -234,34 +238,82 @@ def serve_http(
         **{"ws": "none", **options},
     )
     listeners = _listeners(host, port, connections)
+    announce()
     server = _Server(config, connections)
-    server.run(sockets=listeners)
+    server.run(sockets=list[socket.socket](listeners))
     if not server.started:
         sys.exit(f"{host}, port {port}: the server did not start; its log says why")
 
 
-def _listeners(host: str, port: int, connections: Connections) -> list[socket.socket]:
+def _listeners(host: str, port: int, connections: Connections) -> list[_Listener]:
     """Open listening sockets at all addresses of a name."""
-    listeners: list[socket.socket] = []
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        for family, kind, protocol, _, address in dict.fromkeys(found):
-            listener = _Listener(family, kind, protocol)
-            listeners.append(listener)
-            listener.connections = connections
-            listener.setblocking(False)
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            if family == socket.AF_INET6:
-                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            listener.bind(address)
-            listener.listen(QUEUE)
-    except OSError as error:
+    with ExitStack() as opened:
+        try:
+            listeners = _listen(opened, host, port)
+        except OSError as error:
+            raise _port_error("--port", host, port, error) from error
         for each in listeners:
-            each.close()
-        raise UsageError(
-            f"{host}, port {port}",
-            expected="an address of this machine and a port that is free",
-            found=error.strerror or str(error),
-            todo="Choose another port with --port, or end the program that uses it.",
-        ) from error
+            each.connections = connections
+        opened.pop_all()
     return listeners
+
+
+def require_free_ports(wanted: Mapping[str, tuple[str, int]]) -> None:
+    """Raise an error unless a process can listen at all ports at once.
+
+    Args:
+        wanted: option to the host and the port that it names; port 0 = any free one.
+
+    Raises:
+        InputError: a port is taken or wanted twice, or a host is not an address of this machine.
+    """
+    with ExitStack() as opened:
+        for option, (host, port) in wanted.items():
+            try:
+                _listen(opened, host, port)
+            except OSError as error:
+                raise _port_error(option, host, port, error) from error
+
+
+def _listen(opened: ExitStack, host: str, port: int) -> list[_Listener]:
+    """Listen at all addresses of a name until the stack is closed; return the sockets."""
+    listeners = []
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    for family, kind, protocol, _, address in dict.fromkeys(found):
+        listener = opened.enter_context(_Listener(family, kind, protocol))
+        listener.setblocking(False)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        listener.bind(address)
+        listener.listen(QUEUE)  # with SO_REUSEADDR others could bind it again before
+        listeners.append(listener)
+    return listeners
+
+
+def _port_error(option: str, host: str, port: int, error: OSError) -> InputError:
+    """Return the error about a port that cannot be listened at, with the next free one."""
+    is_taken = error.errno == errno.EADDRINUSE
+    free = next((each for each in range(port + 1, 65536) if _is_free(host, each)), None)
+    if not is_taken or free is None:
+        return InputError(
+            f"{option} {port}",
+            expected=f"an address of this machine and a port that this user may open at {host}",
+            found=error.strerror or str(error),
+            todo="Choose another address with --host, or another port.",
+        )
+    return InputError(
+        f"{option} {port}",
+        expected=f"a free port at {host}",
+        found="one at which another program listens",
+        todo=f"Choose the next free one with {option} {free}, or end that program.",
+    )
+
+
+def _is_free(host: str, port: int) -> bool:
+    with ExitStack() as opened:
+        try:
+            _listen(opened, host, port)
+        except OSError:
+            return False
+    return True

@@ -35,7 +35,9 @@ def routes(context: PageContext) -> APIRouter:
         folder = opened.folder
         return {
             **_glance(context, opened),
-            "reviews": [describe_review(each) for each in reviews_of(opened, latest)],
+            "reviews": [
+                describe_review(each) for each in reviews_of(context.store, opened, latest)
+            ],
             **_corrections(opened),
             "cameras": [
                 {
@@ -102,9 +104,9 @@ def _at_a_glance(context: PageContext, name: str) -> dict[str, Any]:
 def _glance(context: PageContext, match: Match) -> dict[str, Any]:
     store = context.store
     latest = latest_run(store, match.match_id)
-    known = {each.request.id: each for each in reviews_of(match, latest)}
+    known = {each.request.id: each for each in reviews_of(store, match, latest)}
     waiting = []
-    for unit in still_waiting(match, latest):
+    for unit in still_waiting(store, match, latest):
         review = known.get(unit.request)
         waiting.append(
             {

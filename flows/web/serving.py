@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from flows.web.access import LOOPBACK, Access
@@ -10,7 +11,13 @@ from flows.web.http_server import serve_http
 
 
 def serve(
-    project: str, access: Access, *, host: str, port: int, tls: tuple[Path, Path] | None
+    project: str,
+    access: Access,
+    *,
+    host: str,
+    port: int,
+    tls: tuple[Path, Path] | None,
+    announce: Callable[[], None] = lambda: None,
 ) -> None:
     """Serve a project's pages; return when interrupted.
 
@@ -20,16 +27,17 @@ def serve(
         host: address to listen at.
         port: 0 = any free one.
         tls: certificate and key files.
+        announce: called when the port is ours.
 
     Raises:
-        InputError: there is no such project.
-        UsageError: the port is taken.
+        InputError: there is no such project, or the port is taken.
     """
     certificate, key = (None, None) if tls is None else map(str, tls)
     serve_http(
         create_app(project, access),
         host=host,
         port=port,
+        announce=announce,
         server_header=False,
         ssl_certfile=certificate,
         ssl_keyfile=key,

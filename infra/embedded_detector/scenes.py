@@ -15,7 +15,8 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
-from worldpose.simulation.matches import RenderedFrame, open_view, render_frame
+from worldpose.simulation.image_formation import RenderedFrame
+from worldpose.simulation.matches import open_view, render_frame
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
     PATTERNS,

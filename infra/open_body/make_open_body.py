@@ -120,7 +120,8 @@ class Bodies:
 
     def head(self, bone: str) -> Array:
         """Return the mean position of a bone's head (3,)."""
-        return self.heads[:, self.bones.index(bone)].mean(0)
+        mean: Array = self.heads[:, self.bones.index(bone)].mean(0)
+        return mean
 
     def joints(self) -> Array:
         """Return the joints (bodies, 24, 3)."""
@@ -296,7 +297,7 @@ def _t_pose_bones(joints: Array) -> tuple[Array, Array]:
 def sculpted_pose(joints: Array) -> Array:
     """Return rotations (24, 3, 3) relative to the parents from the T-pose to MakeHuman's own."""
     back = _t_pose_bones(joints.mean(0, keepdims=True))[0][0].transpose(0, 2, 1)
-    local = back.copy()
+    local: Array = back.copy()
     for joint, parent in enumerate(PARENTS):
         if parent >= 0:
             local[joint] = back[parent].T @ back[joint]
@@ -304,7 +305,8 @@ def sculpted_pose(joints: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    units: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return units
 
 
 def _turn_onto(start: Array, end: Array) -> Array:

@@ -166,4 +166,5 @@ def _delta_mush(
     )
     left, _, right = np.linalg.svd(moments.reshape(-1, 3, 3))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    return end + np.einsum("nab,nb->na", left @ right, own - start)
+    moved: Array = end + np.einsum("nab,nb->na", left @ right, own - start)
+    return moved

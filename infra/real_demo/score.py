@@ -83,8 +83,9 @@ def score(folder: Path, project: str, video: Path) -> None:
                 pixels = cameras[name].project(tracks.joints[row, person])
                 for a, b in COCO17_BONES:
                     if np.isfinite(pixels[[a, b]]).all():
-                        ends = [tuple(int(x) for x in pixels[end]) for end in (a, b)]
-                        cv2.line(drawn, *ends, COLOURS[person % len(COLOURS)], 4, cv2.LINE_AA)
+                        start, end = pixels[[a, b]].astype(int).tolist()
+                        color = COLOURS[person % len(COLOURS)]
+                        cv2.line(drawn, start, end, color, 4, cv2.LINE_AA)
             pictures.append(drawn)
     write_video(video, pictures, match.spec.fps)
     print(f"wrote {video}, view {name}")

@@ -118,3 +118,24 @@ def test_the_library_lists_what_it_has():
         assert name in dir(worldpose)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         worldpose.nothing  # noqa: B018
+
+
+def test_the_array_example_of_the_library_guide_runs():
+    page = (EXAMPLES.parent / "docs/how-to/library.md").read_text()
+    section = page.partition("## Arrays of your own")[2]
+    code = section.partition("```python\n")[2].partition("```")[0]
+    turns = [np.array([[c, -s, 0], [0, 0, -1], [s, c, 0]]) for c, s in ((1, 0), (0, 1), (0.8, 0.6))]
+    joints = np.random.default_rng(1).uniform(-0.5, 0.5, (3, 2, 17, 3))
+    given = {
+        "K": np.tile([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]], (3, 1, 1)),
+        "distortion": np.zeros((3, 5)),
+        "R": np.stack(turns),
+        "t": np.tile([0.0, 0, 8], (3, 1)),
+        "size": np.tile([1920, 1080], (3, 1)),
+    }
+    cameras = worldpose.Camera.from_matrices(*given.values())
+    given["keypoints"] = np.stack([cameras.project(frame) for frame in joints.reshape(3, 34, 3)])
+    given["keypoints"] = given["keypoints"].reshape(3, 3, 2, 17, 2)
+    given["confidence"] = np.ones((3, 3, 2, 17))
+    exec(code, given)
+    np.testing.assert_allclose(given["result"].joints, joints, atol=1e-3)

@@ -1,7 +1,49 @@
 """Bodies from nothing but pixels: rendered videos through the nets that ship with the project."""
 
+import base64
+import re
+import shutil
+
+import cv2
+import numpy as np
 import pytest
+import yaml
 from command_line import succeed
+
+from flows.registering import open_match
+from flows.reports.match_pictures import background_image
+from worldpose.store import Store
+
+
+def green_share(image):
+    """Return the share of an image's pixels (BGR) that look like grass."""
+    blue, green, red = np.moveaxis(image.astype(int), -1, 0)
+    return np.mean((green > blue + 20) & (green > red + 20))
+
+
+def report_images(page):
+    for content in re.findall(r"data:image/webp;base64,([A-Za-z0-9+/=]+)", page.read_text()):
+        yield cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_match_of_videos_alone_is_reported_over_images_of_its_videos(server, tmp_path):
+    match, project = tmp_path / "match", tmp_path / "project"
+    scenario = ("--scenario", "tiny", "--seed", 2, "--duration", 0.2, "--cameras", 3)
+    succeed("simulate", *scenario, "--render", "--out", match)
+    shutil.rmtree(match / "stills")
+    spec = yaml.safe_load((match / "match.yaml").read_text())
+    for camera in spec["cameras"]:
+        camera.pop("still", None)
+    (match / "match.yaml").write_text(yaml.safe_dump(spec))
+    succeed("run", match, "--project", project, "--set", "detection.stride=4")
+    store = Store.open(str(project))
+    (match_id,) = store.matches()
+    assert green_share(background_image(store, open_match(store, match_id), "cam00")) > 0.3
+    page = tmp_path / "page.html"
+    succeed("report", match, "--project", project, "--out", page)
+    # Clicks and people of cameras are drawn over grass; a plot without an image has almost none.
+    over_grass = [green_share(image) > 0.15 for image in report_images(page)]
+    assert sum(over_grass) >= 5
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_app
     # Everything behind them has a result from before, and may not be built upon.
     assert {name.partition("/")[0] for name in record.results} == {"ingest", "static_calibration"}
     assert {name.partition("/")[0] for name in record.blocked} >= {"tracking", "body_fitting"}
-    reviews = {each.request.id: each for each in reviews_of(open_match(store, TINY), record)}
+    reviews = {each.request.id: each for each in reviews_of(store, open_match(store, TINY), record)}
     assert set(reviews) == {unit.request for unit in record.waiting}
     assert {(each.state, each.request.run_id) for each in reviews.values()} == {("waits", "0002")}
     assert verify(store) == ()
@@ -84,7 +84,7 @@ def test_auto_waits_for_the_results_beyond_a_limit_and_goes_on_when_they_are_app
     assert len(store.blobs.entries("reviews")) == 1
     first, *others = reviews
     approve(store, first)
-    assert units(still_waiting(open_match(store, TINY), latest_run(store, TINY))) == [
+    assert units(still_waiting(store, open_match(store, TINY), latest_run(store, TINY))) == [
         unit.unit for unit in record.waiting if unit.request != first
     ]
     assert len(run(store, "auto").waiting) == len(others)
@@ -181,6 +181,42 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
         approve(store)
     approve(store, wrong)
     assert run(store, "auto").state == "complete"
+
+
+def test_a_corrected_result_needs_no_verdict_and_asks_about_the_new_one(store):
+    def states():
+        found = reviews_of(store, open_match(store, TINY), latest_run(store, TINY))
+        return {each.request.id: each.state for each in found}
+
+    waiting = {unit.unit: unit.request for unit in run(store, "auto").waiting}
+    wrong = waiting.pop(WRONG)
+    match = open_match(store, TINY)
+    correct(store, match, [wrong_click(match)], who="Ada", why="")
+    match = open_match(store, TINY)
+    assert states() == {wrong: "corrected", **dict.fromkeys(waiting.values(), "waits")}
+    assert units(still_waiting(store, match, latest_run(store, TINY))) == list(waiting)
+    # A verdict on all that wait says nothing about the corrected result.
+    assert set(approve(store)) == set(waiting.values())
+    assert still_waiting(store, open_match(store, TINY), latest_run(store, TINY)) == []
+    after = {unit.name: unit for unit in plan_run(store, match, {})}
+    assert not after[WRONG].published
+    # Taken back, the question is open again.
+    withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
+    assert states()[wrong] == "waits"
+
+
+def test_a_correction_of_an_input_makes_the_question_about_a_clip_corrected(store):
+    while (record := run(store, "always")).waiting[0].unit.partition("/")[0] != "tracking":
+        approve(store)
+    (tracked,) = record.waiting
+    match = open_match(store, TINY)
+    correct(store, match, [wrong_click(match)], who="Ada", why="")
+    (review,) = (
+        each
+        for each in reviews_of(store, open_match(store, TINY), record)
+        if each.request.id == tracked.request
+    )
+    assert review.state == "corrected"
 
 
 def test_a_correction_on_what_somebody_else_changed_is_refused(store):

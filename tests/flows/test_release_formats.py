@@ -1,15 +1,19 @@
 """Formats made from what a run would hold, without running anything."""
 
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
+from typer.testing import CliRunner
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.release import BaselineSettings
-from flows.results.export import EXPORTS, Origin
+from data_contracts.release import EXPORT_FORMATS, BaselineSettings
+from flows.cli.app import app
+from flows.results.export import CLASHING, COUNTED, EXPORTS, Origin
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.keypoints import CHALLENGE15
 from worldpose.errors import InputError, WorldposeError
@@ -101,6 +105,16 @@ def origin(folder, **results):
         clips=(ClipSpec(id="A_1", first_frame=100, frame_count=4, broadcast="main"),),
     )
     return Origin(StubRun(**results), SimpleNamespace(spec=spec, folder=str(folder)))
+
+
+def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
+    help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
+    page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
+    assert tuple(EXPORTS) == EXPORT_FORMATS
+    assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
+    for name in EXPORT_FORMATS:
+        assert re.search(rf"\b{name}\b(?!-)", help_text), name
+        assert f"| `{name}` |" in page
 
 
 @pytest.mark.parametrize("form", ["challenge", "challenge-2025"])

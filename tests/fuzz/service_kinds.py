@@ -196,7 +196,7 @@ def use_store(project):
         store = Store.open(str(project.root))
         match = open_match(store, MATCH)
         warnings_of(match)
-        reviews_of(match, latest_run(store, MATCH))
+        reviews_of(store, match, latest_run(store, MATCH))
 
     def read():
         run = open_run(str(project.root), MATCH)

@@ -16,6 +16,7 @@ from worldpose.pitch.template import law_points
 CROWN = 0.1
 """Height of the long axis above the touch lines [m]; it fits both cameras better than 0.2."""
 LENGTH, WIDTH = 105.0, 68.0
+SIZE = (3072, 1728)
 SWAPPED = {("right", 1394.99): "(88.5,14.84)", ("right", 2945.60): "(99.5,68)"}
 """Two clicks of the right camera whose labels are swapped: pixel x to the label of the place."""
 TRUE_CORNER = {14.84: 13.84, 53.16: 54.16}
@@ -51,13 +52,19 @@ def read_clicks(data, side, *, correct_labels=True):
     return places, pixels
 
 
-def write_static_pair(data, folder, *, first_frame=8, frame_count=10, correct_labels=True):
-    """Write the match folder: both videos, the clicks of both cameras, and one clip."""
+SIDES = {"left": 4, "right": 0}
+"""Offset of each camera's frames; the left video is four frames late."""
+
+
+def write_static_pair(
+    data, folder, *, sides=tuple(SIDES), first_frame=8, frame_count=10, correct_labels=True
+):
+    """Write the match folder: both videos or one, their clicks, and one clip."""
     annotations = folder / "annotations" / "static_calibration"
     annotations.mkdir(parents=True)
     (folder / "videos").mkdir()
     points = {}
-    for side in ("left", "right"):
+    for side in sides:
         shutil.copy(data / f"{side}_camera.mp4", folder / "videos" / f"{side}.mp4")
         places, pixels = read_clicks(data, side, correct_labels=correct_labels)
         laws = law_points(LENGTH, WIDTH)
@@ -66,15 +73,16 @@ def write_static_pair(data, folder, *, first_frame=8, frame_count=10, correct_la
         (annotations / f"{side}.json").write_text(json.dumps({"points": clicked}))
     pitch = {"length": LENGTH, "width": WIDTH, "crown": CROWN, "points": points}
     (folder / "pitch.json").write_text(json.dumps(pitch))
-    # The left video is four frames late.
+    cameras = "".join(
+        f"  - {{id: {side}, width: {SIZE[0]}, height: {SIZE[1]}, offset_frames: {SIDES[side]}}}\n"
+        for side in sides
+    )
     (folder / "match.yaml").write_text(
         f"""contract: 1
-match_id: pair
+match_id: {"pair" if len(sides) == 2 else sides[0]}
 fps: 25
 cameras:
-  - {{id: left, width: 3072, height: 1728, offset_frames: 4}}
-  - {{id: right, width: 3072, height: 1728}}
-clips:
+{cameras}clips:
   - {{id: clip, first_frame: {first_frame}, frame_count: {frame_count}}}
 """
     )

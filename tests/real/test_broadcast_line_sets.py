@@ -3,46 +3,31 @@
 WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, calib_eval.py).
 """
 
-import importlib.util
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from broadcast_line_sets import SIZE, cameras, line_sets
+from pitch_lines import jaccards, load_scorer
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 pytestmark = pytest.mark.skipif(
     not (DATA / "wc14").is_dir(), reason="WORLDPOSE_TEST_DATA has no wc14"
 )
 
 
-@pytest.fixture
-def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    path = BENCHMARKS / "broadcast_line_sets.py"
-    spec = importlib.util.spec_from_file_location("broadcast_line_sets", path)
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "broadcast_line_sets", module)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand(bench):
-    lines = bench.line_sets(DATA)
-    found = bench.cameras(lines)
+def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():
+    lines = line_sets(DATA)
+    found = cameras(lines)
     assert None not in found.values()
     centers = np.array([camera.center for camera in found.values()])
     away = np.hypot(centers[:, 0], centers[:, 1])
     # Where main cameras stand; seen: 63 to 95 m, and 13 to 19 m high.
     assert ((away > 50.0) & (away < 120.0)).all()
     assert ((centers[:, 2] > 8.0) & (centers[:, 2] < 40.0)).all()
-    scorer = bench.pitch_lines.load_scorer(DATA)
-    hits = [
-        bench.pitch_lines.jaccards(scorer, lines[name], camera, bench.SIZE)
-        for name, camera in found.items()
-    ]
+    scorer = load_scorer(DATA)
+    hits = [jaccards(scorer, lines[name], camera, SIZE) for name, camera in found.items()]
     # Seen: 96.3, 98.3, 98.3; one marking of the 30 line sets' is 0.5.
     assert (100.0 * np.mean(hits, axis=0) >= (95.8, 97.8, 97.8)).all()

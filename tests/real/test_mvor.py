@@ -4,18 +4,17 @@ WORLDPOSE_TEST_DATA names a folder with `mvor/camma_mvor_2018.json` and `mvor/op
 the repository CAMMA-public/MVOR (CC BY-NC-SA 4.0).
 """
 
-import importlib.util
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mvor import load_moments, measure
 
 from worldpose.tracking import TrackingSettings
 
 MVOR = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "mvor"
 FILES = [MVOR / "camma_mvor_2018.json", MVOR / "openpose_kps.json"]
-BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mvor.py"
 
 pytestmark = pytest.mark.skipif(
     not all(file.is_file() for file in FILES), reason="WORLDPOSE_TEST_DATA has no mvor"
@@ -25,10 +24,7 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def measured():
     """The benchmark's results with default settings: errors [cm] and people, by views."""
-    spec = importlib.util.spec_from_file_location("mvor", BENCHMARK)
-    mvor = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(mvor)
-    return mvor.measure(*mvor.load_moments(MVOR), TrackingSettings())
+    return measure(*load_moments(MVOR), TrackingSettings())
 
 
 # Published errors of mv3dreg are 9.9 and 18.3 cm; seen here 308 of 308 at 9.4, 322 of 415 at 12.8.

@@ -4,13 +4,21 @@ WORLDPOSE_TEST_DATA names a folder with `wc14` (lines.json, homographies.json, c
 `sn22_lines` (lines.json). Settings were chosen on the even half of each; the odd half is scored.
 """
 
-import importlib.util
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pitch_lines import (
+    BROADCAST,
+    SETS,
+    fit,
+    left_out,
+    load_lines,
+    load_scorer,
+    overlap,
+    score_images,
+)
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 
@@ -18,16 +26,6 @@ pytestmark = pytest.mark.skipif(
     not (DATA / "wc14").is_dir() or not (DATA / "sn22_lines").is_dir(),
     reason="WORLDPOSE_TEST_DATA has no wc14 and sn22_lines",
 )
-
-
-@pytest.fixture(scope="module")
-def bench():
-    path = Path(__file__).parents[2] / "benchmarks" / "pitch_lines.py"
-    spec = importlib.util.spec_from_file_location("pitch_lines", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["pitch_lines"] = module  # its dataclass looks its own module up
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize(
@@ -39,28 +37,28 @@ def bench():
         ("sn22", (94.6, 96.0, 96.2)),
     ],
 )
-def test_drawn_lines_give_cameras_that_hit_them(bench, name, minimum):
-    scorer = bench.load_scorer(DATA)
-    _, size = bench.SETS[name]
-    lines = bench.load_lines(DATA, name, half=1, every=1)
-    fits = {key: bench.fit(drawn, size, bench.BROADCAST) for key, drawn in lines.items()}
-    scores = bench.score_images(scorer, lines, fits, size)
+def test_drawn_lines_give_cameras_that_hit_them(name, minimum):
+    scorer = load_scorer(DATA)
+    _, size = SETS[name]
+    lines = load_lines(DATA, name, half=1, every=1)
+    fits = {key: fit(drawn, size, BROADCAST) for key, drawn in lines.items()}
+    scores = score_images(scorer, lines, fits, size)
     assert len(scores) >= 0.988 * len(lines)
     assert (100.0 * np.mean(list(scores.values()), axis=0) >= minimum).all()
 
 
-def test_the_camera_of_the_other_markings_predicts_one(bench):
-    lines = bench.load_lines(DATA, "wc14", half=1, every=3)
-    _, size = bench.SETS["wc14"]
-    hits = bench.left_out(bench.load_scorer(DATA), lines, size, bench.BROADCAST)
+def test_the_camera_of_the_other_markings_predicts_one():
+    lines = load_lines(DATA, "wc14", half=1, every=3)
+    _, size = SETS["wc14"]
+    hits = left_out(load_scorer(DATA), lines, size, BROADCAST)
     # A third of the half, about 130 markings: two deviations of 3 % below the half's 84.1 and 92.6.
     assert hits[0] >= 78.0
     assert hits[1] >= 87.5
 
 
-def test_distortion_free_cameras_overlap_the_annotated_homographies(bench):
-    lines = bench.load_lines(DATA, "wc14", half=1, every=1)
-    _, size = bench.SETS["wc14"]
-    mean, _ = bench.overlap(bench.load_scorer(DATA), DATA, lines, size)
+def test_distortion_free_cameras_overlap_the_annotated_homographies():
+    lines = load_lines(DATA, "wc14", half=1, every=1)
+    _, size = SETS["wc14"]
+    mean, _ = overlap(load_scorer(DATA), DATA, lines, size)
     # Seen: 97.1.
     assert mean >= 96.5

@@ -20,6 +20,7 @@ from tasks.unit import unit_task
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
 from worldpose.formats import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.ingest import import_lenses, read_match
 from worldpose.ingest.footage import write_still
 from worldpose.store import Store, explain_difference, recipe_key
 
@@ -59,6 +60,36 @@ def test_an_edit_after_planning_does_not_reach_the_result(planned, tmp_path):
     planned_translation = unit.recipe.sources["calibration"]["translation"]
     assert stored["translation"].values.tolist() == pytest.approx(planned_translation)
     assert stored.attrs["origin"] == "given"
+
+
+def test_an_imported_lens_is_the_prior_of_its_camera_and_of_no_other(clicked, tmp_path):
+    store, match, units = clicked
+    folder = match.folder.folder
+    truth = read_camera(folder / "reference" / "cameras" / "cam00.npz")
+    (fx, fy), (cx, cy) = np.ravel(truth.focal)[:2], np.ravel(truth.principal_point)[:2]
+    np.savez(
+        tmp_path / "lens.npz",
+        mtx=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+        dist=np.ravel(truth.distortion)[:5],
+    )
+    lens = import_lenses([tmp_path / "lens.npz"], folder, "cam00")["cam00"]
+    match, changed = register(store, folder)
+    assert changed
+    assert match.registration.digest_of("lenses.toml")
+    planned = {unit.name: unit for unit in plan_run(store, match, {})}
+    changed = {name for name in units if planned[name].key != units[name].key}
+    assert "static_calibration/cam00" in changed
+    assert not {name for name in changed if name.startswith("static_calibration/cam01")}
+    unit = planned["static_calibration/cam00"]
+    static_calibration.fn(unit.work(store.url, match, "0001"))
+    stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
+    assert stored["focal"].values[0] == pytest.approx(lens.focal_px, rel=0.01)
+    assert any("the given lens" in each for each in stored.attrs["decisions"])
+    with pytest.raises(InputError, match=r"lenses\.toml: cam00.*expected no lens"):
+        import_lenses([tmp_path / "lens.npz"], folder, "cam00")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    with pytest.raises(InputError, match="Remove them from one of the two files"):
+        read_match(folder)
 
 
 def test_a_clicked_camera_says_how_well_it_is_known(clicked, tiny):

@@ -183,7 +183,7 @@ def fit_bodies(
             result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
-        gone = _long_gaps(there[span, person], settings.max_gap_s * fps)
+        gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
         result.drop(person, span, gone)
     return result.fit(shapes)
 

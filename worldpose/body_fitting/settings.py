@@ -83,5 +83,5 @@ class BodyFittingSettings(Record):
     """Gauss-Newton steps for shape, offsets and coarse poses together [1]."""
     steps: int = Field(default=4, ge=1, le=1000)
     """Gauss-Newton steps for the poses of every frame [1]; feet stand from the third on."""
-    max_gap_s: float = Field(default=1.0, ge=0, le=100)
+    max_filled_gap_s: float = Field(default=1.0, ge=0, le=100)
     """Gaps up to this are filled by motion [s]; in longer ones a person is missing."""

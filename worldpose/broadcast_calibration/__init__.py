@@ -21,7 +21,12 @@ from worldpose.broadcast_calibration.settings import (
     BroadcastCalibrationSettings,
     BroadcastPrior,
 )
-from worldpose.broadcast_calibration.uncertainty import PooledCenter, drawn_to, pool_centers
+from worldpose.broadcast_calibration.uncertainty import (
+    PooledCenter,
+    drawn_to,
+    pool_centers,
+    static_covariance,
+)
 
 __all__ = [
     "BroadcastCalibration",
@@ -42,4 +47,5 @@ __all__ = [
     "moving_arrays",
     "moving_from_arrays",
     "pool_centers",
+    "static_covariance",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame
 from worldpose.broadcast_calibration.evidence import (
+    CLICK,
+    MARKING,
     FlowEvidence,
     PointEvidence,
+    spread_noise,
     together,
 )
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors, PitchFit
 from worldpose.broadcast_calibration.players import (
     FeedOffset,
     People,
@@ -38,18 +42,24 @@ from worldpose.broadcast_calibration.report import (
     BroadcastReport,
     JointFit,
     TrackedClip,
+    pixel_residuals,
     report_calibration,
 )
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.shots import require_one_shot
-from worldpose.broadcast_calibration.solver import Problem, Solution, descend, solve
+from worldpose.broadcast_calibration.solver import Problem, Solution, descend, displace, solve
 from worldpose.broadcast_calibration.tracking import (
     Chain,
     Followed,
     chain,
     follow,
 )
-from worldpose.broadcast_calibration.uncertainty import Uncertainty, compute_uncertainty
+from worldpose.broadcast_calibration.uncertainty import (
+    Uncertainty,
+    compute_uncertainty,
+    lasting_samples,
+    paint_variance,
+)
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
@@ -178,7 +188,8 @@ def refine(
 ) -> BroadcastCalibration:
     """Return the joint fit of all frames (M3 to M6); see `calibrate_broadcast`."""
     people, boxes, fps = clip.people, clip.moving_boxes, clip.fps
-    samples = FieldSamples.of(pitch)
+    learned = _Learned(PitchErrors.of(pitch, settings))
+    first_errors = learned.errors
     camera = tracked.chain.camera
     spread = estimate_smoothness(camera, fps)
     if not settings.smooth:
@@ -194,9 +205,10 @@ def refine(
     offset: FeedOffset | None = None
     points, before = clicks, camera
     for number in range(settings.passes):
+        samples = FieldSamples.of(pitch, learned.errors)
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
-        parts = [clicks, lines.evidence]
+        parts = [learned.errors.rescale(clicks, first_errors), lines.evidence]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
                 # Before any fit includes these players.
@@ -207,9 +219,17 @@ def refine(
             players, noise = player_evidence(lines.camera, people, matches, settings)
             parts.append(players)
         points = together(parts)
-        problem = _problem(points, tracked.flow, share, lines.camera, spread, settings)
-        solution = solve(lines.camera, problem, settings.max_iterations)
-        camera = solution.camera
+        camera = lines.camera
+        for _ in range(_LEARNING):
+            scaled = learned.scale_noise(points)
+            followed = share / learned.lasting
+            problem = _problem(scaled, tracked.flow, followed, camera, spread, settings)
+            solution = solve(camera, problem, settings.max_iterations)
+            camera, before_learning = solution.camera, learned
+            learned = _learn(problem, solution, learned)
+            if learned.is_near(before_learning):
+                break
+            points = learned.errors.rescale(points, before_learning.errors)
     assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
@@ -227,9 +247,114 @@ def refine(
         player_share=noise.share,
         player_frames=noise.frames,
     )
-    fit = JointFit(solution.camera, before, uncertainty, points, matches, weights, offset)
+    fit = JointFit(
+        solution.camera,
+        before,
+        uncertainty,
+        _displace_by_size(problem, solution),
+        matches,
+        weights,
+        offset,
+        learned.describe(pitch, problem, solution),
+    )
     report = report_calibration(tracked, fit, pitch, settings, clip.first)
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
+
+
+_LEARNING: Final = 4
+"""Maximum fits of a pass in which noise and paint errors are learned [1]."""
+_SAME: Final = 1.05
+"""Ratio of two spreads that count as equal [1]."""
+_PRIOR_CLICKS: Final = 10.0
+"""Coordinates that the assumed noise of clicks is worth in its estimate [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """Spreads that the residuals of a clip show.
+
+    Attributes:
+        errors: of the pitch.
+        lines: deviation of a line's sample over its assumed one, at least 1 [1].
+        clicks: the same of clicks [1].
+        lasting: samples of lines that count as one, since the errors of a piece of a marking last
+            for the whole clip [1].
+    """
+
+    errors: PitchErrors
+    lines: float = 1.0
+    clicks: float = 1.0
+    lasting: float = 1.0
+
+    def scale_noise(self, points: PointEvidence) -> PointEvidence:
+        """Return evidence of the assumed noise with the learned noise."""
+        factor = np.ones(len(points))
+        factor[points.kind == MARKING] = self.lines
+        factor[points.kind == CLICK] = self.clicks
+        whitening = points.whitening / factor[:, None, None]
+        return spread_noise(replace(points, whitening=whitening), self.lasting)
+
+    def is_near(self, other: _Learned) -> bool:
+        """Return whether another fit would change little."""
+        pairs = (
+            (self.errors.paint_m, other.errors.paint_m),
+            (self.lines, other.lines),
+            (self.clicks, other.clicks),
+            (self.lasting, other.lasting),
+        )
+        return all(1.0 / _SAME < one / two < _SAME for one, two in pairs)
+
+    def describe(self, pitch: PitchTemplate, problem: Problem, solution: Solution) -> PitchFit:
+        """Return the pitch and the noise for the report."""
+        offset, std = np.zeros(3), np.zeros(3)
+        if problem.size_row >= 0:
+            offset = solution.paint_offsets[problem.size_row]
+            std = np.sqrt(paint_variance(solution)[problem.size_row])
+        rows = np.flatnonzero(~self.errors.surveyed[problem.painted])
+        points = problem.painted[rows]
+        names, places = list(pitch.points), np.array(list(pitch.points.values()))[points]
+        own = np.column_stack([points, np.full(len(points), -1)])
+        by_size = self.errors.displacement_by_size(own, np.ones(own.shape), places)
+        places = places + self.errors.point_m[points, None] * solution.paint_offsets[rows]
+        places = places + by_size * offset
+        return PitchFit(
+            points={names[point]: place for point, place in zip(points, places, strict=True)},
+            size=np.array([pitch.length, pitch.width, pitch.crown]) + self.errors.size_m * offset,
+            size_std=self.errors.size_m * std,
+            paint_m=0.0 if self.errors.surveyed.all() else self.errors.paint_m,
+            line_noise=self.lines,
+            click_noise=self.clicks,
+        )
+
+
+def _learn(problem: Problem, solution: Solution, learned: _Learned) -> _Learned:
+    """Return the spreads that the residuals of a fit show."""
+    points = displace(problem.points, problem, solution.paint_offsets)
+    off = np.clip(pixel_residuals(solution.camera, points), -1e6, 1e6)
+    white = np.abs(np.einsum("nij,nj->ni", points.whitening, off))
+    lines, clicks = learned.lines, learned.clicks
+    across = white[points.kind == MARKING, 0]
+    if len(across):
+        lines = max(1.0, lines * 1.4826 * float(np.median(across)) * np.sqrt(learned.lasting))
+    clicked = points.kind == CLICK
+    used = white[clicked][np.abs(points.whitening[clicked]).any(axis=-1)]
+    if len(used):
+        squares = float((np.minimum(used, points.loss[clicked].max()) ** 2).sum())
+        clicks *= np.sqrt((_PRIOR_CLICKS + squares) / (_PRIOR_CLICKS + len(used)))
+    painted = len(problem.painted)
+    errors = learned.errors
+    if not errors.surveyed.all():
+        variance = paint_variance(solution)[:painted]
+        errors = errors.learn_paint(solution.paint_offsets[:painted], variance, problem.painted)
+    lasting = lasting_samples(points, off) * learned.lasting
+    return _Learned(errors, float(lines), float(clicks), max(1.0, lasting))
+
+
+def _displace_by_size(problem: Problem, solution: Solution) -> PointEvidence:
+    """Return the evidence of a fit with places on the pitch of the estimated size."""
+    size = solution.paint_offsets.copy()
+    size[: len(problem.painted)] = 0.0
+    return displace(problem.points, problem, size)
 
 
 def _problem(
@@ -371,9 +496,24 @@ def broadcast_attributes(
         "pick_next": [first + frame for frame in report.pick_next],
         "markings_off": _pair(report.markings_off),
         "players_off": _pair(report.players_off),
+        "pitch": _pitch(report.pitch),
+        "noise": {
+            "paint_m": report.pitch.paint_m,
+            "lines": report.pitch.line_noise,
+            "clicks": report.pitch.click_noise,
+        },
         "decisions": list(report.decisions),
         "reasons": list(report.reasons),
     }
+
+
+def _pitch(fit: PitchFit) -> dict[str, Any] | None:
+    """Return the estimated pitch for a record; None if all is given."""
+    spec = fit.spec
+    if spec is None:
+        return None
+    chosen = spec.model_dump(mode="json", include={"length", "width", "crown", "points"})
+    return {**chosen, "std_m": fit.size_std.tolist()}
 
 
 def _pair(values: tuple[float, float]) -> list[float | None]:

@@ -32,6 +32,8 @@ class ObservedPoints:
             survey error.
         shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
             error; with `ends`.
+        by_size: (n, 3) [m] displacement of the place along x, y, z per standard deviation of the
+            pitch's length, width and crown; None = they are known.
     """
 
     frame: Integers
@@ -41,6 +43,7 @@ class ObservedPoints:
     source: Integers
     ends: Integers | None = None
     shares: Floats | None = None
+    by_size: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +63,8 @@ class PointEvidence:
         ends: (n, 2) indices of the template's points that define the place; -1 = none.
         shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
             error.
+        by_size: (n, 3) [m] displacement of the place per standard deviation of the pitch's length,
+            width and crown.
     """
 
     frame: Integers
@@ -72,6 +77,7 @@ class PointEvidence:
     source: Integers
     ends: Integers
     shares: Floats
+    by_size: Floats
 
     @classmethod
     def none(cls) -> PointEvidence:
@@ -88,6 +94,7 @@ class PointEvidence:
             index,
             np.empty((0, ENDS), dtype=np.int64),
             np.empty((0, ENDS)),
+            np.empty((0, 3)),
         )
 
     @classmethod
@@ -140,16 +147,26 @@ class PointEvidence:
             source=observed.source,
             ends=ends,
             shares=shares,
+            by_size=np.zeros((count, 3)) if observed.by_size is None else observed.by_size,
         )
 
-    def arrays(self, ends: Integers) -> Points:
+    def arrays(self, ends: Integers, size_row: int = -1) -> Points:
         """Return the arrays for compiled kernels.
 
         Args:
             ends: (n, 2) rows of the paint errors that define a point; -1 = none.
+            size_row: row that holds the pitch's size; -1 = known.
         """
         return Points(
-            self.world, self.image, self.whitening, self.weight, self.loss, ends, self.shares
+            self.world,
+            self.image,
+            self.whitening,
+            self.weight,
+            self.loss,
+            ends,
+            self.shares,
+            self.by_size,
+            size_row,
         )
 
     def __len__(self) -> int:
@@ -194,8 +211,17 @@ class FlowEvidence:
 
 _POINT_PARTS = (
     *("frame", "world", "image", "whitening", "weight", "loss", "kind", "source", "ends", "shares"),
+    "by_size",
 )
 _FLOW_PARTS = ("frame", "start", "end", "deviation")
+
+
+def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
+    """Return evidence in which so many samples of lines count as one; losses keep their pixels."""
+    root = np.where(points.kind == MARKING, np.sqrt(lasting), 1.0)
+    return replace(
+        points, whitening=points.whitening / root[:, None, None], loss=points.loss / root
+    )
 
 
 def together(parts: Sequence[PointEvidence]) -> PointEvidence:

@@ -19,6 +19,7 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solver import Problem, solve
@@ -96,14 +97,23 @@ def calibrate_keys(
     wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
     estimates = [each.estimate for each in found.values()]
     camera = _of_one_place(estimates)
-    samples = FieldSamples.of(pitch)
+    errors = PitchErrors.of(pitch, settings)
+    samples = FieldSamples.of(pitch, errors)
     clicks = PointEvidence.none()
     for _ in range(_ROUNDS):
         parts, lines = [], []
         for index, frame in enumerate(found):
             single = camera.frames(slice(index, index + 1))
             parts.append(
-                _clicks(pitch, clicked[frame], index, single, found[frame].report.wrong, settings)
+                _clicks(
+                    pitch,
+                    clicked[frame],
+                    index,
+                    single,
+                    found[frame].report.wrong,
+                    settings,
+                    errors,
+                )
             )
             if frame in pictures:
                 seen, _ = find_lines(single, samples, pictures[frame], None, settings)
@@ -186,22 +196,25 @@ def _clicks(
     camera: MovingCamera,
     wrong: Sequence[str],
     settings: BroadcastCalibrationSettings,
+    errors: PitchErrors,
 ) -> PointEvidence:
     """Return the evidence of one key frame's clicks without outliers."""
     points = [point for point in key.markings.points if point.name not in wrong]
     drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
     template = {name: number for number, name in enumerate(pitch.points)}
     own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
+    one, world = np.ones(own.shape), pitch.positions([point.name for point in points])
     parts = [
         PointEvidence.at_points(
             ObservedPoints(
                 frame=np.full(len(points), index),
-                world=pitch.positions([point.name for point in points]),
+                world=world,
                 image=np.array([point.xy for point in points]).reshape(-1, 2),
                 kind=CLICK,
                 source=np.full(len(points), -1),
                 ends=own,
-                shares=np.where(own >= 0, settings.survey_error_m, 0.0),
+                shares=errors.shares(own, one),
+                by_size=errors.displacement_by_size(own, one, world),
             ),
             np.full(len(points), settings.click_noise_px),
             settings.field_weight,
@@ -225,6 +238,7 @@ def _clicks(
         )
         known = np.isfinite(place).all(axis=-1)
         names, shares = _locate_on_marking(pitch, marking.name, place[known])
+        ends = np.tile([template[name] for name in names], (int(known.sum()), 1))
         parts.append(
             PointEvidence.across_lines(
                 ObservedPoints(
@@ -233,8 +247,9 @@ def _clicks(
                     image=pixels[known],
                     kind=CLICK,
                     source=np.full(int(known.sum()), -1),
-                    ends=np.tile([template[name] for name in names], (int(known.sum()), 1)),
-                    shares=settings.survey_error_m * shares,
+                    ends=ends,
+                    shares=errors.shares(ends, shares),
+                    by_size=errors.displacement_by_size(ends, shares, place[known]),
                 ),
                 normal[known],
                 np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
@@ -251,7 +266,7 @@ def _locate_on_marking(
     if marking in pitch.arcs:
         center = pitch.arcs[marking].center
         return (center, center), np.tile([1.0, 0.0], (len(places), 1))
-    line = pitch.lines.get(marking) or pitch.goals[marking]
+    line = {**pitch.lines, **pitch.goals, **pitch.unpainted}[marking]
     start, way = pitch.points[line.start], pitch.points[line.end] - pitch.points[line.start]
     share = np.clip((places - start) @ way / (way @ way), 0.0, 1.0)
     return (line.start, line.end), np.stack([1.0 - share, share], axis=-1)

@@ -19,6 +19,7 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
+from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
@@ -55,15 +56,17 @@ class FieldSamples:
     Attributes:
         lines: samples of the painted markings.
         whites: all white structures, for the clearance test.
+        errors: of the pitch.
     """
 
     lines: LineSamples
     whites: WhiteStructures
+    errors: PitchErrors
 
     @classmethod
-    def of(cls, pitch: PitchTemplate) -> FieldSamples:
-        """Return the samples of a pitch."""
-        return cls(sample_markings(pitch, _SPACING), white_structures(pitch))
+    def of(cls, pitch: PitchTemplate, errors: PitchErrors) -> FieldSamples:
+        """Return the samples of a pitch with its errors."""
+        return cls(sample_markings(pitch, _SPACING), white_structures(pitch), errors)
 
 
 def find_lines(
@@ -142,16 +145,19 @@ def _look(
         variances,
     )
     found = np.isfinite(exact)
+    chosen = lines[index[found]]
+    world, ends, shares = chosen.points_world, chosen.ends, chosen.shares
     deviation = np.sqrt(variances[found] + settings.line_noise_px**2)
     return PointEvidence.across_lines(
         ObservedPoints(
             frame=np.zeros(int(found.sum()), dtype=np.int64),
-            world=lines.points_world[index][found],
+            world=world,
             image=(places + exact[:, None] * normals)[found],
             kind=MARKING,
-            source=lines.marking[index][found],
-            ends=lines.ends[index][found],
-            shares=settings.survey_error_m * lines.shares[index][found],
+            source=chosen.marking,
+            ends=ends,
+            shares=samples.errors.shares(ends, shares),
+            by_size=samples.errors.displacement_by_size(ends, shares, world),
         ),
         normals[found],
         deviation,

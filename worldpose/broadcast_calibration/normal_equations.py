@@ -61,6 +61,10 @@ class Points(NamedTuple):
     """(n, 2) rows of the paint errors that define a point; -1 = none."""
     shares: Floats
     """(n, 2) [m] displacement of the point per unit of these."""
+    by_size: Floats
+    """(n, 3) [m] displacement along x, y, z per unit of the pitch's length, width, crown."""
+    size_row: int
+    """Row of the paint errors that holds the pitch's size; -1 = the size is known."""
 
 
 class Flow(NamedTuple):
@@ -165,6 +169,34 @@ def direction_row(
 
 
 @compile_kernel
+def displace_point(points: Points, i: int, paint_offsets: Floats, place: Floats) -> None:
+    """Write the place (3,) of a point with its paint errors and the pitch's size."""
+    place[:] = points.world[i]
+    for end in range(2):
+        row = points.ends[i, end]
+        if row >= 0:
+            for j in range(3):
+                place[j] += points.shares[i, end] * paint_offsets[row, j]
+    if points.size_row >= 0:
+        for j in range(3):
+            place[j] += points.by_size[i, j] * paint_offsets[points.size_row, j]
+
+
+@compile_kernel
+def displacement(points: Points, i: int, one: int) -> tuple[int, float]:
+    """Return the row of the paint errors, -1 = none, and a point's displacement by them.
+
+    Args:
+        points: the points.
+        i: number of the point.
+        one: 3 * source + axis; sources are two template points, and the pitch's size.
+    """
+    if one < 6:
+        return points.ends[i, one // 3], points.shares[i, one // 3]
+    return points.size_row, points.by_size[i, one - 6]
+
+
+@compile_kernel
 def add_points(
     cameras: Cameras,
     bounds: Integers,
@@ -182,13 +214,13 @@ def add_points(
         equations: added to.
     """
     center, rotation = cameras.center, cameras.rotation
-    world, image, whitening = points.world, points.image, points.whitening
-    weight, loss, ends, shares = points.weight, points.loss, points.ends, points.shares
+    image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss
     blocks, border, corner = equations.blocks, equations.border, equations.corner
     right, right_corner = equations.right, equations.right_corner
     cost = 0.0
     pixel, rows = np.empty(2), np.empty((2, 12))
-    place, moved = np.empty(3), np.empty(6)
+    place, moved, row_of = np.empty(3), np.empty(9), np.empty(9, dtype=np.int64)
+    sources = 6 if points.size_row < 0 else 9
     normal, gradient = np.empty((12, 12)), np.empty(12)
     white = np.empty(12)
     for t in range(len(rotation)):
@@ -197,11 +229,7 @@ def add_points(
         lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
         for i in range(bounds[t], bounds[t + 1]):
             limit = loss[i] * loss[i]
-            place[:] = world[i]
-            for end in range(2):
-                if ends[i, end] >= 0:
-                    for j in range(3):
-                        place[j] += shares[i, end] * paint_offsets[ends[i, end], j]
+            displace_point(points, i, paint_offsets, place)
             if not point_row(rotation[t], center, lens, place, pixel, rows):
                 # The maximum of the loss.
                 cost += 0.5 * weight[i] * min(limit, 1e12)
@@ -230,14 +258,15 @@ def add_points(
                     gradient[j] += value * e
                     for m in range(j + 1):
                         normal[j, m] += value * white[m]
-                for end in range(2):
+                for one in range(sources):
                     # The derivative by the point is minus the derivative by the center.
-                    for j in range(3):
-                        moved[3 * end + j] = -white[7 + j] * shares[i, end]
-                for one in range(6):
-                    if ends[i, one // 3] < 0:
+                    first, share = displacement(points, i, one)
+                    moved[one] = -white[7 + one % 3] * share
+                    row_of[one] = -1 if first < 0 else 5 + 3 * first + one % 3
+                for one in range(sources):
+                    row = row_of[one]
+                    if row < 0:
                         continue
-                    row = 5 + 3 * ends[i, one // 3] + one % 3
                     value = factor * moved[one]
                     right_corner[row] += value * e
                     for j in range(7):
@@ -245,10 +274,9 @@ def add_points(
                     for j in range(5):
                         corner[row, j] += value * white[7 + j]
                         corner[j, row] += value * white[7 + j]
-                    for other in range(6):
-                        if ends[i, other // 3] >= 0:
-                            column = 5 + 3 * ends[i, other // 3] + other % 3
-                            corner[row, column] += value * moved[other]
+                    for other in range(sources):
+                        if row_of[other] >= 0:
+                            corner[row, row_of[other]] += value * moved[other]
         for j in range(7):
             right[t, j] += gradient[j]
             for m in range(j + 1):
@@ -272,7 +300,11 @@ _UNDISTORT: Final = 30
 
 @compile_kernel
 def undistort_point(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
-    """Return the undistorted point on the plane z = 1 of (xd, yd), and whether it exists."""
+    """Undistort the point (xd, yd) of the plane z = 1.
+
+    Returns:
+        x and y of the undistorted point, and whether there is one.
+    """
     far = math.sqrt(xd * xd + yd * yd)
     radius = far
     for _ in range(_UNDISTORT):

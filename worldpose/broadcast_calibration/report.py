@@ -20,6 +20,7 @@ from worldpose.broadcast_calibration.evidence import (
 from worldpose.broadcast_calibration.key_frames import Keys
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.pitch_errors import PitchFit
 from worldpose.broadcast_calibration.players import FeedOffset, Matches
 from worldpose.broadcast_calibration.priors import Weights
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
@@ -58,6 +59,7 @@ class BroadcastReport:
         drift: (gaps,) tracking error from one key frame to the next [px].
         feed_offset: the clip's clock offset, from people; None without people.
         weights: of the terms.
+        pitch: the pitch and the noise that the fit shows.
         pick_next: frames whose clicks would help most, the best first.
         markings_off: median distance of painted lines from their projection [px], before players
             and the joint fit, and after; NaN without any.
@@ -79,6 +81,7 @@ class BroadcastReport:
     drift: Floats
     feed_offset: FeedOffset | None
     weights: Weights
+    pitch: PitchFit
     pick_next: tuple[int, ...]
     markings_off: tuple[float, float]
     players_off: tuple[float, float]
@@ -113,6 +116,7 @@ class JointFit:
         matches: players; None without.
         weights: of the terms.
         feed_offset: the clip's clock offset; None without people.
+        pitch: the pitch and the noise that the fit shows.
     """
 
     camera: MovingCamera
@@ -122,6 +126,7 @@ class JointFit:
     matches: Matches | None
     weights: Weights
     feed_offset: FeedOffset | None
+    pitch: PitchFit
 
 
 def report_calibration(
@@ -177,6 +182,7 @@ def report_calibration(
     decisions = [
         f"a followed point counts {fit.weights.flow_share:.2g} of its loss, as tracking drifts",
         f"errors of a person last {fit.weights.player_frames:.1f} frames",
+        *fit.pitch.describe,
     ]
     if fit.feed_offset is not None:
         clock, late = _describe_offset(fit.feed_offset, settings)
@@ -196,6 +202,7 @@ def report_calibration(
         drift=links.drift,
         feed_offset=fit.feed_offset,
         weights=fit.weights,
+        pitch=fit.pitch,
         pick_next=_select_picks(expected),
         markings_off=(earlier[0], later[0]),
         players_off=(earlier[1], later[1]),

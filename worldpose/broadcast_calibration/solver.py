@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -70,6 +70,16 @@ class Problem:
         return np.asarray(found[found >= 0])
 
     @cached_property
+    def size_row(self) -> int:
+        """Row of the paint errors that holds the pitch's size, the last; -1 if it is known."""
+        return len(self.painted) if self.points.by_size.any() else -1
+
+    @property
+    def paint_count(self) -> int:
+        """Rows of the paint errors: template points, and the pitch's size."""
+        return len(self.painted) + (self.size_row >= 0)
+
+    @cached_property
     def ends(self) -> Integers:
         """Indices into `painted` of the points that define each evidence (n, 2); -1 = none."""
         number = np.searchsorted(self.painted, self.points.ends)
@@ -95,8 +105,8 @@ class Solution:
 
     Attributes:
         camera: camera of least cost.
-        paint_offsets: (painted, 3) offsets of painted template points from the survey [standard
-            deviations].
+        paint_offsets: (painted, 3) offsets of painted template points from the survey, then of the
+            pitch's size, if it is not known [standard deviations].
         cost: final cost.
         costs: cost after every iteration.
         equations: equations at the final camera.
@@ -125,7 +135,8 @@ def equations_at(camera: MovingCamera, paint_offsets: Floats, problem: Problem) 
     system.right_corner[CLIP_SIZE:] = paint_offsets.ravel()
     points, flow = problem.points, problem.flow
     edges = bounds(points.frame, frames)
-    cost = add_points(camera.arrays, edges, points.arrays(problem.ends), paint_offsets, system)
+    evidence = points.arrays(problem.ends, problem.size_row)
+    cost = add_points(camera.arrays, edges, evidence, paint_offsets, system)
     if len(flow) and problem.flow_weight > 0.0:
         followed = Flow(
             flow.start, flow.end, flow.deviation, problem.flow_weight, problem.flow_loss
@@ -156,7 +167,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
         paint_offsets = state.paint_offsets + shared[CLIP_SIZE:].reshape(state.paint_offsets.shape)
         return _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
 
-    paint_offsets = np.zeros((len(problem.painted), 3))
+    paint_offsets = np.zeros((problem.paint_count, 3))
     start = _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
     schedule = Schedule(
         damping=_START_DAMPING,
@@ -169,6 +180,20 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     found = minimize(start, step, schedule)
     last = found.state
     return Solution(last.camera, last.paint_offsets, last.cost, found.costs, last.equations)
+
+
+def displace(points: PointEvidence, problem: Problem, paint_offsets: Floats) -> PointEvidence:
+    """Return evidence whose places have the estimated paint errors and size of the pitch.
+
+    Args:
+        points: evidence of the problem.
+        problem: with the rows of the paint errors.
+        paint_offsets: (painted, 3) [standard deviations].
+    """
+    padded = np.concatenate([paint_offsets, np.zeros((1, 3))])
+    world = points.world + (points.shares[..., None] * padded[problem.ends]).sum(axis=1)
+    world += points.by_size * padded[problem.size_row]
+    return replace(points, world=world)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +289,7 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         iterations: number of iterations.
     """
     frames = len(camera) * FRAME_SIZE
-    paint_offsets = np.zeros((len(problem.painted), 3))
+    paint_offsets = np.zeros((problem.paint_count, 3))
     size = frames + CLIP_SIZE + paint_offsets.size
     unit = np.ones(size)
     unit[frames + 3 : frames + CLIP_SIZE] = 1e3

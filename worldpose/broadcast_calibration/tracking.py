@@ -46,7 +46,10 @@ class Chain:
 def chain(
     key_frames: Sequence[int], keys: MovingCamera, followed: Sequence[Followed], outlier: float
 ) -> Chain:
-    """Return cameras tracked between key frames, with the drift distributed linearly.
+    """Return the cameras of all frames, tracked from each key frame to the next.
+
+    At the next key frame the tracked camera differs from the calibrated one by the drift, which is
+    distributed linearly over the frames between them.
 
     Args:
         key_frames: indices of the key frames, rising.

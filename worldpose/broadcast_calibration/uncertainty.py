@@ -10,9 +10,16 @@ import numpy as np
 from scipy.special import chdtri
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.broadcast_calibration.evidence import CLICK, PLAYER
+from worldpose.broadcast_calibration.evidence import CLICK, MARKING, PLAYER, PointEvidence
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.normal_equations import Cameras, Lens, Points, point_row
+from worldpose.broadcast_calibration.normal_equations import (
+    Cameras,
+    Lens,
+    Points,
+    displace_point,
+    displacement,
+    point_row,
+)
 from worldpose.broadcast_calibration.solver import Problem, Solution
 from worldpose.compiled import compile_kernel
 from worldpose.errors import DegenerateError
@@ -24,6 +31,12 @@ _STRETCHES: Final = 64
 """Maximum intervals per clip with a common error of lens second differences [1]."""
 _STRETCH: Final = 3.0
 """Cell size within which a marking has one common paint error [m]."""
+
+
+_UNDETERMINED: Final = (
+    "broadcast camera: a frame's numbers have neither evidence nor prior. Pick a key frame near "
+    "the frames without lines."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +54,21 @@ class Uncertainty:
     def clip(self) -> Floats:
         """(5, 5) of center [m] and principal point [px]."""
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
+
+
+def static_covariance(camera: MovingCamera, uncertainty: Uncertainty) -> Floats:
+    """Return the covariance (frames, 12, 12) of each frame's camera as that of a static camera.
+
+    A static camera's step is in the order of `CAMERA_STEP`, with a shift in its own axes instead
+    of the center's in the world.
+    """
+    size = FRAME_SIZE + CLIP_SIZE
+    chain = np.zeros((len(camera), size, size))
+    chain[:, range(3), range(3)] = 1.0
+    chain[:, 3:6, FRAME_SIZE : FRAME_SIZE + 3] = -camera.rotation
+    order = [3, FRAME_SIZE + 3, FRAME_SIZE + 4, 4, 5, 6]
+    chain[:, range(6, size), order] = 1.0
+    return np.asarray(chain @ uncertainty.frame @ np.swapaxes(chain, -1, -2))
 
 
 def compute_uncertainty(
@@ -75,10 +103,7 @@ def compute_uncertainty(
     system = solution.equations.system
     factor = BandedFactor.of(system.blocks)
     if not factor.determined:
-        raise DegenerateError(
-            "broadcast camera: a frame's numbers have neither evidence nor prior. Pick a key frame "
-            "near the frames without lines."
-        )
+        raise DegenerateError(_UNDETERMINED)
     by_shared = factor.solve(system.border)
     count = system.border.shape[2]
     flat = system.border.reshape(-1, count)
@@ -107,6 +132,50 @@ def compute_uncertainty(
     return Uncertainty(0.5 * (whole + np.swapaxes(whole, -1, -2)))
 
 
+def lasting_samples(points: PointEvidence, off: Floats) -> float:
+    """Return how many samples of lines count as one, by their residuals [1].
+
+    The mean over all pieces of markings of the squared mean residual, over that of independent
+    samples.
+
+    Args:
+        points: evidence, on the estimated pitch.
+        off: (n, 2) residuals [px].
+    """
+    lines = np.flatnonzero(points.kind == MARKING)
+    if not len(lines):
+        return 1.0
+    some = points[lines]
+    white = np.einsum("nj,nj->n", some.whitening[:, 0], off[lines])
+    weight = 1.0 / (1.0 + (white / some.loss) ** 2) ** 2
+    _, cluster = np.unique(_cells(some), axis=0, return_inverse=True)
+    sums, counts = (np.bincount(cluster.ravel(), each) for each in (weight * white, weight))
+    return float(np.mean(sums**2 / np.maximum(counts, 1.0)))
+
+
+def _cells(points: PointEvidence) -> Integers:
+    """Return the kind, marking or person, and piece of the marking (n, 4) of each point."""
+    cell = np.floor(points.world[:, :2] / _STRETCH).astype(np.int64)
+    cell[points.kind == PLAYER] = 0
+    return np.column_stack([points.kind, points.source, cell])
+
+
+def paint_variance(solution: Solution) -> Floats:
+    """Return the posterior variance (painted, 3) of a solution's paint errors [std^2].
+
+    Raises:
+        DegenerateError: the system is singular.
+    """
+    system = solution.equations.system
+    factor = BandedFactor.of(system.blocks)
+    if not factor.determined:
+        raise DegenerateError(_UNDETERMINED)
+    flat = system.border.reshape(-1, system.border.shape[2])
+    solved = factor.solve(system.border).reshape(flat.shape)
+    covariance = np.linalg.inv(system.corner - flat.T @ solved)
+    return np.asarray(covariance.diagonal()[CLIP_SIZE:].reshape(-1, 3))
+
+
 def _lasting_gradients(
     solution: Solution, problem: Problem, shared: int, line_shift: float, player_shift: float
 ) -> tuple[Floats, Floats]:
@@ -117,9 +186,7 @@ def _lasting_gradients(
     """
     points, camera = problem.points, solution.camera
     chosen = points.kind != CLICK
-    cell = np.floor(points.world[:, :2] / _STRETCH).astype(np.int64)
-    cell[points.kind == PLAYER] = 0
-    key = np.column_stack([points.kind, points.source, cell])[chosen]
+    key = _cells(points[chosen])
     sources, cluster = np.unique(key, axis=0, return_inverse=True)
     columns = len(sources) + 4
     by_frame, by_shared = np.zeros((len(camera), FRAME_SIZE, columns)), np.zeros((shared, columns))
@@ -132,7 +199,7 @@ def _lasting_gradients(
         shift,
         len(sources) + 2 * people.astype(np.int64),
     )
-    evidence = points[chosen].arrays(problem.ends[chosen])
+    evidence = points[chosen].arrays(problem.ends[chosen], problem.size_row)
     _add_gradients(camera.arrays, evidence, solution.paint_offsets, clusters, by_frame, by_shared)
     together = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
@@ -192,16 +259,12 @@ def _add_gradients(
     by_shared: Floats,
 ) -> None:
     """Add every point's gradient to the columns of its lasting errors; see `add_points`."""
-    world, image, whitening = points.world, points.image, points.whitening
-    weight, loss, ends, shares = points.weight, points.loss, points.ends, points.shares
+    image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss
     frame, shift = clusters.frame, clusters.shift
     pixel, rows, place = np.empty(2), np.empty((2, 12)), np.empty(3)
     for i in range(len(frame)):
         t = frame[i]
-        place[:] = world[i]
-        for end in range(2):
-            if ends[i, end] >= 0:
-                place += shares[i, end] * paint_offsets[ends[i, end]]
+        displace_point(points, i, paint_offsets, place)
         lens = Lens(cameras.principal_point, cameras.focal[t], cameras.distortion[t])
         if not point_row(cameras.rotation[t], cameras.center, lens, place, pixel, rows):
             continue
@@ -224,11 +287,11 @@ def _add_gradients(
                 by_frame[t, j, column] += x * rows[0, j] + y * rows[1, j]
             for j in range(5):
                 by_shared[j, column] += x * rows[0, 7 + j] + y * rows[1, 7 + j]
-            for end in range(2):
-                if ends[i, end] >= 0:
-                    for j in range(3):
-                        moved = -(x * rows[0, 7 + j] + y * rows[1, 7 + j]) * shares[i, end]
-                        by_shared[5 + 3 * ends[i, end] + j, column] += moved
+            for one in range(9):
+                row, share = displacement(points, i, one)
+                if row >= 0:
+                    moved = -(x * rows[0, 7 + one % 3] + y * rows[1, 7 + one % 3]) * share
+                    by_shared[5 + 3 * row + one % 3, column] += moved
 
 
 _UNLIKELY = 1e-3

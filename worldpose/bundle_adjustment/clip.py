@@ -35,7 +35,7 @@ class Clicks:
 
     @classmethod
     def of(cls, calibration: StaticCalibration, pitch: PitchTemplate) -> Clicks:
-        """Return the clicked points that a camera was calibrated on."""
+        """Return all clicked points of a camera, inliers and outliers of its calibration."""
         points = calibration.report.points
         names = tuple(point.name for point in points)
         return cls(

@@ -83,7 +83,7 @@ def held_out_errors(
 
 
 def triangulate_without(clip: Clip, cameras: Camera, camera: int, frames: Integers) -> Floats:
-    """Return joints (k, persons, 17, 3) from all cameras but one [m], world.
+    """Return joints (k, persons, 17, 3) [m], world, triangulated without one camera.
 
     Args:
         clip: keypoints and their persons.

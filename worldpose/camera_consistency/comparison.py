@@ -238,7 +238,7 @@ class Comparison:
         return float(found.mean()) - usual, max(spread, chance_noise(usual))
 
     def is_side_by_side(self, a: int, b: int) -> bool:
-        """Return whether people see two cameras in nearly one direction.
+        """Return whether both cameras see the people from nearly the same direction.
 
         Rays of such cameras meet anywhere along themselves, so the cameras cannot be inconsistent.
         """
@@ -487,7 +487,7 @@ def _weights(
     heights: tuple[float, float],
     joint_noise: float,
 ) -> Floats:
-    """Return the match weights of every two detections (a, b), 0 to 1."""
+    """Return the match weight, 0 to 1, of each pair of a detection in a and one in b, (a, b)."""
     count_a, joints, _ = rays_a.shape
     count_b = rays_b.shape[0]
     weights = np.zeros((count_a, count_b))

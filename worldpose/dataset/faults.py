@@ -39,7 +39,7 @@ class Fault:
 
 
 def point_faults() -> Iterator[Fault]:
-    """Yield faults of 3D positions."""
+    """Yield the faults that a file of 3D poses may have: pivot, angles, units, axes."""
     yield Fault(
         "root_about_origin",
         "global_orient turns about the model's origin and not about the pelvis joint",

@@ -7,15 +7,12 @@ fallback; fine-tuned or larger models serve better. Needs torch.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import torch
-from scipy.sparse.csgraph import connected_components
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Image
 from worldpose.detection.bundled_nets import (
     COARSEST,
     PeopleNet,
@@ -24,35 +21,21 @@ from worldpose.detection.bundled_nets import (
     place_net,
     precision,
 )
+from worldpose.detection.enlargement import STEPS, Part, find_groups, find_small
 from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.detection.suppression import suppress
-from worldpose.geometry.boxes import box_iou
 
 MAX_PEOPLE: Final = 300
 """Most people per frame."""
 NMS_IOU: Final = 0.7
 """Boxes with a larger intersection over union are of one person [1]."""
-PEOPLE_HEIGHTS: Final = (100.0, 160.0)
-"""The enlarged heights of a group's people [px], one pass per height: the detector is trained on
-heights up to 160; where one pass merges two heads, the other may separate them."""
-ZOOMS: Final = (1.25, 3.0)
-"""A group that needs less enlargement is large enough; none is enlarged more [1]."""
-MIN_GROUP_SCORE: Final = 0.25
-"""Boxes from this score on form a group [1]."""
-SAME_PERSON_IOU: Final = 0.6
-"""Boxes that overlap more are one person's [1, intersection over union]."""
-MIN_NEIGHBOUR_IOU: Final = 0.15
-"""Neighbours in a group overlap more [1, intersection over union]."""
-GROUP_MARGIN: Final = 0.25
-"""Margin within which people still belong to a group, as a share of its people's height [1]."""
-HEIGHT_RANGE: Final = (0.5, 2.0)
-"""Shortest and tallest box in a group, as a share of its people's height [1]."""
 
 
 class BundledDetector:
     """A net that detects the centres of people and the sides of their boxes.
 
-    The detector runs a second time on enlarged crops of groups of people who occlude one another.
+    The detector runs again on enlarged tiles where people are small, then on enlarged crops of
+    groups of people who occlude one another.
     """
 
     def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
@@ -65,20 +48,27 @@ class BundledDetector:
 
     def detect(self, images: Sequence[Image]) -> list[People]:
         """Return the people in each frame, computed one by one."""
-        return [self._people(image) for image in images]
+        return [self._people(image, None) for image in images]
 
-    def _people(self, image: Image) -> People:
-        whole = self._detect(image)
-        passes = [
-            whole,
-            *(
-                group.to_frame(self._detect(group.crop(image)))
-                for group in find_groups(whole, image.shape)
-            ),
-        ]
-        boxes = np.concatenate([people.boxes for people in passes])
-        scores = np.concatenate([people.scores for people in passes])
-        return suppress(People(boxes, scores), NMS_IOU)
+    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
+        """Return the people in each frame; the caller knows where they are small."""
+        return [self._people(image, parts) for image in images]
+
+    def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
+        found = self._detect(image)
+        if parts is None:
+            for step in STEPS:
+                found = self._look_at(image, found, find_small(found, image.shape, step))
+        else:
+            found = self._look_at(image, found, parts)
+        found = self._look_at(image, found, find_groups(found, image.shape))
+        return suppress(found, NMS_IOU)
+
+    def _look_at(self, image: Image, found: People, parts: Sequence[Part]) -> People:
+        """Return the people of earlier passes and of parts of the frame."""
+        for part in parts:
+            found = part.merge(found, self._detect(part.crop(image)))
+        return found
 
     def _detect(self, image: Image) -> People:
         """Return the detections in an image; the same person may be there twice."""
@@ -94,70 +84,3 @@ class BundledDetector:
         found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
         real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)
         return People(found[real], scores.double().cpu().numpy()[real])
-
-
-@dataclass(frozen=True)
-class Group:
-    """A part of a frame in which people occlude one another.
-
-    Attributes:
-        corner: left, upper pixel of the crop.
-        end: right, lower pixel, not included.
-        zoom: enlargement [1].
-        inner: x0, y0, x1, y1 of the region that holds the centres of its people [px].
-        tall: median height of its people [px].
-    """
-
-    corner: tuple[int, int]
-    end: tuple[int, int]
-    zoom: float
-    inner: Floats
-    tall: float
-
-    def crop(self, image: Image) -> Image:
-        """Return the enlarged crop of the frame."""
-        (left, top), (right, bottom) = self.corner, self.end
-        part = image[top:bottom, left:right]
-        size = (round(self.zoom * (right - left)), round(self.zoom * (bottom - top)))
-        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-
-    def to_frame(self, people: People) -> People:
-        """Return the group's people among those found in `crop`, in the frame's pixels."""
-        sides = np.array(self.end) - self.corner
-        scale = np.tile(sides / np.round(self.zoom * sides), 2)
-        boxes = (people.boxes + 0.5) * scale - 0.5 + np.tile(self.corner, 2)
-        middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
-        shares = (boxes[:, 3] - boxes[:, 1]) / self.tall
-        mine = np.all((middles > self.inner[:2]) & (middles < self.inner[2:]), axis=1)
-        mine &= (shares > HEIGHT_RANGE[0]) & (shares < HEIGHT_RANGE[1])
-        return People(boxes[mine], people.scores[mine])
-
-
-def find_groups(people: People, shape: tuple[int, ...]) -> list[Group]:
-    """Return the groups that need a second detection pass, one entry per enlargement.
-
-    Args:
-        people: detections in the whole frame.
-        shape: height, width of the frame [px].
-    """
-    sure = suppress(people, SAME_PERSON_IOU)
-    boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
-    count, member = connected_components(box_iou(boxes, boxes) > MIN_NEIGHBOUR_IOU, directed=False)
-    size = np.array([shape[1], shape[0]])
-    found = []
-    for number in range(count):
-        own = boxes[member == number]
-        tall = float(np.median(own[:, 3] - own[:, 1]))
-        low, high = own[:, :2].min(axis=0), own[:, 2:].max(axis=0)
-        inner = np.concatenate([low - GROUP_MARGIN * tall, high + GROUP_MARGIN * tall])
-        corner = np.maximum(np.floor(low - 2.0 * GROUP_MARGIN * tall), 0).astype(int)
-        end = np.minimum(np.ceil(high + 2.0 * GROUP_MARGIN * tall), size).astype(int)
-        # No second pass costs more than the first.
-        widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
-        zooms = {min(height / tall, ZOOMS[1], widest) for height in PEOPLE_HEIGHTS if len(own) > 1}
-        found += [
-            Group((corner[0], corner[1]), (end[0], end[1]), zoom, inner, tall)
-            for zoom in sorted(zooms)
-            if zoom >= ZOOMS[0]
-        ]
-    return found

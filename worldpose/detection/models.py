@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 from typing import Final
 
+from data_contracts.checkpoint import Checkpoint
 from worldpose.detection.interfaces import Detector, PoseEstimator
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
+from worldpose.formats.files import read_json
 from worldpose.ingest.registration import digest_of_files
+from worldpose.ingest.validation import validate_record
 
 LIBRARIES: Final = {
     "embedded": ("torch",),
@@ -26,6 +30,32 @@ BUNDLED_WEIGHTS: Final = (
     Path(__file__).with_name("embedded_keypoints.safetensors"),
 )
 """Shipped weights of the bundled detector and of the bundled pose estimator."""
+
+
+PULLED_RECORD: Final = "model.json"
+"""File of a pulled checkpoint with its `Checkpoint`, beside the folder `PULLED_FILES`."""
+PULLED_FILES: Final = "files"
+
+
+def model_folder() -> Path:
+    """Return the folder of pulled checkpoints: WORLDPOSE_MODEL_FOLDER, or in the user's cache."""
+    given = os.environ.get("WORLDPOSE_MODEL_FOLDER")
+    if given:
+        return Path(given).expanduser().resolve()
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(cache).expanduser().resolve() / "worldpose" / "models"
+
+
+def read_pulled(name: str, folder: Path) -> Checkpoint | None:
+    """Return the record of a pulled checkpoint; None if it is not in the folder.
+
+    Raises:
+        InputError: its record is damaged.
+    """
+    file = folder / name / PULLED_RECORD
+    if not file.is_file():
+        return None
+    return validate_record(Checkpoint, read_json(file), str(file))
 
 
 def load_detectors(settings: DetectionSettings) -> list[Detector]:
@@ -159,13 +189,37 @@ def digest_of_weights(path: Path) -> str:
 def _split_name(name: str) -> tuple[str, Path | None]:
     """Return the kind of a model and the path of its weights; None for those that ship."""
     kind, colon, path = name.partition(":")
+    if kind == "model" and path:
+        return _find_pulled(path)
     library, dash, _form = kind.partition("-")
     unknown = library not in LIBRARIES or (dash and library != "onnx")
     if unknown or (colon and not path) or (kind != "embedded" and not path):
         raise InputError(
             f"detection: {name!r}",
-            expected="embedded, embedded:FILE, transformers:FOLDER, onnx:FILE or onnx-FORM:FILE",
+            expected="embedded, embedded:FILE, model:NAME, transformers:FOLDER, onnx:FILE or "
+            "onnx-FORM:FILE",
             found=repr(name),
             todo="Correct detection.detector or detection.pose.",
         )
     return kind, Path(path).expanduser().resolve() if path else None
+
+
+def _find_pulled(name: str) -> tuple[str, Path]:
+    """Return kind and path of a pulled checkpoint.
+
+    Raises:
+        InputError: it was not pulled.
+    """
+    folder = model_folder()
+    # A name is never a path.
+    known = name == Path(name).name and not name.startswith(".")
+    pulled = read_pulled(name, folder) if known else None
+    if pulled is None:
+        raise InputError(
+            f"detection: 'model:{name}'",
+            expected=f"a pulled checkpoint in {folder}",
+            found="none of this name",
+            todo=f"Pull it: worldpose models pull {name}. worldpose models list shows the names.",
+        )
+    files = folder / name / PULLED_FILES
+    return pulled.kind, files if pulled.kind == "transformers" else files / pulled.files[0].name

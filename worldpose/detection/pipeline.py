@@ -1,4 +1,4 @@
-"""People in one camera's video: boxes, then keypoints, in chunks of frames (D1-D3)."""
+"""People in one camera's video: boxes, then keypoints, in chunks of frames (D1-D5)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
+from worldpose.detection.enlargement import Part, SeesParts, expect_small
 from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
@@ -165,6 +166,7 @@ class PeopleFinder:
             for detector in detectors
         ]
         self._estimator, self._settings = estimator, settings
+        self._parts: list[Part] | None = None
         self.report = DetectionReport()
 
     def find(
@@ -178,6 +180,10 @@ class PeopleFinder:
         """
         self.report = DetectionReport()
         cleaner = BoxCleaner(self._settings)
+        self._parts = None
+        if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
+            margin = self._settings.pitch_margin_m
+            self._parts = expect_small(place.camera, place.pitch, margin)
         detected_frames = detect_strided(
             frames,
             lambda images: self._people(images, place),
@@ -204,7 +210,12 @@ class PeopleFinder:
     def _people(self, images: list[Image], place: Place | None) -> list[People]:
         """Return the people on the pitch in each frame."""
         settings = self._settings
-        found = [detector.detect(images) for detector in self._detectors]
+        found = [
+            detector.detect(images)
+            if self._parts is None or not isinstance(detector, SeesParts)
+            else detector.detect_parts(images, self._parts)
+            for detector in self._detectors
+        ]
         everybody = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":

@@ -20,14 +20,14 @@ ClassNumber = Annotated[int, Field(ge=0, le=10_000)]
 
 
 class DetectionSettings(Record):
-    """Settings of `detection` (paper: refinement of 2D detection results; D1-D3)."""
+    """Settings of `detection` (paper: refinement of 2D detection results; D1-D5)."""
 
     detector: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         default=("embedded",), min_length=1
     )
-    """Detectors of people: `embedded`, `embedded:FILE`, `transformers:FOLDER`, `onnx:FILE`, or
-    `onnx-FORM:FILE` where the net's outputs do not tell its form, for example `onnx-rtmdet:FILE`;
-    several form an ensemble whose boxes are fused."""
+    """Detectors of people: `embedded`, `embedded:FILE`, `model:NAME` (see `worldpose models`),
+    `transformers:FOLDER`, `onnx:FILE`, or `onnx-FORM:FILE` where the net's outputs do not tell its
+    form, for example `onnx-rtmdet:FILE`; several form an ensemble whose boxes are fused."""
     person_classes: tuple[ClassNumber, ...] | None = Field(
         default=None, min_length=1, max_length=100
     )

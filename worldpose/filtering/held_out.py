@@ -62,8 +62,8 @@ def measure_held_out(
     fold = np.arange(count) % FOLDS
     total, keypoints = 0.0, 0
     for left_out in range(min(FOLDS, count)):
-        index = np.where((fold == left_out)[:, None], np.int16(-1), used.index)
-        others = replace(used, index=index.astype(np.int16))
+        index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
+        others = replace(used, detection_index=index.astype(np.int16))
         placed = triangulate_joints(cameras, others, settings, camera_covariance)
         for camera in np.flatnonzero(fold == left_out):
             seen = np.asarray(detected[:, camera], dtype=np.float64)

@@ -130,12 +130,12 @@ class TriangulatedDetections(TrackedDetections):
         Args:
             shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
         """
-        frame, camera, person = np.nonzero(self.index >= 0)
+        frame, camera, person = np.nonzero(self.detection_index >= 0)
         order = _order_joints(self.exchanged[frame, camera, person])
         own = np.zeros((len(frame), *shift.shape[3:]))
         np.put_along_axis(own, order[..., None], shift[frame, camera, person], axis=1)
         out = np.zeros(self.keypoints.shape)
-        out[frame, camera, self.index[frame, camera, person]] = np.nan_to_num(own)
+        out[frame, camera, self.detection_index[frame, camera, person]] = np.nan_to_num(own)
         return out
 
 
@@ -224,7 +224,7 @@ def body_residuals(
     """
     unshifted = replace(suspects, offsets=np.zeros_like(suspects.offsets))
     rows, (frame, camera, person), order = _pair_with_bodies(views, unshifted)
-    place = suspects.index[frame, camera, person]
+    place = suspects.detection_index[frame, camera, person]
     wrong = np.take_along_axis(judged.rejected[frame, camera, place], order, axis=1)
     wrong |= (judged.fits[frame, camera, place] != person)[:, None]
     missed = np.where(wrong[..., None], np.nan, rows.pixels - rows.image)
@@ -257,7 +257,7 @@ def judge_detections(
     dropped = np.zeros(shape[:3], dtype=np.bool_)
 
     rows, (frame, camera, person), order = _pair_with_bodies(views, suspects)
-    place = suspects.index[frame, camera, person].astype(np.int64)
+    place = suspects.detection_index[frame, camera, person].astype(np.int64)
     away = rows.mahalanobis_distance(spread)
     alike = rows.similarity()
     count, fitting = _count_fitting(away, settings)
@@ -289,8 +289,8 @@ def _pair_with_bodies(
     views: BodyViews, suspects: TriangulatedDetections
 ) -> tuple[_Pairs, tuple[Places, Places, Places], Places]:
     """Return detections with the bodies of their tracked persons, and the order of their joints."""
-    frame, camera, person = np.nonzero(suspects.index >= 0)
-    place = suspects.index[frame, camera, person]
+    frame, camera, person = np.nonzero(suspects.detection_index >= 0)
+    place = suspects.detection_index[frame, camera, person]
     order = _order_joints(suspects.exchanged[frame, camera, person])
     pixels = (
         suspects.keypoints[frame, camera, place] - suspects.offsets[frame, camera, person, None]

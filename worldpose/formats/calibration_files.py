@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,7 @@ def build_camera(
         raise calibration_error(
             f"{where}: size", f"whole pixels from 1 to {SIZE_LIMIT}", str(size.tolist())
         )
-    _require_optics(where, size, focal, principal_point)
+    require_optics(where, size, focal, principal_point)
     far = float(np.max(np.abs(translation)))
     if far > DISTANCE_LIMIT:
         raise calibration_error(
@@ -109,7 +109,7 @@ def build_camera(
         ) from invalid
 
 
-def _require_optics(
+def require_optics(
     where: str,
     size: NDArray[np.float64],
     focal: NDArray[np.float64],
@@ -174,22 +174,48 @@ def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
         InputError: with file and key: unreadable, a missing or misshapen entry, not finite, no
             rotation, a fisheye camera, no camera, or two cameras of one name.
     """
+    return index_by_name(
+        path,
+        [
+            (where, _read_toml_camera(where, name, table))
+            for where, name, table in camera_tables(path)
+        ],
+    )
+
+
+def camera_tables(path: Path) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Yield the place, the camera's id and the table of each camera of a TOML file.
+
+    Raises:
+        InputError: the file is unreadable, or has an entry that is no table.
+    """
     content = read_toml(path)
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
-    cameras = []
     for key, table in tables.items():
         if key == "metadata":
             continue
         where = f"{path}: {key}" if tables is content else f"{path}: cameras.{key}"
         if not isinstance(table, dict):
             raise calibration_error(where, "a table for each camera", _shorten(table))
-        name = table.get("name", f"cam_{key}" if key.isdecimal() else key)
-        cameras.append((where, _read_toml_camera(where, str(name), table)))
-    return index_by_name(path, cameras)
+        yield where, str(table.get("name", f"cam_{key}" if key.isdecimal() else key)), table
 
 
-def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> CameraCalibration:
+class Optics(NamedTuple):
+    """Size, focal lengths and principal point (2,) [px], and distortion (5,) k1 k2 p1 p2 k3."""
+
+    size: NDArray[np.float64]
+    focal: NDArray[np.float64]
+    principal_point: NDArray[np.float64]
+    distortion: NDArray[np.float64]
+
+
+def read_optics(where: str, table: Mapping[str, Any]) -> Optics:
+    """Return size, matrix and distortion of a camera's table.
+
+    Raises:
+        InputError: an entry is missing or misshapen, or the lens has another model.
+    """
     if table.get("fisheye", False) is not False:
         raise InputError(
             f"{where}.fisheye",
@@ -199,7 +225,6 @@ def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> Camera
         )
     matrix = _read_numbers(table, where, "matrix", (3, 3))
     size = _read_numbers(table, where, "size", (2,))
-    rotation = _read_rotation(table, where)
     distortion = np.ravel(_read_numbers(table, where, "distortions", None))
     if len(distortion) not in (4, 5, 8, 12, 14):
         found = f"{len(distortion)} numbers"
@@ -215,14 +240,26 @@ def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> Camera
         raise calibration_error(
             f"{where}.matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", str(matrix.tolist())
         )
+    return Optics(size, np.diag(matrix)[:2], matrix[:2, 2], np.append(distortion, 0.0)[:5])
+
+
+def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> CameraCalibration:
+    if "matrix" in table and not {"rotation", "translation"} & table.keys():
+        raise InputError(
+            f"{where}.rotation",
+            expected="the pose of the camera, rotation and translation",
+            found="a lens alone",
+            todo="Import lenses with worldpose import --lens FILE --out MATCH, and click the pose.",
+        )
+    optics = read_optics(where, table)
     return build_camera(
         where,
         name,
-        size=size,
-        focal=np.diag(matrix)[:2],
-        principal_point=matrix[:2, 2],
-        distortion=np.append(distortion, 0.0)[:5],
-        rotation=rotation,
+        size=optics.size,
+        focal=optics.focal,
+        principal_point=optics.principal_point,
+        distortion=optics.distortion,
+        rotation=_read_rotation(table, where),
         translation=_read_numbers(table, where, "translation", (3,)),
     )
 

@@ -113,6 +113,52 @@ class Camera:
         )
 
     @classmethod
+    def from_matrices(
+        cls,
+        matrix: ArrayLike,
+        distortion: ArrayLike,
+        rotation: ArrayLike,
+        translation: ArrayLike,
+        image_size: ArrayLike,
+    ) -> Camera:
+        """Return the cameras of OpenCV's matrices; batch dimensions `...` broadcast.
+
+        Args:
+            matrix: (..., 3, 3), `K` [px], without skew.
+            distortion: (..., 5) k1 k2 p1 p2 k3.
+            rotation: (..., 3, 3) of `x_cam = rotation x_world + translation`.
+            translation: (..., 3) [m].
+            image_size: (..., 2) width, height [px].
+
+        Raises:
+            InputError: an array has the wrong shape, K has a skew or another last row than (0, 0,
+                1), or a rotation is not orthonormal with determinant 1 within six decimals.
+        """
+        k = check_shape("Camera.from_matrices: matrix", matrix, (3, 3))
+        known = np.isfinite(k).all(axis=(-2, -1))
+        if np.any(k[known][:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != [0.0, 0.0, 0.0, 0.0, 1.0]):
+            raise InputError(
+                "Camera.from_matrices: matrix",
+                expected="fx 0 cx, 0 fy cy, 0 0 1",
+                found=f"{k.tolist()}",
+                todo="Give K without skew, not transposed.",
+            )
+        where = "Camera.from_matrices: rotation"
+        given = check_shape(where, rotation, (3, 3))
+        exact = [
+            each if np.isnan(each).any() else nearest_rotation(where, each)
+            for each in given.reshape(-1, 3, 3)
+        ]
+        pose = Rigid(np.reshape(exact, given.shape), np.asarray(translation, dtype=np.float64))
+        return cls(
+            focal=np.stack([k[..., 0, 0], k[..., 1, 1]], axis=-1),
+            principal_point=k[..., :2, 2],
+            distortion=np.asarray(distortion, dtype=np.float64),
+            cam_from_world=pose,
+            image_size=np.asarray(image_size, dtype=np.int64),
+        )
+
+    @classmethod
     def from_calibration(cls, calibration: CameraCalibration) -> Camera:
         """Return the camera of a record, its rotation replaced by the nearest exact one.
 
@@ -224,7 +270,9 @@ class Camera:
         Raises:
             InputError: the shapes do not agree.
         """
-        batch, cameras, points = self._flat("Camera.project: points_world", points_world, 3)
+        batch, cameras, points = self._flat(
+            "Camera.project_with_jacobians: points_world", points_world, 3
+        )
         shape = points.shape[:-1]
         image = np.empty((*shape, 2))
         jacobian = np.empty((*shape, 2, 18))

@@ -9,8 +9,13 @@ from worldpose.formats.calibration_files import read_calibration, write_calibrat
 from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.clicks import ImportedClicks, import_clicks
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
-from worldpose.ingest.importing import import_match, import_videos
-from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
+from worldpose.ingest.importing import import_lenses, import_match, import_videos
+from worldpose.ingest.match_folder import (
+    MatchFolder,
+    read_match,
+    require_calibrated,
+    unclicked_clips,
+)
 from worldpose.ingest.registration import register_match
 from worldpose.ingest.writing import MatchAnnotations, write_match
 
@@ -20,6 +25,7 @@ __all__ = [
     "MatchFolder",
     "UnitFrames",
     "import_clicks",
+    "import_lenses",
     "import_match",
     "import_videos",
     "read_calibration",
@@ -28,6 +34,7 @@ __all__ = [
     "read_unit",
     "register_match",
     "require_calibrated",
+    "unclicked_clips",
     "unit_frames",
     "write_calibration_toml",
     "write_match",

@@ -30,9 +30,28 @@ from worldpose.pitch.template import law_points
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
 SNAP: Final = 0.1
-"""A place closer to a point of the Laws than this is that point [m]: labels are rounded."""
+"""A place closer to a known point than this is that point [m]: labels are rounded."""
 AGAIN: Final = ".again"
 """Suffix of the second click with one label."""
+
+
+@dataclass(frozen=True)
+class RepeatedClick:
+    """A label that was clicked a second time in one image.
+
+    Attributes:
+        owner: the static camera, or the clip.
+        image: name of the image.
+        label: as in the file.
+        names: of the first click and of this one, in the match folder.
+        pixels: of both [px].
+    """
+
+    owner: str
+    image: str
+    label: str
+    names: tuple[str, str]
+    pixels: tuple[tuple[float, float], tuple[float, float]]
 
 
 @dataclass
@@ -43,14 +62,14 @@ class ImportedClicks:
         files: written, relative to the match folder.
         clicks: number of clicks and drawn lines, by camera or clip.
         own_points: points that the Laws do not name, with their places (3,) [m, world].
-        repeated: labels that were clicked more than once in one image, with the image.
+        repeated: labels that were clicked more than once in one image.
         mirrored: whether the labels' y axis points towards the near side; None without coordinates.
     """
 
     files: list[str] = field(default_factory=list)
     clicks: dict[str, int] = field(default_factory=dict)
     own_points: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    repeated: list[tuple[str, str]] = field(default_factory=list)
+    repeated: list[RepeatedClick] = field(default_factory=list)
     mirrored: bool | None = None
 
 
@@ -59,9 +78,9 @@ def import_clicks(file: Path, folder: Path, owner: str | None = None) -> Importe
 
     Labels are names of the pitch template, or places in metres: from a corner along the touch line
     and the goal line, or, if some are negative, from the centre spot. On which side y is positive
-    follows from the clicks: no camera above a pitch sees it mirrored. Places that the Laws do not
-    name become points of pitch.json. A label that is clicked twice in one image gives two points at
-    one place, from which calibration tells the wrong one.
+    follows from the clicks: no camera above a pitch sees it mirrored. Places that neither the Laws
+    nor pitch.json name become points of pitch.json. A label that is clicked twice in one image
+    gives two points at one place, from which calibration tells the wrong one.
 
     Args:
         file: CVAT for images XML, Label Studio JSON or COCO keypoints JSON.
@@ -154,7 +173,7 @@ def _records(
     file: Path, owner: str, camera: CameraSpec, images: Sequence[MarkedImage], labels: _Labels
 ) -> dict[str, Record]:
     if camera.kind == "static":
-        return {clicked_file(owner): labels.markings(images[0])}
+        return {clicked_file(owner): labels.markings(owner, images[0])}
     frames = {}
     for image in images:
         digits = re.findall(r"\d+", PurePosixPath(image.name).stem)
@@ -165,7 +184,7 @@ def _records(
                 found="no number" if not digits else f"frame {int(digits[-1])} again",
                 todo="Name the images by the frames of the clip's video.",
             )
-        frames[int(digits[-1])] = labels.markings(image)
+        frames[int(digits[-1])] = labels.markings(owner, image)
     return {
         key_frames_file(owner): KeyFrames(
             key_frames=tuple(
@@ -183,26 +202,32 @@ class _Labels:
     ) -> None:
         self._file, self._report = file, report
         self._pitch, self._template = pitch, PitchTemplate.from_spec(pitch)
-        self._laws = {
-            name: np.array(place[:2])
-            for name, place in law_points(pitch.length, pitch.width).items()
-            if place[2] == 0.0
+        above = {name for name, at in law_points(pitch.length, pitch.width).items() if at[2]}
+        self._known = {
+            name: place[:2] for name, place in self._template.points.items() if name not in above
         }
         self._frame = _label_frame(file, images, pitch)
         if self._frame is not None:
             report.mirrored = bool(self._frame[1, 1] < 0)
 
-    def markings(self, image: MarkedImage) -> ClickedMarkings:
-        """Return the clicked markings of an image."""
+    def markings(self, owner: str, image: MarkedImage) -> ClickedMarkings:
+        """Return the clicked markings of an image of a camera or clip."""
         points, seen = [], Counter[str]()
+        first: dict[str, tuple[float, float]] = {}
         for label, pixel in image.points:
             name = self._name(image, label)
             seen[name] += 1
+            where = (float(pixel[0]), float(pixel[1]))
             if seen[name] > 1:
-                self._report.repeated.append((image.name, label))
-                place = self._place(name)
-                name += AGAIN if seen[name] == 2 else f"{AGAIN}{seen[name]}"
+                place, names = self._place(name), (name, name + AGAIN)
+                if seen[name] > 2:
+                    names = (name, f"{name}{AGAIN}{seen[name]}")
+                self._report.repeated.append(
+                    RepeatedClick(owner, image.name, label, names, (first[name], where))
+                )
+                name = names[1]
                 self._report.own_points[name] = place
+            first.setdefault(name, where)
             points.append({"name": name, "xy": pixel.tolist()})
         drawn: dict[str, list[list[float]]] = {}
         for label, pixels in image.lines:
@@ -225,7 +250,7 @@ class _Labels:
         x, y = self._frame @ [float(found[1]), float(found[2]), 1.0]
         if abs(x) > 0.5 * self._pitch.length + 30.0 or abs(y) > 0.5 * self._pitch.width + 30.0:
             raise self._unknown(image, label, self._template.points)
-        for name, place in self._laws.items():
+        for name, place in self._known.items():
             if np.hypot(*(place - [x, y])) < SNAP:
                 return name
         name = f"at_{x:.2f}_{y:.2f}"

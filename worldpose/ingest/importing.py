@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from data_contracts.cameras import LensCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import write_match
 from worldpose.video import index_frames
@@ -68,6 +73,44 @@ def import_match(
         people[name] = on_frames(file, people[name], [(first, last - first + 1)])
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec
+
+
+def import_lenses(
+    files: Sequence[Path], folder: Path, camera: str | None = None
+) -> dict[str, LensCalibration]:
+    """Write lenses without a pose into a match folder's lenses.toml, and return them.
+
+    Static calibration takes them as prior of focal length, principal point and distortion; the
+    pose comes from clicks.
+
+    Args:
+        files: what `read_lenses` reads.
+        folder: the match folder, with match.yaml.
+        camera: the static camera of a file that names none.
+
+    Raises:
+        InputError: a file is invalid, its camera is unknown or has a lens already, or calibration
+            .toml gives it with its pose.
+    """
+    spec = read_spec(folder)
+    sizes = image_sizes(spec)
+    target = folder / LENS_FILE
+    known = read_lens_toml(target, sizes) if target.exists() else {}
+    lenses = read_lenses(files, camera, sizes)
+    given = folder / "calibration.toml"
+    posed = read_calibration(given) if given.exists() else {}
+    for name in lenses:
+        if name in known or name in posed:
+            place = LENS_FILE if name in known else given.name
+            raise InputError(
+                f"{folder / place}: {name}",
+                expected="no lens of this camera yet",
+                found="one",
+                todo="Remove it there first.",
+            )
+    with whole_file(target) as draft:
+        write_lens_toml(draft, {**known, **lenses})
+    return lenses
 
 
 def files_by_camera(

@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import Final
 
 from data_contracts.broadcast_calibration import KeyFrames
-from data_contracts.cameras import CameraCalibration
+from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import read_calibration
 from worldpose.formats.files import read_yaml
-from worldpose.ingest.annotations import clicked_file, read_clicked, read_key_frames
+from worldpose.formats.lens_files import read_lens_toml
+from worldpose.ingest.annotations import (
+    clicked_file,
+    key_frames_file,
+    read_clicked,
+    read_key_frames,
+)
 from worldpose.ingest.pitch_file import read_pitch
 from worldpose.ingest.validation import existing_file, reachable, validate_record
 
@@ -38,6 +44,7 @@ class MatchFolder:
         clicked: clicked markings, by id of a static camera; may lack some.
         stills: one image, by id of a static camera; may lack some.
         key_frames: clicked key frames of the broadcast camera, by id of a clip; may lack some.
+        lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates of the broadcast camera, by id of a clip; may lack
             some.
     """
@@ -51,6 +58,7 @@ class MatchFolder:
     clicked: Mapping[str, ClickedMarkings]
     stills: Mapping[str, Path]
     key_frames: Mapping[str, KeyFrames]
+    lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
 
 
@@ -90,27 +98,29 @@ def read_spec(folder: Path) -> MatchSpec:
 
 def _read_match(folder: Path) -> MatchFolder:
     spec = read_spec(folder)
-    if not spec.static_cameras:
+    if not spec.static_cameras and not any(clip.broadcast for clip in spec.clips):
         raise InputError(
             f"{folder / 'match.yaml'}: cameras",
-            expected="at least one camera of kind static",
-            found=f"{len(spec.cameras)} broadcast",
-            todo="Add the static cameras.",
+            expected="a static camera, or a clip with a broadcast camera",
+            found=f"{len(spec.cameras)} broadcast, which no clip names",
+            todo=f"Add the static cameras, or `broadcast: {spec.cameras[0].id}` to a clip.",
         )
     detections = _detections(folder, spec)
     videos = _videos(folder, spec)
     _require_footage(folder, spec, detections, videos)
     pitch = read_pitch(folder, spec)
+    calibrations = _calibrations(folder, spec)
     return MatchFolder(
         folder=folder,
         spec=spec,
-        calibrations=_calibrations(folder, spec),
+        calibrations=calibrations,
         detections=detections,
         pitch=pitch,
         videos=videos,
         clicked=read_clicked(folder, spec, pitch),
         stills=_stills(folder, spec),
         key_frames=read_key_frames(folder, spec, pitch),
+        lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec),
     )
 
@@ -118,9 +128,13 @@ def _read_match(folder: Path) -> MatchFolder:
 def require_calibrated(match: MatchFolder) -> None:
     """Raise InputError for a match with a static camera without calibration and clicks.
 
+    A match without static cameras needs clicked key frames, in one clip at least.
+
     Raises:
         InputError: with the missing cameras and the required files.
     """
+    if not match.spec.static_cameras:
+        _require_key_frames(match)
     known = {**match.calibrations, **match.clicked}
     missing = [camera.id for camera in match.spec.static_cameras if camera.id not in known]
     if missing:
@@ -137,6 +151,37 @@ def require_calibrated(match: MatchFolder) -> None:
             found=f"missing camera {', '.join(missing)}; there: {_list_names(known)}",
             todo=f"{needed}, or take it out of match.yaml.",
         )
+
+
+def unclicked_clips(match: MatchFolder) -> tuple[str, ...]:
+    """Return the broadcast clips that need key frames; none if static cameras film the match."""
+    clips = (clip.id for clip in match.spec.clips if clip.broadcast is not None)
+    filmed = (clip for clip in clips if clip in match.videos and match.pitch is not None)
+    unclicked = tuple(clip for clip in filmed if clip not in match.key_frames)
+    return () if match.spec.static_cameras else unclicked
+
+
+def _require_key_frames(match: MatchFolder) -> None:
+    """Raise InputError if no broadcast clip of a match without static cameras can be calibrated."""
+    usable = match.key_frames.keys() & match.videos.keys()
+    if match.pitch is not None and usable:
+        return
+    clip = next(each.id for each in match.spec.clips if each.broadcast is not None)
+    found, todo = "no clip with a video", f"Add broadcast/{clip}.mp4."
+    if match.pitch is None:
+        found, todo = "no pitch", "Take `pitch: none` out of match.yaml."
+    elif match.videos:
+        found = "no clicked key frame"
+        todo = (
+            f"Click {CLICKS_NEEDED} in a frame into {match.folder / key_frames_file(clip)}, or "
+            f"click on the pages: worldpose ingest {match.folder}, then worldpose review serve."
+        )
+    raise InputError(
+        str(match.folder),
+        expected="a clip with clicked key frames and a video, as there are no static cameras",
+        found=found,
+        todo=todo,
+    )
 
 
 def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]:
@@ -163,6 +208,33 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
                 todo="Calibrate at the size of the video, or correct match.yaml.",
             )
     return calibrations
+
+
+LENS_FILE: Final = "lenses.toml"
+"""File of given lenses without a pose, relative to the match folder."""
+
+
+def _lenses(
+    folder: Path, spec: MatchSpec, calibrations: Mapping[str, CameraCalibration]
+) -> dict[str, LensCalibration]:
+    if not (folder / LENS_FILE).exists():
+        return {}
+    file = existing_file(folder, LENS_FILE, str(folder))
+    lenses = read_lens_toml(file, image_sizes(spec))
+    both = [name for name in lenses if name in calibrations]
+    if both:
+        raise InputError(
+            f"{file}: {', '.join(both)}",
+            expected="lenses of cameras without a given pose",
+            found="cameras that calibration.toml gives with their pose",
+            todo="Remove them from one of the two files.",
+        )
+    return lenses
+
+
+def image_sizes(spec: MatchSpec) -> dict[str, tuple[int, int]]:
+    """Return width and height [px] of each static camera's images."""
+    return {camera.id: (camera.width, camera.height) for camera in spec.static_cameras}
 
 
 def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:

@@ -10,7 +10,7 @@ from typing import Final
 
 from data_contracts.match import Registration, SourceFile
 from worldpose.errors import InputError
-from worldpose.ingest.match_folder import MatchFolder
+from worldpose.ingest.match_folder import LENS_FILE, MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.validation import reachable
 
@@ -21,9 +21,9 @@ SETTLE_SECONDS: Final = 0.5
 def register_match(match: MatchFolder, previous: Registration | None) -> Registration:
     """Return the match with the SHA-256 of its files, and its identity.
 
-    The registration covers match.yaml, calibration.toml, the pitch file, videos, stills,
-    detections, estimates and annotations; `reference/` is not part of the match. The identity
-    covers only the paths and contents of videos, detections and pitch, so that neither the
+    The registration covers match.yaml, calibration.toml, lenses.toml, the pitch file, videos,
+    stills, detections, estimates and annotations; `reference/` is not part of the match. The
+    identity covers only the paths and contents of videos, detections and pitch, so that neither the
     folder's name nor an edited click, still, roster, estimate or calibration changes it.
 
     Args:
@@ -79,7 +79,7 @@ def _identifying_files(match: MatchFolder) -> set[str]:
 
 
 def _further_files(match: MatchFolder) -> set[str]:
-    names = ("match.yaml", "calibration.toml", "annotations")
+    names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
     roots = [*(match.folder / name for name in names), *match.stills.values()]
     roots += match.estimates.values()
     return {path for root in roots for path in _files_under(match.folder, root)}

@@ -121,7 +121,11 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _number(where: str, title: str, values: Mapping[str, str]) -> float:
-    """Return a number; NaN for an empty height."""
+    """Return the number in a column of one row; NaN for an empty height.
+
+    Raises:
+        InputError: the text is no finite number.
+    """
     text = values[title]
     if COLUMNS[title] == "z" and not text:
         return math.nan

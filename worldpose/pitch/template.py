@@ -165,6 +165,13 @@ class PitchTemplate:
     goals: dict[str, LineSpec]
     """`goal_post_{side}_{end}`, `crossbar_{side}`: visible and drawn like markings, but not painted
     on the surface."""
+    unpainted: dict[str, LineSpec]
+    """Lines on the surface without paint, such as edges of mowing stripes: `stripe_{side}_{n}`."""
+    surveyed: frozenset[str] = frozenset()
+    """Names of the points with a surveyed position; the others have that of the Laws."""
+    assumed: frozenset[str] = frozenset()
+    """Those of `length`, `width`, `crown` that nobody measured: there is no surveyed point, and
+    they have the values of the standard pitch."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -184,13 +191,42 @@ class PitchTemplate:
             name: np.array([x, y, above + _ridge(y, spec.width, spec.crown)])
             for name, (x, y, above) in law_points(spec.length, spec.width).items()
         }
-        points.update({name: np.array(place) for name, place in spec.points.items()})
+        stripes = _stripe_edges(spec)
+        given = {**stripes, **spec.points}
+        points.update(
+            {
+                name: np.array(
+                    [*place[:2], *(place[2:] or (_ridge(place[1], spec.width, spec.crown),))]
+                )
+                for name, place in given.items()
+            }
+        )
         for place in points.values():
             place.setflags(write=False)
-        lines = {**law_lines(), **spec.lines}
+        edges = {
+            near.removesuffix("_near"): LineSpec(start=near, end=far, painted=False)
+            for near, far in zip(list(stripes)[::2], list(stripes)[1::2], strict=True)
+        }
+        every = {**law_lines(), **edges, **spec.lines}
+        lines = {name: line for name, line in every.items() if line.painted}
+        unpainted = {name: line for name, line in every.items() if not line.painted}
         arcs = {**law_arcs(), **spec.arcs}
-        _check_markings(points, lines, arcs)
-        return cls(spec.length, spec.width, spec.crown, points, lines, arcs, law_goals())
+        _check_markings(points, every, arcs)
+        usual = PitchSpec()
+        sizes = ("length", "width", "crown")
+        assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
+        return cls(
+            spec.length,
+            spec.width,
+            spec.crown,
+            points,
+            lines,
+            arcs,
+            law_goals(),
+            unpainted,
+            surveyed=frozenset(spec.points),
+            assumed=frozenset(() if spec.points else assumed),
+        )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         """Return the height of the surface [m], continued beyond the touch lines.
@@ -218,7 +254,12 @@ class PitchTemplate:
 
     @property
     def marking_names(self) -> tuple[str, ...]:
-        """Names of all that can be drawn: lines, arcs, and the goals' posts and crossbars."""
+        """Names of all that can be drawn: lines, arcs, goals' posts and crossbars, stripes."""
+        return (*self.white_names, *self.unpainted)
+
+    @property
+    def white_names(self) -> tuple[str, ...]:
+        """Names of what is white: painted lines, arcs, and the goals' posts and crossbars."""
         return (*self.lines, *self.arcs, *self.goals)
 
     def marking_points(self, name: str, spacing: float) -> NDArray[np.float64]:
@@ -231,8 +272,8 @@ class PitchTemplate:
         Raises:
             InputError: the name is unknown.
         """
-        if name in self.lines:
-            return self._line_points(self.lines[name], spacing)
+        if name in self.lines or name in self.unpainted:
+            return self._line_points({**self.lines, **self.unpainted}[name], spacing)
         if name in self.arcs:
             points = self._arc_points(self.arcs[name], spacing)
             span = self.arcs[name].end_angle - self.arcs[name].start_angle
@@ -315,6 +356,24 @@ def _ridge(
 def _steps(extent: float, spacing: float) -> int:
     # Rounding errors of the extent must not add a step.
     return max(1, math.ceil(extent / spacing - 1e-9))
+
+
+def _stripe_edges(spec: PitchSpec) -> dict[str, tuple[float, float]]:
+    """Return x, y [m] of the near and the far end of every stripe's edge, in turn, by name."""
+    if spec.stripes is None:
+        return {}
+    spacing = spec.stripes.spacing
+    first = spec.stripes.first or spacing
+    count = math.ceil((0.5 * spec.length - first) / spacing - 1e-6)
+    return {
+        f"stripe_{side}_{n + 1}_{end}": (
+            sign * (0.5 * spec.length - first - n * spacing),
+            0.5 * across * spec.width,
+        )
+        for side, sign in SIDES.items()
+        for n in range(count)
+        for end, across in ENDS.items()
+    }
 
 
 def _check_size(spec: PitchSpec) -> None:

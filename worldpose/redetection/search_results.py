@@ -329,7 +329,7 @@ def _compare_with_bodies(
     suspects = TriangulatedDetections(
         keypoints=results.keypoints[:, None, None],
         confidence=results.confidence[:, None, None],
-        index=np.zeros((count, 1, 1), dtype=np.int64),
+        detection_index=np.zeros((count, 1, 1), dtype=np.int64),
         offsets=np.zeros((count, 1, 1, 2)),
         exchanged=np.zeros((count, 1, 1, 3), dtype=np.bool_),
         dropped=np.zeros((count, 1, 1), dtype=np.bool_),

@@ -72,7 +72,7 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
                 stale.append((correction, reason))
             continue
         if not isinstance(edit, MovedPoint | RedrawnMarking):
-            stale.append((correction, f"nothing takes in a {edit.kind} yet"))
+            stale.append((correction, f"no stage applies a correction of kind {edit.kind}"))
             continue
         reason = _objection(folder, template, pictures, edit)
         if reason is None:

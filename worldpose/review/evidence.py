@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.cameras import LensCalibration
 from data_contracts.review import Acceptance
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.geometry import Camera, Rays, intersect_rays
@@ -148,6 +149,8 @@ APART: Final = 12.0
 pixel in a lens that bends a line by 10 px over 400."""
 HALVINGS: Final = 8
 """Maximum number of subdivisions."""
+EDGE_HALVINGS: Final = 12
+"""Bisections to the border of the image: 12 px become 0.003 px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +206,17 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
         middle = (along[halved] + along[halved + 1]) / 2
         along = np.insert(along, halved + 1, middle)
         places = np.insert(places, halved + 1, project_along(middle), axis=0)
+    # The last point within the image, found by bisection: else a curve ends up to 12 px too early.
+    inside = _is_inside(places, target)
+    edges = np.flatnonzero(inside[1:] != inside[:-1])
+    inner = np.where(inside[edges], along[edges], along[edges + 1])
+    outer = np.where(inside[edges], along[edges + 1], along[edges])
+    for _ in range(EDGE_HALVINGS):
+        middle = (inner + outer) / 2
+        is_seen = _is_inside(project_along(middle), target)
+        inner, outer = np.where(is_seen, middle, inner), np.where(is_seen, outer, middle)
+    moved = ~np.isin(inner, along)
+    places = np.insert(places, edges[moved] + 1, project_along(inner[moved]), axis=0)
     inside = _is_inside(places, target)
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
     runs = [places[begin:end] for begin, end in zip(bounds[::2], bounds[1::2], strict=True)]
@@ -340,6 +354,7 @@ def preview(
     *,
     picture: NDArray[np.uint8] | None = None,
     settings: StaticCalibrationSettings = StaticCalibrationSettings(),  # noqa: B008
+    lens: LensCalibration | None = None,
 ) -> Preview:
     """Return the camera from the current clicks, and the projected pitch.
 
@@ -350,12 +365,19 @@ def preview(
         picture: (height, width, 3); if given, the calibration refines the camera on the painted
             lines, which takes seconds and not milliseconds.
         settings: as for the stage `static_calibration`.
+        lens: the given lens of a static camera, if there is one.
 
     Raises:
         InputError: the clicks do not determine a camera; the message says which clicks to add.
     """
     found = calibrate_camera(
-        drawing.template, clicked, image_size, picture=picture, settings=settings, where="so far"
+        drawing.template,
+        clicked,
+        image_size,
+        picture=picture,
+        settings=settings,
+        where="so far",
+        lens=lens,
     )
     camera = found.estimate.camera
     return Preview(

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.cameras import LensCalibration
 from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration.descent import Measurements, Solutions, descend
 from worldpose.static_calibration.evidence import Evidence, count_neighbors
@@ -30,13 +31,14 @@ class Problem:
     Attributes:
         evidence: clicks and drawn markings.
         image_size: width, height [px].
-        prior: (19,), see `prior_residuals`.
+        prior: (21,), see `prior_residuals`.
         free: (12,) parameters to solve for.
         click_noise: standard deviation of each click (n,), each axis [px].
         drawn_noise: standard deviation of each drawn pixel (d,), across its marking [px]: larger
             where other pixels are close, so that a marking counts by its length.
         drawn_loss: Cauchy scale of drawn points [standard deviations].
         where: file or camera, for messages.
+        lens: the given lens that `prior` contains; None = none is known.
     """
 
     evidence: Evidence
@@ -47,6 +49,7 @@ class Problem:
     drawn_noise: NDArray[np.float64]
     drawn_loss: float
     where: str = "clicked markings"
+    lens: LensCalibration | None = None
 
     @property
     def half_diagonal(self) -> float:
@@ -104,6 +107,7 @@ def build_problem(
     settings: StaticCalibrationSettings,
     distortion: str | None = None,
     where: str = "clicked markings",
+    lens: LensCalibration | None = None,
 ) -> Problem:
     """Return the fit problem of evidence and settings.
 
@@ -113,6 +117,7 @@ def build_problem(
         settings: noise, prior, free coefficients.
         distortion: radial coefficients to solve for, if not those of the settings.
         where: file or camera, for messages.
+        lens: replaces the prior of focal length, principal point and distortion.
     """
     width, height = image_size
     known = settings.prior
@@ -125,7 +130,14 @@ def build_problem(
     prior += [known.k1_std, known.k2_std, known.k3_std]
     prior += [np.log(known.height_m), known.log_height_std]
     prior += [np.log(known.distance_m), known.log_distance_std, known.roll_std_rad, _MIN_HEIGHT]
-    prior += [*known.lens_std, known.k1]
+    prior += [*known.lens_std, known.k1, 0.0, 0.0]
+    if lens is not None:
+        reach = (0.5 * np.hypot(width, height) / lens.focal_px) ** 2
+        k1, k2, _, _, k3 = lens.distortion
+        prior[:2] = [np.log(lens.focal_px), lens.focal_std_px / lens.focal_px]
+        prior[2:5] = [*lens.principal_point_px, lens.principal_point_std_px]
+        prior[6:9] = [lens.distortion_std] * 3
+        prior[15:] = [0.0, 0.0, 0.0, k1 * reach, k2 * reach**2, k3 * reach**3]
     return Problem(
         evidence=evidence,
         image_size=image_size,
@@ -136,6 +148,7 @@ def build_problem(
         * np.sqrt(count_neighbors(evidence, settings.drawn_correlation_px)),
         drawn_loss=settings.drawn_loss_scale,
         where=where,
+        lens=lens,
     )
 
 
@@ -155,8 +168,11 @@ def adjust(
         iterations: at most; 0 only evaluates the starts.
     """
     count, evidence = len(rows), problem.evidence
+    starts = rows.copy()
+    if problem.lens is not None:
+        starts[:, 6:8] = problem.lens.distortion[2:4]  # tangential terms, which no fit changes
     found = Solutions(
-        rows=rows.copy(),
+        rows=starts,
         cost=np.empty(count),
         information=np.empty((count, SIZE, SIZE)),
         observed=np.empty((count, SIZE, SIZE)),

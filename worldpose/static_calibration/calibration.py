@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
@@ -93,6 +94,7 @@ def calibrate_camera(
     picture: NDArray[np.uint8] | None = None,
     settings: StaticCalibrationSettings | None = None,
     where: str = "clicked markings",
+    lens: LensCalibration | None = None,
 ) -> StaticCalibration:
     """Return the camera of an image, its covariance and its report.
 
@@ -108,6 +110,8 @@ def calibrate_camera(
         picture: (height, width) or (height, width, 3); without it there is no stage 3.
         settings: noise, prior and thresholds; the defaults if None.
         where: file or camera, for messages.
+        lens: a lens that was calibrated before, the prior of focal length, principal point and
+            distortion; its k1, k2 and k3 are then all solved for. None = not known.
 
     Raises:
         InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
@@ -118,9 +122,11 @@ def calibrate_camera(
         C1-C5; paper section "Static Camera Calibration".
     """
     stated = settings or StaticCalibrationSettings()
+    if lens is not None:
+        stated = stated.model_copy(update={"distortion": "k1_k2_k3"})
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
-    problem = build_problem(evidence, image_size, stated, where=where)
+    problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
     found = fit_inliers_at_best_noise(problem, find_start(problem, stated), stated)
     found = _find_explanation(found, pitch, stated)
     check_determined(found, pitch)

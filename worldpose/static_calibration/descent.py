@@ -31,7 +31,7 @@ class Measurements(NamedTuple):
         bounds: (m + 1,) first sample of each marking, and the end.
         drawn_image: (d, 2) drawn pixels [px].
         drawn_marking: (d,) index of the marking of each.
-        prior: (19,), see `prior_residuals`.
+        prior: (21,), see `prior_residuals`.
         free: (12,) parameters to solve for.
         click_noise: (n,) standard deviations, each axis [px].
         drawn_noise: (d,) standard deviations across the marking [px].

@@ -129,7 +129,9 @@ def gather_evidence(
         bounds=np.cumsum([0, *(len(part) for part in samples)]),
         drawn_image=np.array([xy for drawn in pixels.values() for xy in drawn]).reshape(-1, 2),
         drawn_marking=np.repeat(np.arange(len(pixels)), counts),
-        straight=np.array([name in pitch.lines for name in pixels], dtype=np.bool_),
+        straight=np.array(
+            [name in pitch.lines or name in pitch.unpainted for name in pixels], dtype=np.bool_
+        ),
     )
 
 

@@ -252,7 +252,7 @@ class WhiteStructures:
 
 def white_structures(pitch: PitchTemplate) -> WhiteStructures:
     """Return the polylines of a template's markings and goals."""
-    parts = [pitch.marking_points(name, _STEP) for name in pitch.marking_names]
+    parts = [pitch.marking_points(name, _STEP) for name in pitch.white_names]
     return WhiteStructures(
         np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     )

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.cameras import LensCalibration
 from worldpose.geometry import Camera, RayStatus
 from worldpose.geometry.cameras import camera_arrays
 from worldpose.pitch import PitchTemplate
@@ -131,6 +132,10 @@ _TRUSTED: Final = 4.0
 """Maximum mean loss per observation [1] without a warning: twice the stated noise."""
 
 
+_LENS_CONTRADICTED: Final = 4.0
+"""Deviation from a given lens above which the camera needs review [standard deviations]."""
+
+
 def build_report(
     estimate: CameraEstimate,
     found: Explanation,
@@ -200,6 +205,16 @@ def build_report(
     if lines is not None:
         samples = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
         decisions = (*decisions, f"painted lines: {lines.reason or samples}")
+    off = _lens_deviations(problem.lens, estimate.camera, problem.half_diagonal)
+    if off:
+        worst = max(off, key=lambda name: off[name])
+        said = f"the given lens: the {worst} is {off[worst]:.1f} standard deviations off it"
+        decisions = (*decisions, said)
+        if off[worst] > _LENS_CONTRADICTED:
+            reasons.append(
+                f"the clicks contradict {said}. Check that it is this camera's lens at this zoom "
+                "and image size, or state larger deviations"
+            )
     misnamed = [
         _true_name(int(index), estimate, problem, pitch, settings)
         for index in np.flatnonzero(~fit.markings)
@@ -231,6 +246,29 @@ def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ..
     """Return why a camera cannot image places (n, 3) [m], world; empty strings if it can."""
     status = camera.project_with_jacobians(places).status
     return tuple(_CANNOT_IMAGE.get(RayStatus(code), "") for code in status.tolist())
+
+
+def _lens_deviations(
+    lens: LensCalibration | None, camera: Camera, half_diagonal: float
+) -> dict[str, float]:
+    """Return by how many standard deviations a camera differs from the given lens; empty if none.
+
+    Not from the prior: an assumption, such as a cropped image, may have widened it.
+    """
+    if lens is None:
+        return {}
+    focal, middle = float(camera.focal[0]), camera.principal_point - lens.principal_point_px
+    reach = (half_diagonal / focal) ** 2
+    given = (half_diagonal / lens.focal_px) ** 2
+    corner = [
+        camera.distortion[i] * reach**power - lens.distortion[i] * given**power
+        for power, i in ((1, 0), (2, 1), (3, 4))
+    ]
+    return {
+        "focal length": abs(np.log(focal / lens.focal_px)) * lens.focal_px / lens.focal_std_px,
+        "principal point": float(np.hypot(middle[0], middle[1])) / lens.principal_point_std_px,
+        "distortion": float(np.abs(corner).max()) / lens.distortion_std,
+    }
 
 
 def _distance(residual: NDArray[np.float64]) -> str:

@@ -186,9 +186,10 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
 
     Args:
         c: (22,) camera.
-        prior: (19,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
+        prior: (21,) log focal, its spread; cx, cy, their spread; half diagonal [px]; spreads of
             k1, k2, k3; log height, its spread; log distance, its spread; spread of the roll; the
-            minimum height [m]; spreads of k1, k2, k3 as coefficients; the middle of k1.
+            minimum height [m]; spreads of k1, k2, k3 as coefficients; the middles of k1, k2, k3 as
+            displacements of the corner.
         residual: (9,), written.
         jacobian: (9, 12), written.
     """
@@ -205,8 +206,7 @@ def prior_residuals(c: Floats, prior: Floats, residual: Floats, jacobian: Floats
         # The displacement of the image corner: it shrinks with the focal length.
         value = c[8] if k == 2 else c[4 + k]
         spread = np.hypot(prior[6 + k], prior[15 + k] * power)
-        middle = prior[18] if k == 0 else 0.0
-        residual[3 + k] = (value * power - middle) / spread
+        residual[3 + k] = (value * power - prior[18 + k]) / spread
         jacobian[3 + k, 9 + k] = power / spread
         # Displacement and spread both depend on the focal length.
         wide = (prior[15 + k] * power / spread) ** 2

@@ -158,10 +158,10 @@ def read_checksum(data: bytes) -> str:
 
 
 def _content_after_seal(data: bytes) -> bytes | None:
-    """Return the bytes that the checksum at the start of a document seals.
+    """Return the content of a document that begins with its checksum.
 
-    Parsing JSON, writing it again and comparing takes ten times as long. Instead the checksum is
-    cut out, and the rest must be the bytes from which `seal` computed it.
+    The function cuts the checksum out of the text; the remaining bytes must be those from which
+    `seal` computed it. Parsing the JSON and writing it again would take ten times as long.
 
     Returns:
         None if another key comes before the checksum, or the rest does not match the checksum.

@@ -11,7 +11,7 @@ from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
 from worldpose.store.blobs import Entry, read_published
-from worldpose.store.documents import record_checksum, unseal
+from worldpose.store.documents import read_checksum, unseal
 from worldpose.store.paths import DAMAGED, MANIFEST, PROJECT, ResultId, damaged_path, is_name
 from worldpose.store.runs import is_run_file
 from worldpose.store.store import Store
@@ -19,6 +19,10 @@ from worldpose.store.writer import content_digest
 
 Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""
+
+SealedEntry = tuple[JournalEntry, str]
+"""A journal entry, and the checksum in its document. A version of worldpose that had fewer fields
+sealed other bytes than those of the record as it is now."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ def verify(
         done += sum(entry.size for entry in entries.values())
         if progress:
             progress(done, total)
-    journals: dict[str, list[JournalEntry]] = {}
+    journals: dict[str, list[SealedEntry]] = {}
     published = {result for result, entries in groups.items() if result.manifest_path in entries}
     if match_id is None:
         findings.extend(_check_document(store, PROJECT, published, journals))
@@ -138,7 +142,7 @@ def _check_result(
 
 
 def _check_document(
-    store: Store, path: str, published: set[ResultId], journals: dict[str, list[JournalEntry]]
+    store: Store, path: str, published: set[ResultId], journals: dict[str, list[SealedEntry]]
 ) -> Iterator[Finding]:
     where, parts = f"{store.url}/{path}", path.split("/")
     is_record = False
@@ -173,7 +177,7 @@ def _check_document(
             case ["reviews", match_id, name] if name.endswith(".json"):
                 entry = unseal(JournalEntry, data, where)
                 fits = (match_id, name) == (entry.match_id, f"{entry.number:06d}.json")
-                journals.setdefault(match_id, []).append(entry)
+                journals.setdefault(match_id, []).append((entry, read_checksum(data)))
             case ["pins", match_id, name] if _is_json(name):
                 is_record = True
                 pin = unseal(Pin, data, where)
@@ -194,14 +198,14 @@ def _is_json(name: str) -> bool:
     return name.endswith(".json") and is_name(name)
 
 
-def _check_chain(entries: list[JournalEntry]) -> Iterator[Finding]:
+def _check_chain(entries: list[SealedEntry]) -> Iterator[Finding]:
     """Yield journal entries whose predecessor is missing or damaged."""
     tip = None
-    for entry in sorted(entries, key=lambda entry: entry.number):
+    for entry, checksum in sorted(entries, key=lambda sealed: sealed[0].number):
         if entry.previous != tip:
             path = f"reviews/{entry.match_id}/{entry.number:06d}.json"
             yield Finding(path, "its previous entry is missing or damaged")
-        tip = record_checksum(entry)
+        tip = checksum
 
 
 def _check_named_results(

@@ -367,7 +367,10 @@ class Run(Mapping[str, "xr.Dataset"]):
                 f"run {self.record.run_id} of match {self.record.match_id}: {name}",
                 expected="a result of this version of worldpose",
                 found=f"a result of an earlier version, without {', '.join(absent)}",
-                todo=f"Recompute it: worldpose run {self.record.match_id}.",
+                todo=(
+                    f"Compute a new run: worldpose run {self.record.match_id}. The version that "
+                    "wrote this one exports it."
+                ),
             )
 
     def __repr__(self) -> str:

@@ -136,7 +136,7 @@ def join_costs(
     for i, old in enumerate(before):
         for j, new in enumerate(after):
             gap = (new.frame - old.frame) / fps
-            if 0.0 < gap <= settings.max_gap_s:
+            if 0.0 < gap <= settings.max_join_gap_s:
                 costs[i, j] = _join_cost(old, new, gap, area, settings)
     return costs
 

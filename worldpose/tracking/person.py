@@ -170,7 +170,12 @@ class Person:
 
 @compile_kernel
 def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Floats, bool]:
-    """Return the pose with known joints replaced and others shifted, the shift, and any known."""
+    """Update a pose with the joints of a new frame, which are NaN where unknown.
+
+    Returns:
+        The pose, in which known joints are replaced and the others shifted by the median motion of
+        the known ones; this shift (3,); whether any joint is known.
+    """
     both, known = np.empty((len(pose), 3)), False
     count = 0
     for joint in range(len(pose)):

@@ -34,7 +34,7 @@ class TrackingSettings(Record):
     """Least number of joints, seen on both sides, for a mean distance [1]."""
     birth_views: int = Field(default=3, ge=2, le=1000)
     """Cameras that must agree on a new person [1]; `pair_odds` decides about two. Two rays alone
-    also meet at ghosts."""
+    also intersect where no person is."""
     pair_odds: float = Field(default=10.0, ge=1, le=1000)
     """Odds from which two views of a new person count as much as three [1]: that the rays of one
     person pass at that distance, with limbs of that size and undetected by the cameras that should
@@ -68,7 +68,8 @@ class TrackingSettings(Record):
     max_lost_s: float = Field(default=2.0, ge=0, le=1000)
     """Causal: time after which an unseen person's track ends [s]."""
     min_track_s: float = Field(default=0.2, ge=0, le=100)
-    """Tracks with less time in two or more views are ghosts and dropped [s]."""
+    """Tracks with less time in two or more views are false positives and dropped [s]. There is no
+    maximum length."""
     merge_distance_m: float = Field(default=0.2, ge=0, le=100)
     """Two tracks with mean joint distance below this are one person [m]: two bodies cannot be."""
     merge_time_s: float = Field(default=0.2, ge=1e-6, le=100)
@@ -82,7 +83,7 @@ class TrackingSettings(Record):
     tracks: assistants keep within 1.5. Not in causal mode."""
     end_time_s: float = Field(default=0.3, ge=1e-6, le=100)
     """Time over which position and velocity at either end of a track are fitted [s]."""
-    max_gap_s: float = Field(default=60.0, ge=1e-6, le=10000)
+    max_join_gap_s: float = Field(default=60.0, ge=1e-6, le=10000)
     """Longest time between two tracks of one person that are joined [s]."""
     velocity_memory_s: float = Field(default=1.0, ge=1e-6, le=100)
     """Time after which a velocity does not predict the next one [s]."""

@@ -15,8 +15,8 @@ from worldpose.triangulation.chunking import (
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
 from worldpose.triangulation.detections import ClipDetections, shift_in_time
 from worldpose.triangulation.left_right_swaps import unswap
+from worldpose.triangulation.passes import Triangulation, triangulate_joints
 from worldpose.triangulation.reports import TriangulationReport
-from worldpose.triangulation.robust import Triangulation, triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 

@@ -21,7 +21,7 @@ from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
 from worldpose.triangulation.detections import CHUNK, ClipDetections, check_shapes
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
-from worldpose.triangulation.robust import (
+from worldpose.triangulation.passes import (
     DetectorModel,
     Triangulation,
     learn_detector,
@@ -223,7 +223,7 @@ def reconstruct_joints(
         InputError: the shapes do not match.
     """
     check_shapes(cameras, detections, camera_covariance)
-    clip = ClipDetections(detections.keypoints, detections.confidence, detections.index)
+    clip = ClipDetections(detections.keypoints, detections.confidence, detections.detection_index)
     model, clip = learn_clip(cameras, clip, fps, settings, camera_covariance)
     length = len(detections.keypoints)
     (chunk,) = reconstruct_chunks(cameras, clip, model, fps, settings, camera_covariance, length)

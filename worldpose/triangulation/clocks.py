@@ -178,7 +178,7 @@ def _sum_equations(
 ) -> _Sums:
     """Return the normal equations from the residuals of an interval of frames."""
     common = shift_in_time(detections, late)
-    pixels, index = common.keypoints, common.index
+    pixels, index = common.keypoints, common.detection_index
     precision = NoiseModel.nominal(pixels.shape[-2]).precision(common.confidence)
     joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
     half = max(1, round(VELOCITY_TIME * fps))

@@ -54,7 +54,8 @@ def consensus(
 
     The first attempt uses all views. If they disagree, a Geman-McClure loss whose scale shrinks
     from the largest error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
-    1987). Without a majority, the pair of views with the smallest error over all views decides.
+    1987). Without a majority, the pair of views with the smallest error over all views decides. The
+    result is the plain least-squares point of the views within `limit`.
 
     Args:
         tiles: (cameras, ROWS x LANES); writes `USED`.

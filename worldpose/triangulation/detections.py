@@ -59,7 +59,7 @@ class ClipDetections:
         return TrackedDetections(
             np.concatenate([one.keypoints for one in each]),
             np.concatenate([one.confidence for one in each]),
-            np.concatenate([one.index for one in each]),
+            np.concatenate([one.detection_index for one in each]),
         )
 
     def have_views(self, views: int) -> Flags:
@@ -83,9 +83,9 @@ def shift_in_time(detections: TrackedDetections, late: Floats) -> TrackedDetecti
     Returns:
         Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index.
     """
-    frames, _, persons = detections.index.shape
-    at = np.maximum(detections.index, 0).astype(np.int64)[..., None]
-    there = (detections.index >= 0)[..., None]
+    frames, _, persons = detections.detection_index.shape
+    at = np.maximum(detections.detection_index, 0).astype(np.int64)[..., None]
+    there = (detections.detection_index >= 0)[..., None]
     pixels = np.take_along_axis(detections.keypoints, at[..., None], axis=2).astype(np.float64)
     weights = np.take_along_axis(detections.confidence, at, axis=2).astype(np.float64)
     weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
@@ -117,7 +117,7 @@ def check_shapes(
         InputError: they do not match.
     """
     keypoints, confidence = detections.keypoints, detections.confidence
-    detection_index = detections.index
+    detection_index = detections.detection_index
     if (
         confidence.ndim != 4
         or keypoints.shape != (*confidence.shape, 2)

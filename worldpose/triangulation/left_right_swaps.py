@@ -71,8 +71,8 @@ def undo_swaps(detections: TrackedDetections, exchanged: Flags) -> TrackedDetect
     """
     return replace(
         detections,
-        keypoints=unswap(detections.keypoints, detections.index, exchanged),
-        confidence=unswap(detections.confidence, detections.index, exchanged),
+        keypoints=unswap(detections.keypoints, detections.detection_index, exchanged),
+        confidence=unswap(detections.confidence, detections.detection_index, exchanged),
     )
 
 

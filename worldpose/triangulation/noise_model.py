@@ -94,7 +94,7 @@ def learn_noise(
         noise: stated, [px] and [m].
         limit: largest squared error of an inlier [variances].
     """
-    confidence, index = detections.confidence, detections.index
+    confidence, index = detections.confidence, detections.detection_index
     count, joints = index.shape[1], confidence.shape[-1]
     model = NoiseModel.nominal(joints)
     place = np.maximum(index, 0).astype(np.int64)[..., None]

@@ -146,7 +146,7 @@ def observe_person(
         person: index of the person.
         frames: frames to include.
     """
-    index = detections.index[frames, :, person]
+    index = detections.detection_index[frames, :, person]
     at = np.maximum(index, 0).astype(np.int64)[:, :, None, None]
     pixels = np.take_along_axis(detections.keypoints[frames], at[..., None], axis=2)[:, :, 0]
     weights = np.take_along_axis(precision[frames], at, axis=2)[:, :, 0]

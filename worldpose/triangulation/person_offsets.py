@@ -207,7 +207,7 @@ def estimate_midhip_shift(
     Returns:
         (frames, cameras, persons, 3) [px].
     """
-    index = detections.index
+    index = detections.detection_index
     middle = detections.keypoints[..., HIPS, :].mean(axis=-2, keepdims=True, dtype=np.float64)
     sure = detections.confidence[..., HIPS].min(axis=-1, keepdims=True)
     precision = NoiseModel.nominal(1).precision(sure)

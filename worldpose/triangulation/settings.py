@@ -53,7 +53,7 @@ class TriangulationSettings(Record):
     """Initial displacement of people by calibration errors [m], from which "body" learns if cameras
     have no covariance: the residual error of careful calibration from pitch markings in the middle
     of the pitch."""
-    max_gap_s: float = Field(default=0.5, ge=0, le=100)
+    max_filled_gap_s: float = Field(default=0.5, ge=0, le=100)
     """Longest time without a triangulated joint that smoothing fills [s]: a stride."""
     max_clock_error_frames: float = Field(default=0.05, ge=1e-6, le=10)
     """A camera's clock offset is determined if its standard error is below this [frame]."""

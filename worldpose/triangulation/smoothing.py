@@ -44,8 +44,8 @@ from worldpose.triangulation.observations import (
     linearize,
     observe_person,
 )
+from worldpose.triangulation.passes import Triangulation
 from worldpose.triangulation.reports import Changes, Histogram, SmoothingReport
-from worldpose.triangulation.robust import Triangulation
 from worldpose.triangulation.settings import TriangulationSettings
 
 BAND: Final = 6
@@ -459,7 +459,7 @@ def smooth_joints(
         )
         motion = learn_motion(rig, tracks, raw.joints.shape[2], fps, settings)
     penalty = (fps**2 / motion.acceleration) ** 2
-    gap = round(settings.max_gap_s * fps)
+    gap = round(settings.max_filled_gap_s * fps)
     limit = settings.max_deviation**2
     for person in range(raw.joints.shape[1]):
         track = observe_person(detections, precision, raw.offsets, raw.joints, person)

@@ -1,7 +1,7 @@
 // Clicks of a user, with undo, redo and autosave.
 //
 // Every change is an edit with what it changes (`was`). The server takes an edit in while that is
-// so still; otherwise somebody else was quicker, and the person decides whose it shall be. An edit
+// so still; otherwise another person changed it first, and the person decides whose it shall be. An edit
 // keeps its id until the server acknowledged it: sent twice, it is kept once.
 
 import { matchPath, newId, post, Refusal } from "./api.js";

@@ -108,7 +108,7 @@ def test_longer_gaps_than_the_longest_stay_empty():
     rng = np.random.default_rng(11)
     joints, covariance = seen(walker(60, rng), 0.01, rng)
     joints[20:40] = np.nan
-    settings = BodyFittingSettings(max_gap_s=0.3)
+    settings = BodyFittingSettings(max_filled_gap_s=0.3)
     fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     assert np.isnan(fit.joints[20:40]).all() and np.isfinite(fit.joints[:20]).all()
     assert not fit.filled.any()

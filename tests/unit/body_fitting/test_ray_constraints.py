@@ -73,7 +73,7 @@ def test_a_person_who_was_never_triangulated_has_no_line():
 def test_stretches_of_one_view_are_filled_better_than_by_motion_alone(length):
     hidden = slice(20, 20 + length)
     exact, joints, covariance, keypoints, index = scene(40 + length, hidden)
-    settings = BodyFittingSettings(max_gap_s=2.0)
+    settings = BodyFittingSettings(max_filled_gap_s=2.0)
     lines = find_ray_constraints(CAMERA, keypoints, index, joints)
     alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     lined = fit_bodies(
@@ -95,7 +95,7 @@ def test_stretches_of_one_view_are_filled_better_than_by_motion_alone(length):
 
 def test_who_is_seen_by_one_camera_stays_longer_than_the_longest_gap():
     _, joints, covariance, keypoints, index = scene(90, slice(15, 75))
-    settings = BodyFittingSettings(max_gap_s=0.5)
+    settings = BodyFittingSettings(max_filled_gap_s=0.5)
     lines = find_ray_constraints(CAMERA, keypoints, index, joints)
     gone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     stays = fit_bodies(

@@ -93,7 +93,9 @@ def test_the_gradient_is_the_slope_of_the_cost():
     # On nothing, one point, two points, or one twice, as arcs do.
     ends = rng.integers(-1, 4, (len(points), 2))
     shares = 0.01 * rng.uniform(0.2, 1.0, ends.shape)
-    robust = replace(points, loss=np.full(len(points), 3.0), ends=ends, shares=shares)
+    by_size = 0.01 * rng.standard_normal((len(points), 3))
+    known = {"ends": ends, "shares": shares, "by_size": by_size}
+    robust = replace(points, loss=np.full(len(points), 3.0), **known)
     problem = Problem(
         robust,
         flow,
@@ -103,7 +105,7 @@ def test_the_gradient_is_the_slope_of_the_cost():
         2.0,
     )
     camera = true.take_step(1e-4 * rng.standard_normal((6, 7)), [0.02, -0.01, 0.03, 0.5, -0.4])
-    beside = 0.3 * rng.standard_normal((len(problem.painted), 3))
+    beside = 0.3 * rng.standard_normal((problem.paint_count, 3))
     here = equations_at(camera, beside, problem)
     step, shared = rng.standard_normal((6, 7)), rng.standard_normal(5)
     paint = rng.standard_normal(beside.shape)

@@ -9,8 +9,11 @@ from worldpose.broadcast_calibration import (
     drawn_to,
     estimate_feed_offset,
     pool_centers,
+    static_covariance,
 )
+from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
+from worldpose.static_calibration.parameters import project_with_jacobian
 
 FRAMES, FPS = 120, 50.0
 SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
@@ -163,3 +166,20 @@ def test_how_well_the_offset_is_known_follows_from_how_its_cost_bends(
     assert found.determined == (error < 0.5)
     if found.determined:
         assert found.frames == pytest.approx(1.25)
+
+
+def test_a_moving_cameras_covariance_is_that_of_static_cameras_with_the_same_pixels():
+    camera = clip.moving(frames=2)
+    rng = np.random.default_rng(3)
+    spread = rng.standard_normal((12, 12)) * 1e-3
+    known = Uncertainty(np.broadcast_to(spread @ spread.T, (2, 12, 12)))
+    places = np.array([[3.0, -10.0, 0.1], [-8.0, 5.0, 0.0]])
+    rows, pixel = np.empty((2, 12)), np.empty(2)
+    for frame, covariance in enumerate(static_covariance(camera, known)):
+        _, jacobian = project_with_jacobian(camera.camera[frame], places)
+        for place, row in zip(places, jacobian, strict=True):
+            lens = camera.lens(frame)
+            point_row(camera.rotation[frame], camera.center, lens, place, pixel, rows)
+            np.testing.assert_allclose(
+                row @ covariance @ row.T, rows @ known.frame[frame] @ rows.T, rtol=1e-6
+            )

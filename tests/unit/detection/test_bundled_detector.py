@@ -1,9 +1,11 @@
-"""The detector finds people close together in an enlarged view, in frame coordinates."""
+"""The detector finds small people and people close together in enlarged parts of a frame."""
 
 import numpy as np
 
-from worldpose.detection.bundled_detector import find_groups
+from worldpose.detection.enlargement import expect_small, find_groups, find_small
 from worldpose.detection.interfaces import People
+from worldpose.geometry import Camera, Rigid
+from worldpose.pitch import PitchTemplate
 
 SHAPE = (1080, 1920, 3)
 
@@ -46,3 +48,64 @@ def test_a_box_seen_from_nearer_lies_where_it_is_in_the_picture():
     np.testing.assert_allclose(back.boxes, [[34.5, 39.5, 54.5, 89.5]], atol=0.3)
     # People outside of the group, or of another size, come from the view of the whole frame.
     assert len(group.to_frame(people((0.0, 0.0, 400.0, 500.0), (5.0, 5.0, 9.0, 9.0))).scores) == 0
+
+
+def test_small_people_are_seen_in_enlarged_tiles_and_tall_ones_are_not():
+    small = [(x, 500.0, x + 10.0, 520.0) for x in np.arange(100.0, 1900.0, 100.0)]
+    step = (36.0, 2.0)
+    tiles = find_small(people(*small), SHAPE, step)
+    assert len(tiles) == 4  # 1782 px and a margin on both sides, enlarged, in tiles of 1024 px
+    for box in small:
+        # Each person's centre lies in one tile, whose crop shows the person whole.
+        (tile,) = [t for t in tiles if len(t.merge(people(), seen(t, box)).scores)]
+        assert np.all(np.array(tile.corner) < box[:2]) and np.all(np.array(tile.end) > box[2:])
+        np.testing.assert_allclose(tile.to_frame(seen(tile, box)).boxes, [box], atol=1e-9)
+    tall = [(x, 400.0, x + 20.0, 440.0) for x in np.arange(100.0, 1900.0, 50.0)]
+    assert find_small(people(*small, *tall), SHAPE, step) == []
+    # Where nobody is sure, everybody tells the size.
+    assert find_small(people(*small, score=0.1), SHAPE, step)
+    assert find_small(people(), SHAPE, step) == []
+
+
+def seen(part, *boxes):
+    """Boxes of the frame as found in the crop of a part."""
+    shift = np.tile(np.array(part.corner), 2)
+    return people(*((np.array(boxes) - shift + 0.5) * part.zoom - 0.5))
+
+
+def test_an_enlarged_tile_replaces_small_people_and_keeps_tall_ones():
+    (tile,) = find_small(people((300.0, 300.0, 310.0, 320.0)), SHAPE, (36.0, 2.0))
+    small, moved = (300.0, 300.0, 310.0, 320.0), (301.0, 300.0, 311.0, 321.0)
+    tall, other = (295.0, 280.0, 320.0, 340.0), (900.0, 300.0, 910.0, 320.0)
+    merged = tile.merge(people(small, tall, other), seen(tile, moved, tall))
+    # The tile is no judge of tall people, nor of anybody outside of it.
+    np.testing.assert_allclose(merged.boxes, [tall, other, moved], atol=1e-9)
+
+
+def test_a_calibrated_camera_tells_where_people_are_small():
+    def looking(focal):
+        center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
+        forward = (target - center) / np.linalg.norm(target - center)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+        return Camera(
+            focal=np.full(2, focal),
+            principal_point=np.array([959.5, 539.5]),
+            distortion=np.zeros(5),
+            cam_from_world=Rigid(rotation, -rotation @ center),
+            image_size=np.array([1920, 1080]),
+        )
+
+    pitch = PitchTemplate.standard()
+    assert expect_small(looking(4000.0), pitch, 2.5) == []
+    assert {tile.zoom for tile in expect_small(looking(1000.0), pitch, 2.5)} == {2.0, 3.0}
+    camera = looking(1250.0)
+    tiles = expect_small(camera, pitch, 2.5)
+    assert {tile.zoom for tile in tiles} == {2.0}
+    for y, wanted in ((33.0, True), (-33.0, False)):  # 20 and 48 px
+        (feet, head) = camera.project(np.array([[5.0, y, 0.0], [5.0, y, 1.8]]))
+        middle = 0.5 * (feet + head)
+        box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
+        found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
+        assert found == wanted

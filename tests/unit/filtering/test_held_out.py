@@ -20,13 +20,13 @@ def scene():
 def measured(scene, index=None, used=None):
     suspects = scene.suspects
     keypoints, confidence = (suspects.keypoints, suspects.confidence) if used is None else used
-    index = suspects.index if index is None else index
+    index = suspects.detection_index if index is None else index
     detections = TrackedDetections(keypoints, confidence, index.astype(np.int16))
     return measure_held_out(scene.cameras, detections, suspects.keypoints, SETTINGS)
 
 
 def test_people_who_are_not_followed_make_it_worse_though_nothing_contradicts_them(scene):
-    index = scene.suspects.index.copy()
+    index = scene.suspects.detection_index.copy()
     index[:, :, 0] = -1
     whole, fewer = measured(scene), measured(scene, index)
     assert fewer.keypoints == whole.keypoints
@@ -45,19 +45,21 @@ def test_people_placed_from_planted_keypoints_are_foreseen_worse_than_without_th
 
 
 def test_what_nobody_foresees_counts_as_the_farthest(scene):
-    nobody = np.full_like(scene.suspects.index, -1)
+    nobody = np.full_like(scene.suspects.detection_index, -1)
     assert measured(scene, nobody).error == pytest.approx(FARTHEST)
 
 
 def test_without_keypoints_there_is_nothing_to_foresee(scene):
     nothing = np.full_like(scene.suspects.keypoints, np.nan)
-    index = scene.suspects.index.astype(np.int16)
+    index = scene.suspects.detection_index.astype(np.int16)
     used = TrackedDetections(nothing, nothing[..., 0], index)
     assert measure_held_out(scene.cameras, used, nothing, SETTINGS) is None
 
 
 def test_a_clip_without_anybody_is_as_badly_foreseen_as_can_be(scene):
-    assert measured(scene, scene.suspects.index[:, :, :0]).error == pytest.approx(FARTHEST)
+    assert measured(scene, scene.suspects.detection_index[:, :, :0]).error == pytest.approx(
+        FARTHEST
+    )
 
 
 @pytest.mark.parametrize(("count", "least", "judges"), [(2, 2, False), (3, 2, True), (3, 3, False)])
@@ -68,7 +70,7 @@ def test_left_out_cameras_judge_only_where_enough_others_are_left(scene, count, 
         TrackedDetections(
             suspects.keypoints[:, some],
             suspects.confidence[:, some],
-            suspects.index[:, some].astype(np.int16),
+            suspects.detection_index[:, some].astype(np.int16),
         ),
         suspects.keypoints[:, some],
         TriangulationSettings(min_views=least),

@@ -41,22 +41,22 @@ def test_everybody_fits_the_body_that_is_his(scene):
 
 def test_a_box_that_nobody_claims_is_given_to_the_body_that_it_fits(scene):
     frame, camera, person = 3, 1, 2
-    index = scene.suspects.index.copy()
+    index = scene.suspects.detection_index.copy()
     place = index[frame, camera, person]
     assert place >= 0
     index[frame, camera, person] = -1
-    found = judged(scene, index=index)
+    found = judged(scene, detection_index=index)
     assert found.fits[frame, camera, place] == person
     assert not found.dropped[frame, camera, place]
 
 
 def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
-    index = scene.suspects.index.copy()
+    index = scene.suspects.detection_index.copy()
     frame, camera = 5, 0
     first, second = np.flatnonzero(index[frame, camera] >= 0)[:2]
     places = index[frame, camera, [first, second]]
     index[frame, camera, [first, second]] = places[::-1]
-    found = judged(scene, index=index)
+    found = judged(scene, detection_index=index)
     assert found.fits[frame, camera, places].tolist() == [first, second]
     assert not found.dropped[frame, camera, places].any()
     assert found.rejected[frame, camera, places].mean() < 0.3
@@ -65,7 +65,7 @@ def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
 def test_a_box_that_fits_nobody_is_dropped_whole(scene):
     keypoints = scene.suspects.keypoints.copy()
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.index[frame, camera, person]
+    place = scene.suspects.detection_index[frame, camera, person]
     keypoints[frame, camera, place, :, 0] += 400.0
     found = judged(scene, keypoints=keypoints)
     assert found.dropped[frame, camera, place]
@@ -76,21 +76,21 @@ def test_a_box_that_fits_nobody_is_dropped_whole(scene):
 
 def test_a_dropped_box_that_nobody_claims_any_more_stays_dropped_until_it_fits(scene):
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.index[frame, camera, person]
+    place = scene.suspects.detection_index[frame, camera, person]
     before = np.zeros_like(scene.suspects.dropped)
     before[frame, camera, place] = True
     assert not judged(scene, dropped=before).dropped[frame, camera, place]
-    keypoints, index = scene.suspects.keypoints.copy(), scene.suspects.index.copy()
+    keypoints, index = scene.suspects.keypoints.copy(), scene.suspects.detection_index.copy()
     keypoints[frame, camera, place, :, 0] += 400.0
     index[frame, camera, person] = -1
-    unclaimed = {"keypoints": keypoints, "index": index}
+    unclaimed = {"keypoints": keypoints, "detection_index": index}
     assert judged(scene, dropped=before, **unclaimed).dropped[frame, camera, place]
     assert not judged(scene, **unclaimed).dropped[frame, camera, place]
 
 
 def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.index[frame, camera, person]
+    place = scene.suspects.detection_index[frame, camera, person]
     keypoints = scene.suspects.keypoints.copy()
     own = keypoints[frame, camera, place]
     keypoints[frame, camera, place] = 2.0 * np.nanmean(own, axis=0) - own
@@ -101,7 +101,7 @@ def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
 
 def test_sides_that_were_put_right_are_no_contradiction(scene):
     frame, camera, person = 6, 3, 0
-    place = scene.suspects.index[frame, camera, person]
+    place = scene.suspects.detection_index[frame, camera, person]
     honest = judged(scene).mahalanobis_distance[frame, camera, place]
     left_right = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
     keypoints, confidence = scene.suspects.keypoints.copy(), scene.suspects.confidence.copy()
@@ -131,9 +131,9 @@ def test_a_person_without_a_body_is_not_judged(scene):
 
 
 def test_nothing_to_judge_is_no_error(scene):
-    index = np.full_like(scene.suspects.index, -1)
+    index = np.full_like(scene.suspects.detection_index, -1)
     keypoints = np.full_like(scene.suspects.keypoints, np.nan)
-    found = judged(scene, index=index, keypoints=keypoints)
+    found = judged(scene, detection_index=index, keypoints=keypoints)
     assert not found.rejected.any()
     assert (found.fits == -1).all()
 
@@ -142,7 +142,7 @@ def test_without_anybody_boxes_are_nobody_s_and_none_is_rejected(scene):
     suspects = scene.suspects
     nobody = replace(
         suspects,
-        index=suspects.index[:, :, :0],
+        detection_index=suspects.detection_index[:, :, :0],
         offsets=suspects.offsets[:, :, :0],
         exchanged=suspects.exchanged[:, :, :0],
     )

@@ -130,10 +130,10 @@ def with_a_late_camera(scene, frames, held):
     """
     motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
     late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
-    at = np.nonzero(scene.suspects.index >= 0)
+    at = np.nonzero(scene.suspects.detection_index >= 0)
     keypoints = scene.suspects.keypoints.copy()
     shift = late[:, None, None, None] * motion.image_motion
-    keypoints[(*at[:2], scene.suspects.index[at])] += shift[at]
+    keypoints[(*at[:2], scene.suspects.detection_index[at])] += shift[at]
     offsets = held * np.nan_to_num(shift.mean(axis=-2))
     suspects = replace(scene.suspects, keypoints=keypoints, offsets=offsets)
     return SystematicErrors(ViewBias.none(), late), motion, suspects
@@ -150,8 +150,8 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     right = suspects.subtract(systematic.shift(motion, scene.views))
     exact = replace(systematic, late=np.zeros(6)).shift(motion, scene.views)
     on_time = scene.suspects.subtract(exact).keypoints
-    at = np.nonzero(scene.suspects.index >= 0)
-    place = (*at[:2], scene.suspects.index[at])
+    at = np.nonzero(scene.suspects.detection_index >= 0)
+    place = (*at[:2], scene.suspects.detection_index[at])
     here = at[1] == 1
     honest = ~scene.displaced[place][here]
 
@@ -193,14 +193,14 @@ def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, shar
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
     suspects = scene.suspects
-    frame, camera, person = np.argwhere(suspects.index >= 0)[0]
+    frame, camera, person = np.argwhere(suspects.detection_index >= 0)[0]
     exchanged = suspects.exchanged.copy()
     exchanged[frame, camera, person, 2] = True  # the legs
     suspects = replace(suspects, exchanged=exchanged)
-    shift = np.full((*suspects.index.shape, 17, 2), np.nan)
+    shift = np.full((*suspects.detection_index.shape, 17, 2), np.nan)
     shift[frame, camera, person] = np.arange(34.0).reshape(17, 2)
     found = suspects.assign_to_detections(shift)
-    own = found[frame, camera, suspects.index[frame, camera, person]]
+    own = found[frame, camera, suspects.detection_index[frame, camera, person]]
     left, right = COCO17.index("left_hip"), COCO17.index("right_hip")
     np.testing.assert_array_equal(own[left], [2.0 * right, 2.0 * right + 1.0])
     assert np.count_nonzero(found.any(axis=(-1, -2))) == 1

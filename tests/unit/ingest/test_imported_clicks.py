@@ -8,6 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 
+from flows.review.repeated_clicks import explain_repeated
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
 from worldpose.ingest import import_clicks
@@ -138,7 +139,10 @@ def test_a_label_clicked_twice_gives_two_points_at_one_place(tmp_path):
     folder = match(tmp_path / "m")
     clicks = [*CLICKS.items(), ("halfway_far", (10.0, 20.0))]
     report = import_clicks(cvat(tmp_path / "c.xml", clicks), folder)
-    assert report.repeated == [("east.png", "halfway_far")]
+    (repeated,) = report.repeated
+    assert (repeated.owner, repeated.image, repeated.label) == ("east", "east.png", "halfway_far")
+    assert repeated.names == ("halfway_far", "halfway_far.again")
+    assert repeated.pixels == (CLICKS["halfway_far"], (10.0, 20.0))
     assert clicked(folder)[0]["halfway_far.again"] == (10.0, 20.0)
     assert report.own_points == {"halfway_far.again": (0.0, 34.0, -0.2)}
 
@@ -210,7 +214,7 @@ REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair")
 def test_real_cvat_clicks_with_places_become_a_match(tmp_path):
-    folder = match(tmp_path / "m")
+    folder = match(tmp_path / "m", pitch={"crown": 0.1, "stripes": {"spacing": 5.5}})
     text = (folder / "match.yaml").read_text().replace("1920", "3072").replace("1080", "1728")
     (folder / "match.yaml").write_text(text)
     east = import_clicks(REAL / "left_keypoints.xml", folder, "east")
@@ -218,5 +222,15 @@ def test_real_cvat_clicks_with_places_become_a_match(tmp_path):
     assert east.clicks | west.clicks == {"east": 38, "west": 39}
     assert east.mirrored and west.mirrored
     # Both are the other one's label: they were swapped with places that were clicked as well.
-    assert [label for _, label in west.repeated] == ["(105,14.84)", "(99.5,0)"]
+    assert [each.label for each in west.repeated] == ["(105,14.84)", "(99.5,0)"]
+    # The question names both pixels, the wrong one, and the place that it really shows.
+    first, second = explain_repeated(folder, REAL / "right_keypoints.xml", west.repeated)
+    assert "(1394, 795) and at (1737, 805)" in first
+    assert "the one at (1394, 795) shows" in first
+    assert "near penalty_area_right_far_front" in first
+    assert "the one at (2945, 1117) shows" in second
+    assert "near stripe_right_1_near" in second
+    assert "right_keypoints.xml" in second
+    own = read_pitch(folder, read_spec(folder)).points
+    assert not [name for name in own if name.startswith("at_") and "34.00" in name]  # all stripes
     assert {"corner_left_far", "goal_area_left_far_front"} <= clicked(folder, "east")[0].keys()

@@ -273,3 +273,38 @@ def test_unknown_names_and_spacings_are_refused(standard):
     for spacing in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="positive distance"):
             standard.sample_lines(spacing)
+
+
+def test_a_point_without_a_height_lies_on_the_crown():
+    points = {"mast": (10.0, 17.0), "board": (10.0, 17.0, 0.5)}
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=0.4, points=points))
+    assert pitch.points["mast"].tolist() == pytest.approx([10.0, 17.0, -0.1])
+    assert pitch.points["board"].tolist() == [10.0, 17.0, 0.5]
+
+
+def test_edges_of_mowing_stripes_have_names_on_either_half_and_no_paint(standard):
+    spec = PitchSpec(crown=0.1, stripes={"spacing": 5.5})
+    pitch = PitchTemplate.from_spec(spec)
+    assert len(pitch.unpainted) == 18  # nine in each half of 52.5 m
+    assert pitch.points["stripe_left_3_far"].tolist() == pytest.approx([-36.0, 34.0, -0.1])
+    assert pitch.points["stripe_right_1_near"].tolist() == pytest.approx([47.0, -34.0, -0.1])
+    line = pitch.marking_points("stripe_right_9", 1.0)
+    assert line[:, 0] == pytest.approx(3.0)
+    assert line[len(line) // 2].tolist() == pytest.approx([3.0, 0.0, 0.0])  # it follows the crown
+    # Nothing white is expected there.
+    assert pitch.white_names == standard.marking_names
+    assert pitch.sample_lines(1.0).names == standard.sample_lines(1.0).names
+    first = PitchTemplate.from_spec(PitchSpec(stripes={"spacing": 10.0, "first": 2.5}))
+    assert [float(first.points[f"stripe_left_{n}_far"][0]) for n in (1, 5)] == [-50.0, -10.0]
+    assert "stripe_left_6" not in first.unpainted  # the halfway line has its own name
+
+
+def test_a_line_of_ones_own_is_painted_unless_it_says_otherwise():
+    points = {"a": (-40.0, 0.0), "b": (40.0, 0.0)}
+    lines = {
+        "white": LineSpec(start="a", end="b"),
+        "edge": LineSpec(start="a", end="b", painted=False),
+    }
+    pitch = PitchTemplate.from_spec(PitchSpec(points=points, lines=lines))
+    assert "white" in pitch.white_names and "edge" not in pitch.white_names
+    assert {"white", "edge"} <= set(pitch.marking_names)

@@ -175,7 +175,7 @@ def added(box, nose=None):
         (moved((9.0, 9.0), (3.0, 4.0)), "was (3.0, 4.0) when"),
         (moved((9.0, 9.0), (1.0, 2.0), marking="corner_left_far"), "is not there now"),
         (moved((9.0, 9.0), None), "was not there when"),
-        (ChosenFrames(stage="bundle_adjustment", clip="clip", frames=(1,)), "nothing takes in"),
+        (ChosenFrames(stage="bundle_adjustment", clip="clip", frames=(1,)), "no stage applies"),
         (added((0, 0, 9, 9)), None),
         (added((9, 9, 0, 0)), "not a box inside the image of a"),
         (added((200, 9, 300, 30)), "not a box inside the image of a"),

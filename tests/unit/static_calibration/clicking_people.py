@@ -1,9 +1,11 @@
 """Simulated clicks in the image of a known camera."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
+from data_contracts.cameras import LensCalibration
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.pitch import PitchTemplate
@@ -12,6 +14,7 @@ from worldpose.simulation.scene import place_camera
 
 SIZE = (1920, 1080)
 PITCH = PitchTemplate.standard()
+DISTORTION = np.array([-0.30, 0.12, 0.002, -0.001, -0.02])
 
 
 def seat(index: int, seed: int = 0):
@@ -104,3 +107,27 @@ def surprise_of(estimate, truth):
     free = np.diag(estimate.covariance) > 0
     inner = estimate.covariance[np.ix_(free, free)]
     return float(step[free] @ np.linalg.solve(inner, step[free])), int(free.sum())
+
+
+def wide_camera(seed):
+    """A camera with a lens that bends its corners, off its middle, and the generator."""
+    camera, rng = seat(seed % 4, seed)
+    focal = 0.6 * camera.focal
+    middle = camera.principal_point + [25.0, -14.0]
+    return replace(camera, focal=focal, principal_point=middle, distortion=DISTORTION), rng
+
+
+def lens_of(camera, rng, focal=1.0):
+    """The lens as a board calibration with a deviation of half a per cent gives it."""
+    f = focal * float(camera.focal[0]) * (1.0 + 0.005 * rng.standard_normal())
+    x, y = camera.principal_point + 3.0 * rng.standard_normal(2)
+    return LensCalibration(
+        id="cam",
+        image_size=SIZE,
+        focal_px=f,
+        principal_point_px=(float(x), float(y)),
+        distortion=tuple(camera.distortion.tolist()),
+        focal_std_px=0.005 * f,
+        principal_point_std_px=3.0,
+        distortion_std=0.001,
+    )

@@ -4,6 +4,9 @@ import clicking_people as people
 import numpy as np
 import pytest
 
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.pitch import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 
@@ -51,3 +54,19 @@ def test_lines_do_not_overrule_clicks_that_agree_with_them(view):
     result = calibrate_camera(PITCH, clicked, SIZE, picture=picture, settings=EXACT)
     assert result.report.wrong == ()
     assert result.report.stage == "lines"
+
+
+def test_drawn_edges_of_mowing_stripes_determine_a_camera_with_few_points(view):
+    camera, _ = view
+    pitch = PitchTemplate.from_spec(PitchSpec(stripes={"spacing": 5.5}))
+    rng = np.random.default_rng(2)
+    names = [name for name in pitch.unpainted if name.startswith("stripe_left")]
+    drawn = people.draw(camera, names, rng, count=6, noise=0.5, pitch=pitch)
+    assert len(drawn) >= 4
+    points = people.click(camera, rng, count=4).clicked.points
+    alone, both = (
+        calibrate_camera(pitch, ClickedMarkings(points=points, drawn=lines), SIZE, settings=EXACT)
+        for lines in ((), drawn)
+    )
+    assert both.report.wrong == ()
+    assert median_error(both, camera) < 0.8 * median_error(alone, camera)

@@ -9,10 +9,14 @@ from typing import Any
 import pytest
 from store_samples import place, publish, run_once, sample_recipe, sample_record
 
+from data_contracts.review import ReviewDecision
 from data_contracts.run import UnitFailure
 from worldpose.errors import InputError
+from worldpose.review.journal import append, read_journal
 from worldpose.store import Store, recipe_key, verify
 from worldpose.store.documents import canonical_json, digest
+
+NOW = "2026-01-01T00:00:00Z"
 
 
 def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -> None:
@@ -70,3 +74,15 @@ def test_results_of_other_code_are_never_taken_for_ours(folder_store: Store) -> 
         other = ours.model_copy(update={part: {**getattr(ours, part), "numpy": "another"}})
         assert recipe_key(other) != recipe_key(ours)
         assert not folder_store.has(*place(other))
+
+
+def test_a_journal_of_a_version_with_fewer_fields_is_whole(folder_store: Store) -> None:
+    # An entry is sealed as its version wrote it: a field that was added since is in no checksum.
+    said = {"request": "tracking.clip.1", "verdict": "approve", "who": "Ada", "decided_at": NOW}
+    for number in (1, 2):
+        decision = ReviewDecision.model_validate({"match_id": "final", **said})
+        append(folder_store, read_journal(folder_store, "final"), [decision])
+        path = f"reviews/final/{number:06d}.json"
+        rewrite(folder_store, path, lambda fields: fields["records"][0].pop("why"))
+    assert verify(folder_store) == ()
+    assert [record.why for record in read_journal(folder_store, "final").questions] == ["", ""]

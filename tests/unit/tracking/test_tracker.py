@@ -129,7 +129,7 @@ def test_track_ends_when_a_person_is_unseen_for_longer(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 160))
     keypoints[20:140] = np.nan
     causal = SETTINGS.model_copy(update={"causal": True})
-    for setting in (causal, SETTINGS.model_copy(update={"max_gap_s": 2.0})):
+    for setting in (causal, SETTINGS.model_copy(update={"max_join_gap_s": 2.0})):
         result = track_people(ring(5), keypoints, confidence, FPS, setting)
         assert sorted(owners(result)) == [0, 0, 1, 1, 2, 2, 3, 3]
         assert result.report.losses == 4

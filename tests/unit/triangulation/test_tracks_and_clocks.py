@@ -175,7 +175,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     index[4, 1, 0] = -1
     late = np.array([0.0, 2.0, -0.5])
     shifted = shift_in_time(TrackedDetections(keypoints, confidence, index), late)
-    pixels, moved = shifted.keypoints, shifted.index
+    pixels, moved = shifted.keypoints, shifted.detection_index
     np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
     np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
     assert (moved[:2, 1] == -1).all()

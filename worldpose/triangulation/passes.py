@@ -1,4 +1,8 @@
-"""Robust weighted triangulation of every joint of every person (T3, T4)."""
+"""Triangulation of every joint of every person, in passes (T3, T4).
+
+Each pass solves all joints (`solving`, with the inliers of `consensus`) and learns from the
+residuals: noise, left-right swaps, calibration's share, offsets of people. The next pass uses it.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +135,7 @@ def triangulate_joints(
     if model is None and (
         settings.learn_noise or settings.offsets == "body" or settings.repair_limb_lengths
     ):
-        chosen = sample_frames(detections.index.shape, detections.confidence.shape[-1])
+        chosen = sample_frames(detections.detection_index.shape, detections.confidence.shape[-1])
         model = learn_detector(cameras, detections[chosen], settings, camera_covariance)
     passes = _run_passes(cameras, detections, settings, camera_covariance, model)
     solution, shift, noise = passes.solution, passes.shift, passes.model.noise[-1]
@@ -148,11 +152,11 @@ def triangulate_joints(
         reprojection_error=solution.reprojection_error,
         inliers=solution.inliers,
         exchanged=passes.exchanged,
-        offsets=shift[..., :2] if len(shift) else np.zeros((*detections.index.shape, 2)),
+        offsets=shift[..., :2] if len(shift) else np.zeros((*detections.detection_index.shape, 2)),
         calibration_covariance=lasting,
         common_bias=bias,
         noise=noise,
-        agreement=_count_agreement(passes, covariance, detections.index),
+        agreement=_count_agreement(passes, covariance, detections.detection_index),
     )
 
 
@@ -198,7 +202,8 @@ def _run_passes(
 
     def observe(shift: Floats) -> Observations:
         precision = models[-1].precision(detections.confidence)
-        return Observations.from_rig(rig, detections.keypoints, precision, detections.index, shift)
+        index = detections.detection_index
+        return Observations.from_rig(rig, detections.keypoints, precision, index, shift)
 
     def observe_in_next_pass(shift: Floats) -> Observations:
         if known is not None:
@@ -215,7 +220,7 @@ def _run_passes(
     observations = observe_in_next_pass(shift)
     solution = solve_joints(observations, settings)
     calibration = None if settings.offsets == "midhip" else camera_covariance
-    exchanged = np.zeros((*detections.index.shape, len(EXCHANGED_PARTS)), np.bool_)
+    exchanged = np.zeros((*detections.detection_index.shape, len(EXCHANGED_PARTS)), np.bool_)
     if settings.undo_swaps:
         exchanged = find_swaps(observations, settings.noise, limit, solution)
         detections = undo_swaps(detections, exchanged)

@@ -1,0 +1,211 @@
+"""Compares the camera of a real broadcast clip with lines drawn by hand.
+
+    python benchmarks/broadcast_clip.py fetch DATA
+    python benchmarks/broadcast_clip.py score DATA
+
+The clip: 51 frames of a league match from the repository of narya (MIT), squeezed to 512 x 512
+there; `fetch` gets them by git, checks the digest of the folder and restores 16:9. Key frames
+(0, 25, 50) are clicked and drawn, and further six frames drawn twice, off enlargements by eye
+(tests/real/broadcast_clip); the second drawing was made without the first. Distances are across
+the lines, in the columns of the squeezed images; `score` also prints what the camera states there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from data_contracts.arrays import Floats
+from data_contracts.broadcast_calibration import KeyFrames
+from worldpose.broadcast_calibration import (
+    BroadcastCalibration,
+    BroadcastCalibrationSettings,
+    BroadcastClip,
+    calibrate_broadcast,
+)
+from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.pitch import PitchTemplate
+from worldpose.video import open_video
+
+REPOSITORY = "https://github.com/DonsetPG/narya"
+COMMIT = "a26438e9dae091e016813f675d2f37dbcbe6c84d"
+FOLDER = "test_img"
+TREE = "28b4a46a77f33086b844a19ada649bf380d80a72"
+"""Git's digest of the folder and all its files."""
+FRAMES, FPS = 51, 25.0
+SIZE = (910, 512)
+"""Width, height of the restored images [px]."""
+SQUEEZED = 512
+"""Width of the images as published [px]."""
+DRAWN = Path(__file__).parents[1] / "tests" / "real" / "broadcast_clip"
+FIRST, SECOND = "drawn_first.json", "drawn_second.json"
+
+
+def fetch(out: Path, repository: str = REPOSITORY) -> None:
+    """Write the restored frames as `out/frames/NNN.png`.
+
+    Args:
+        out: folder to write.
+        repository: URL or folder to clone from.
+
+    Raises:
+        SystemExit: the folder's digest is another.
+    """
+    clone = out / "narya"
+    if not clone.is_dir():
+        _git("clone", "--quiet", "--no-checkout", "--filter=blob:none", repository, str(clone))
+    (row,) = _git("-C", str(clone), "ls-tree", COMMIT, FOLDER).decode().splitlines()
+    if row.split()[2] != TREE:
+        raise SystemExit(f"expected the folder {TREE}, found {row.split()[2]}")
+    (out / "frames").mkdir(exist_ok=True)
+    names = _git("-C", str(clone), "ls-tree", "-z", "--name-only", f"{COMMIT}:{FOLDER}")
+    for name in names.decode().strip("\0").split("\0"):
+        number = int(name.removesuffix(".jpg").rpartition("_")[2])
+        data = _git("-C", str(clone), "cat-file", "blob", f"{COMMIT}:{FOLDER}/{name}")
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise SystemExit(f"expected {name} to be an image, found bytes that are none")
+        wide = cv2.resize(picture, SIZE, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(out / "frames" / f"{number:03d}.png"), wide)
+
+
+def _git(*arguments: str) -> bytes:
+    return subprocess.run(["git", *arguments], check=True, stdout=subprocess.PIPE).stdout
+
+
+def write_match(data: Path, folder: Path) -> None:
+    """Write a match folder of the broadcast camera alone, with links to the frames."""
+    clicks = folder / "annotations" / "broadcast_calibration"
+    clicks.mkdir(parents=True)
+    (clicks / "goal.json").write_bytes((DRAWN / "clicks.json").read_bytes())
+    (folder / "frames").mkdir()
+    for image in sorted((data / "frames").glob("*.png")):
+        (folder / "frames" / image.name).hardlink_to(image)
+    width, height = SIZE
+    camera = {"id": "main", "kind": "broadcast", "width": width, "height": height}
+    match = {
+        "contract": 1,
+        "match_id": "broadcast-clip",
+        "fps": FPS,
+        "cameras": [{**camera, "video": "frames"}],
+        "clips": [{"id": "goal", "frame_count": FRAMES, "broadcast": "main"}],
+    }
+    (folder / "match.yaml").write_text(json.dumps(match))
+
+
+def read_drawn(name: str) -> KeyFrames:
+    """Return clicks and drawn lines of a file."""
+    return KeyFrames.model_validate_json((DRAWN / name).read_text())
+
+
+def calibrate(
+    data: Path, settings: BroadcastCalibrationSettings | None = None
+) -> BroadcastCalibration:
+    """Return the clip's camera, from its key frames."""
+    with open_video(data / "frames") as video:
+        pictures = [picture for _, picture in video.frames(grey=True)]
+    clip = BroadcastClip(read_drawn("clicks.json").key_frames, lambda: iter(pictures), FPS)
+    settings = settings or BroadcastCalibrationSettings()
+    return calibrate_broadcast(PitchTemplate.standard(), clip, settings)
+
+
+def estimated_pitch(found: BroadcastCalibration) -> PitchTemplate:
+    """Return the pitch with the size and the markings that the fit shows."""
+    spec = found.report.pitch.spec
+    return PitchTemplate.standard() if spec is None else PitchTemplate.from_spec(spec)
+
+
+def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrames) -> list[Row]:
+    """Return frame, marking, signed distance and its stated deviation of every drawn pixel.
+
+    A distance is from the projected marking to the pixel, positive below it [px of 512 columns].
+    """
+    squeeze = np.array([SQUEEZED / SIZE[0], 1.0])
+    rows = []
+    for key in drawn.key_frames:
+        camera = found.camera.camera[key.frame]
+        for marking in key.markings.drawn:
+            world = pitch.marking_points(marking.name, 0.05)
+            line = camera.project(world) * squeeze
+            for pixel in marking.xy:
+                off = np.array(pixel) * squeeze - line
+                nearest = int(np.nanargmin((off**2).sum(axis=1)))
+                ends = line[[max(0, nearest - 1), min(len(line) - 1, nearest + 1)]]
+                along = ends[1] - ends[0]
+                normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+                normal *= np.sign(normal[1])
+                covariance = _pixel_covariance(found, key.frame, world[nearest])
+                std = np.sqrt(normal * squeeze @ covariance @ (normal * squeeze))
+                rows.append((key.frame, marking.name, float(off[nearest] @ normal), float(std)))
+    return rows
+
+
+Row = tuple[int, str, float, float]
+
+
+def _pixel_covariance(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
+    """Return the covariance (2, 2) [px^2] of a place's pixel by the camera's covariance."""
+    camera, pixel, by_step = found.camera, np.empty(2), np.empty((2, 12))
+    lens = camera.lens(frame)
+    point_row(camera.rotation[frame], camera.center, lens, place, pixel, by_step)
+    return np.asarray(by_step @ found.uncertainty.frame[frame] @ by_step.T)
+
+
+def repeatability(one: list[Row], two: list[Row]) -> float:
+    """Return the deviation of one drawing of a marking in a frame [px of 512 columns]."""
+    means: list[dict[tuple[int, str], float]] = []
+    for rows in (one, two):
+        groups: dict[tuple[int, str], list[float]] = {}
+        for frame, name, off, _ in rows:
+            groups.setdefault((frame, name), []).append(off)
+        means.append({key: float(np.mean(each)) for key, each in groups.items()})
+    both = means[0].keys() & means[1].keys()
+    return float(np.sqrt(np.mean([(means[0][key] - means[1][key]) ** 2 for key in both]) / 2.0))
+
+
+def score(data: Path) -> None:
+    """Print distances of hand-drawn lines, by drawing and by marking."""
+    found = calibrate(data)
+    camera, std = found.camera, np.sqrt(np.diag(found.uncertainty.clip))
+    print("center {:.2f} {:.2f} {:.2f} m".format(*camera.center), end="")
+    print(", standard deviations {:.2f} {:.2f} {:.2f}".format(*std[:3]))
+    print("\n".join(found.report.pitch.describe))
+    print(f"expected error {np.nanmedian(found.report.reprojection_error):.2f} px of {SIZE[0]}")
+    for title, pitch in (
+        ("the Laws' markings", PitchTemplate.standard()),
+        ("the estimated markings", estimated_pitch(found)),
+    ):
+        drawings = [distances(found, pitch, read_drawn(name)) for name in (FIRST, SECOND)]
+        for rows in drawings:
+            off, stated = (np.array([row[column] for row in rows]) for column in (2, 3))
+            mean, middle, most = np.mean(abs(off)), np.median(abs(off)), np.quantile(abs(off), 0.95)
+            print(f"{title}: {len(off)} pixels, mean {mean:.2f} px, median {middle:.2f}", end="")
+            rms = np.sqrt(np.mean(off**2)), np.sqrt(np.mean(stated**2))
+            print(f", 95 % {most:.2f}, rms {rms[0]:.2f}, stated {rms[1]:.2f}")
+        for name in sorted({row[1] for row in drawings[0]}):
+            offs = [[row[2] for row in rows if row[1] == name] for rows in drawings]
+            print(f"  {name}: mean {np.mean(offs[0]):+.2f}, {np.mean(offs[1]):+.2f} px")
+    print(f"repeatability of a drawn marking {repeatability(drawings[0], drawings[1]):.2f} px")
+
+
+def main() -> None:
+    """Run one of the two commands."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("command", choices=("fetch", "score"))
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--repository", default=REPOSITORY)
+    options = parser.parse_args()
+    if options.command == "fetch":
+        options.data.mkdir(parents=True, exist_ok=True)
+        fetch(options.data, options.repository)
+    else:
+        score(options.data)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,465 @@
+"""Prints every metric on real data in one table.
+
+    python benchmarks/real.py DATA [--only NAME ...] [--json] [--frames N]
+
+DATA is a folder with any of these; what is absent is skipped:
+
+- `static_pair`: left_camera.mp4, right_camera.mp4, left_keypoints.xml, right_keypoints.xml (two
+  cameras on one mast, clicks of CVAT whose known wrong names tests/real/static_pair.py lists);
+- `panorama_people`: see panorama_people.py;
+- `shelf_dev`: see shelf.py;
+- `moving_clip`: one video of a moving broadcast camera, `key_frames.json` (clicks in the form of
+  annotations/broadcast_calibration), optionally `lines.json` (drawn lines in the same form, which
+  are scored and not fitted; without it those of the key frames are scored) and `pitch.json`;
+- `stills`: images, and one JSON file with boxes and 17 joints of people in COCO form;
+- `mvor`: see mvor.py.
+
+Left out: each click in turn, predicted by the camera of the others, with the names of the places
+that were clicked. Wrong names found and right clicks rejected: with the names as given. Feet: each
+camera alone tracks people on the pitch; per frame, mutual nearest neighbours within 2 m are
+compared, after the clock offset that makes them agree best. Errors count from 8 pairs per frame on:
+fewer people are easier. Recall and precision: boxes of the detector from its high score threshold
+on, at an IoU of 0.5. PCK: visible joints within a fifth of the torso, in the labelled boxes.
+`--frames N` takes N frames, stills, moments or left-out clicks of each part: a quick look, not a
+result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
+
+import mvor
+import panorama_people
+import shelf
+import static_pair
+from common import distances_to_polyline, run_in_process
+from scipy.spatial import KDTree
+
+from data_contracts.broadcast_calibration import KeyFrames
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.broadcast_calibration import BroadcastClip, calibrate_broadcast
+from worldpose.detection import DetectionSettings
+from worldpose.detection.models import load_pose
+from worldpose.errors import InputError, WorldposeError
+from worldpose.formats.files import read_json
+from worldpose.geometry.boxes import box_iou
+from worldpose.ingest.validation import validate_record
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import StaticCalibration, calibrate_camera
+from worldpose.store import Store
+from worldpose.tracking import TrackingSettings
+from worldpose.training.labels import PictureCache, read_labels
+from worldpose.training.metrics import score_keypoints
+from worldpose.video import index_video, open_video
+
+Metrics = dict[str, Any]
+PAIR_M = 2.0
+"""Largest distance of two cameras' positions of one person [m]."""
+WANTED_PAIRS = 8.0
+"""Least number of pairs per frame from which distances of feet are comparable."""
+MAX_OFFSET_FRAMES = 3.0
+"""Largest clock offset between the cameras of the static pair, beyond the stated one [frame]."""
+TRUE_IOU = 0.5
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi")
+
+
+def calibrate_pair(
+    places: Mapping[str, NDArray[np.float64]], pixels: Mapping[str, Sequence[float]]
+) -> StaticCalibration:
+    """Return one camera of the static pair from its clicks."""
+    points = {name: tuple(place) for name, place in places.items()}
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=static_pair.CROWN, points=points))
+    clicked = [{"name": name, "xy": pixel} for name, pixel in pixels.items()]
+    markings = ClickedMarkings.model_validate({"points": clicked})
+    return calibrate_camera(pitch, markings, static_pair.SIZE)
+
+
+def score_clicks(folder: Path, side: str, count: int | None) -> Metrics:
+    """Return the error of left-out clicks (the first `count`), and judged wrong names."""
+    places, pixels = static_pair.read_clicks(folder, side)
+    off = []
+    for name, pixel in list(pixels.items())[:count]:
+        camera = calibrate_pair(places, {n: p for n, p in pixels.items() if n != name})
+        projected = camera.estimate.camera.project(places[name][None])[0]
+        off.append(np.linalg.norm(projected - pixel))
+    said, as_given = static_pair.read_clicks(folder, side, correct_labels=False)
+    true = {tuple(pixel): places[name] for name, pixel in pixels.items()}
+    wrong = {
+        name
+        for name, pixel in as_given.items()
+        if np.linalg.norm((said[name] - true[tuple(pixel)])[:2]) > 0.5
+    }
+    rejected = {p.name for p in calibrate_pair(said, as_given).report.points if not p.inlier}
+    return {
+        "left_out_px_median": float(np.median(off)),
+        "wrong_named": len(rejected & wrong),
+        "wrong_names": len(wrong),
+        "right_accused": len(rejected - wrong),
+    }
+
+
+def track_side(folder: Path, side: str, frames: int, work: Path) -> NDArray[np.float64]:
+    """Return where one camera alone places people (frames, persons, 2) [m]; NaN where missing."""
+    match, project = work / side, work / f"{side}-project"
+    static_pair.write_static_pair(folder, match, sides=(side,), first_frame=0, frame_count=frames)
+    store = Store.create(project)
+    name, (keys,) = run_in_process(store, match, "tracking", 1, {})
+    tracks = store.open_result(name, "tracking", "clip", keys["tracking/clip"])
+    if "ground" not in tracks:
+        return np.full((frames, 0, 2), np.nan)
+    return tracks["ground"].values.astype(np.float64)
+
+
+def pair_feet(
+    first: NDArray[np.float64], second: NDArray[np.float64], offset: float
+) -> list[NDArray[np.float64]]:
+    """Return the distances of pairs [m] in each frame, the second camera's taken `offset` later."""
+    before = int(np.floor(offset))
+    found = []
+    for frame in range(len(first)):
+        if not 0 <= frame + before < len(second) - 1:
+            continue
+        share = offset - before
+        here = first[frame]
+        there = (1.0 - share) * second[frame + before] + share * second[frame + before + 1]
+        a, b = (places[np.isfinite(places[:, 0])] for places in (here, there))
+        if not len(a) or not len(b):
+            found.append(np.empty(0))
+            continue
+        distance, nearest = KDTree(b).query(a)
+        _, back = KDTree(a).query(b)
+        mutual = (back[nearest] == np.arange(len(a))) & (distance <= PAIR_M)
+        found.append(distance[mutual])
+    return found
+
+
+def score_static_pair(folder: Path, frames: int | None) -> Metrics:
+    """Return metrics of both cameras' clicks, and of the feet of people whom both see."""
+    files = [
+        f"{side}_{name}" for side in static_pair.SIDES for name in ("camera.mp4", "keypoints.xml")
+    ]
+    _require(folder, files)
+    whole = min(
+        len(index_video(folder / f"{side}_camera.mp4")) - offset
+        for side, offset in static_pair.SIDES.items()
+    )
+    count = whole if frames is None else min(frames, whole)
+    metrics: Metrics = {side: score_clicks(folder, side, frames) for side in static_pair.SIDES}
+    with tempfile.TemporaryDirectory() as temporary:
+        left, right = (
+            track_side(folder, side, count, Path(temporary)) for side in static_pair.SIDES
+        )
+    offsets = np.arange(-MAX_OFFSET_FRAMES, MAX_OFFSET_FRAMES + 0.05, 0.1)
+    by_offset = [pair_feet(left, right, float(offset)) for offset in offsets]
+    by_offset = [frames for frames in by_offset if frames]
+    best = min(by_offset, key=lambda frames: _quantile(np.concatenate(frames), 0.5, np.inf))
+    pairs = np.concatenate(best)
+    metrics["feet_m_median"] = _quantile(pairs, 0.5, math.nan)
+    metrics["feet_m_p95"] = _quantile(pairs, 0.95, math.nan)
+    metrics["people_per_frame"] = len(pairs) / len(best)
+    return metrics
+
+
+def _quantile(values: NDArray[np.float64], share: float, otherwise: float) -> float:
+    return float(np.quantile(values, share)) if len(values) else otherwise
+
+
+def score_panorama(folder: Path, frames: int | None) -> Metrics:
+    """Return AP50 of small people in a panorama."""
+    return {"ap50": panorama_people.measure(folder, DetectionSettings(), frames)["ap50"]}
+
+
+def score_shelf(folder: Path, frames: int | None) -> Metrics:
+    """Return PCP3D of joints and bodies of the Shelf sequence [%]."""
+    _require(folder, ["import/calibration.toml", "import/detections", "gt.npz", "pcp.py"])
+    with tempfile.TemporaryDirectory() as temporary:
+        given = Path(shutil.copytree(folder / "import", Path(temporary) / "import"))
+        if frames is not None:
+            _shorten_detections(given / "detections", frames)
+        joints, bodies = shelf.scores(folder, given, Path(temporary))
+    return {"joints_pcp3d_percent": joints, "bodies_pcp3d_percent": bodies}
+
+
+def _shorten_detections(folder: Path, frames: int) -> None:
+    """Keep the people of the first frames."""
+    people = {file: json.loads(file.read_text()) for file in folder.glob("*.json")}
+    first = min(person["image_id"] for each in people.values() for person in each)
+    for file, each in people.items():
+        kept = [person for person in each if person["image_id"] < first + frames]
+        file.write_text(json.dumps(kept))
+
+
+def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
+    """Return the distance of drawn lines to the projected ones, and the camera's centre."""
+    _require(folder, ["key_frames.json"])
+    videos = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in VIDEOS]
+    if len(videos) != 1:
+        raise InputError(
+            str(folder),
+            expected="one video",
+            found=", ".join(file.name for file in videos) or "none",
+            todo="Keep the video of the moving camera there, and no other.",
+        )
+    keys = _read_key_frames(folder / "key_frames.json")
+    lines = folder / "lines.json"
+    drawn = _read_key_frames(lines) if lines.exists() else keys
+    pitch = PitchTemplate.standard()
+    if (folder / "pitch.json").exists():
+        given = read_json(folder / "pitch.json")
+        pitch = PitchTemplate.from_spec(
+            validate_record(PitchSpec, given, str(folder / "pitch.json"))
+        )
+    index = index_video(videos[0])
+    count = len(index) if frames is None else min(frames, len(index))
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with open_video(videos[0], index) as video:
+            yield from (picture for _, picture in video.frames(0, count, grey=True))
+
+    clip = BroadcastClip(
+        [key for key in keys.key_frames if key.frame < count],
+        pictures,
+        index.fps,
+        where=str(folder / "key_frames.json"),
+    )
+    calibration = calibrate_broadcast(pitch, clip)
+    off = []
+    for key in drawn.key_frames:
+        if key.frame >= count:
+            continue
+        camera = calibration.camera.camera[key.frame]
+        for marking in key.markings.drawn:
+            line = camera.project(pitch.marking_points(marking.name, 0.1))
+            off.append(distances_to_polyline(np.array(marking.xy), line))
+    if not off:
+        raise InputError(
+            str(lines if lines.exists() else folder / "key_frames.json"),
+            expected="drawn lines",
+            found=f"none in the first {count} frames",
+            todo="Draw lines in some frames: `drawn` of their markings.",
+        )
+    pixels = np.concatenate(off)
+    return {
+        "lines_px_mean": float(pixels.mean()),
+        "lines_px_p95": float(np.quantile(pixels, 0.95)),
+        "stated_px": float(np.nanmedian(calibration.report.reprojection_error)),
+        "center_m": calibration.camera.center.tolist(),
+    }
+
+
+def _read_key_frames(file: Path) -> KeyFrames:
+    return validate_record(KeyFrames, read_json(file), str(file))
+
+
+def score_stills(folder: Path, frames: int | None) -> Metrics:
+    """Return recall, precision and PCK of the bundled nets on labelled stills."""
+    files = sorted(folder.glob("*.json"))
+    if len(files) != 1:
+        raise InputError(
+            str(folder),
+            expected="one JSON file with labels in COCO form",
+            found=", ".join(file.name for file in files) or "none",
+            todo="Keep the labels of all stills in one file.",
+        )
+    stills = read_labels(files[0])
+    if not (folder / stills[0].path.name).exists() and (folder / "images").is_dir():
+        stills = read_labels(files[0], folder / "images")
+    stills = stills[:frames]
+    settings = DetectionSettings()
+    hits = asked = boxes = 0
+    for found, still in zip(panorama_people.detect_people(stills, settings), stills, strict=True):
+        sure = found.boxes[found.scores >= settings.high_score_threshold]
+        true = _match(sure, still.boxes[~still.ignored])
+        stray = box_iou(sure[~true], still.boxes[still.ignored]) >= TRUE_IOU
+        hits += int(true.sum())
+        asked += int((~still.ignored).sum())
+        boxes += len(sure) - int(stray.any(axis=1).sum())
+    pck = score_keypoints(load_pose(settings), stills, PictureCache(1 << 28)).pck
+    return {
+        "recall": hits / asked if asked else math.nan,
+        "precision": hits / boxes if boxes else math.nan,
+        "pck": pck,
+    }
+
+
+def _match(boxes: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether boxes, best first, take a labelled person that no better box has taken."""
+    right, free = np.zeros(len(boxes), dtype=np.bool_), np.ones(len(true), dtype=np.bool_)
+    for row, overlap in enumerate(box_iou(boxes, true) if len(true) else ()):
+        best = int(np.where(free, overlap, -1.0).argmax())
+        if free[best] and overlap[best] >= TRUE_IOU:
+            right[row], free[best] = True, False
+    return right
+
+
+def score_mvor(folder: Path, frames: int | None) -> Metrics:
+    """Return errors and shares of people of an operating room, with three and with two views."""
+    _require(folder, ["camma_mvor_2018.json", "openpose_kps.json"])
+    cameras, moments = mvor.load_moments(folder)
+    result = mvor.measure(cameras, moments[:frames], TrackingSettings())
+    metrics: Metrics = {}
+    for name, views in (("three", 3), ("two", 2)):
+        errors, people = result["errors"][views], result["people"][views]
+        placed = result["results"][views]
+        metrics[name] = {
+            "error_cm": float(mvor.mean_error(errors).mean()),
+            "matched_percent": 100.0 * len(errors) / people if people else math.nan,
+            "false_percent": 100.0 * result["extra"][views] / placed if placed else math.nan,
+        }
+    return metrics
+
+
+def _require(folder: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if not (folder / name).exists():
+            raise InputError(
+                str(folder / name),
+                expected="this part of the data",
+                found="nothing",
+                todo=f"Complete the folder {folder.name}, or remove it to skip its metrics.",
+            )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the data.
+
+    Attributes:
+        score: returns its metrics, from its folder and the number of frames; None = all.
+        notes: the last column of the table, by metric.
+    """
+
+    score: Callable[[Path, int | None], Metrics]
+    notes: Mapping[str, str]
+
+
+PARTS: dict[str, Part] = {
+    "static_pair": Part(
+        score_static_pair,
+        {
+            "left.left_out_px_median": "leave-one-out, median",
+            "right.left_out_px_median": "leave-one-out, median",
+            "feet_m_median": "0.15 wanted",
+            "feet_m_p95": "0.5 wanted",
+            "people_per_frame": f"pairs; {WANTED_PAIRS:g} or more wanted",
+        },
+    ),
+    "panorama_people": Part(score_panorama, {"ap50": "bundled detector"}),
+    "shelf_dev": Part(score_shelf, {}),
+    "moving_clip": Part(score_moving_clip, {"stated_px": "expected error, median over frames"}),
+    "mvor": Part(
+        score_mvor,
+        {"three.error_cm": "9.9 published (mv3dreg)", "two.error_cm": "18.3 published (mv3dreg)"},
+    ),
+    "stills": Part(score_stills, {}),
+}
+
+
+def flatten(metrics: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested metrics by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in metrics.items():
+        if isinstance(value, Mapping):
+            found |= flatten(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def as_json(value: Any) -> Any:
+    """Return metrics with null in place of NaN."""
+    if isinstance(value, Mapping):
+        return {name: as_json(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [as_json(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def show(value: Any) -> str:
+    """Return a value as the table has it."""
+    if isinstance(value, list):
+        return ", ".join(f"{each:.2f}" for each in value)
+    if isinstance(value, int):
+        return str(value)
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.1f}" if abs(value) >= 20.0 else f"{value:.3f}"
+
+
+def measure(data: Path, only: Sequence[str], frames: int | None) -> dict[str, Any]:
+    """Return metrics by part, and under `skipped` why others have none."""
+    chosen = [name for name in PARTS if not only or name in only]
+    there = [name for name in chosen if (data / name).is_dir()]
+    if not there:
+        raise InputError(
+            str(data),
+            expected=f"a folder with {' or '.join(chosen)}",
+            found="none of them" if data.is_dir() else "no such folder",
+            todo="Name the folder that holds them; benchmarks/real.py says how each is laid out.",
+        )
+    skipped = {name: f"{data / name} is absent" for name in chosen if name not in there}
+    result: dict[str, Any] = {}
+    for name in there:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        try:
+            result[name] = PARTS[name].score(data / name, frames)
+        except (OSError, ValueError, KeyError, ElementTree.ParseError) as error:
+            # A file of another form: which one, its reader alone knows.
+            raise WorldposeError(f"{name}: {type(error).__name__}: {error}") from error
+    return {**result, "skipped": skipped}
+
+
+def print_table(result: Mapping[str, Any]) -> None:
+    """Print a Markdown table, then what was skipped."""
+    print("| data | metric | value | |\n| --- | --- | --- | --- |")
+    for name, part in PARTS.items():
+        for metric, value in flatten(result.get(name, {})).items():
+            print(f"| {name} | {metric} | {show(value)} | {part.notes.get(metric, '')} |")
+    pairs = result.get("static_pair", {}).get("people_per_frame", WANTED_PAIRS)
+    if pairs < WANTED_PAIRS:
+        print(
+            f"\nstatic_pair: fewer than {WANTED_PAIRS:g} pairs per frame, so that the distances of "
+            "feet are not comparable"
+        )
+    for name, reason in result["skipped"].items():
+        print(f"\n{name} skipped: {reason}")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--only", action="append", choices=tuple(PARTS), default=[])
+    parser.add_argument("--frames", type=int, help="frames, stills or moments per part")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if options.frames is not None and options.frames < 1:
+        parser.error("--frames: expected a positive number")
+    try:
+        result = measure(options.data, options.only, options.frames)
+    except WorldposeError as error:
+        sys.exit(f"error: {error}")
+    if options.json:
+        print(json.dumps(as_json(result), indent=2))
+    else:
+        print_table(result)
+
+
+if __name__ == "__main__":
+    main()

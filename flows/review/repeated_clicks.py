@@ -1,0 +1,95 @@
+"""Which of two clicks with one label is meant: what the other clicks of the image say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.ingest.annotations import clicked_file, read_clicked_markings
+from worldpose.ingest.clicks import RepeatedClick
+from worldpose.ingest.match_folder import read_spec
+from worldpose.ingest.pitch_file import read_pitch
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import calibrate_camera
+
+NAMED: Final = 1.0
+"""A place nearer to a point of the pitch than this is told by its name [m]."""
+FAR: Final = 2.0
+"""A click is another place's only if it shows one farther from its label than this [m]."""
+FARTHER: Final = 3.0
+"""And so many times as far as the other click [1]."""
+
+
+def explain_repeated(folder: Path, file: Path, repeated: list[RepeatedClick]) -> list[str]:
+    """Return a sentence for each repeated label: both pixels, the wrong one, and what to do.
+
+    Args:
+        folder: the match folder into which the clicks were imported.
+        file: the annotation file, for the advice.
+        repeated: the labels.
+    """
+    return [
+        f"{each.image}: {each.label!r} is clicked at {_pixel(each.pixels[0])} and at "
+        f"{_pixel(each.pixels[1])}. Which one is meant? {_judge(folder, each)} Correct "
+        f"the label of the wrong one in {file.name}, remove {_clicks_path(folder, each)} and "
+        "import again; or leave both: calibration excludes a click that the others contradict."
+        for each in repeated
+    ]
+
+
+def _pixel(pixel: tuple[float, float]) -> str:
+    return f"({pixel[0]:.0f}, {pixel[1]:.0f})"
+
+
+def _clicks_path(folder: Path, each: RepeatedClick) -> str:
+    return str(folder / clicked_file(each.owner))
+
+
+def _judge(folder: Path, each: RepeatedClick) -> str:
+    """Return which of the two clicks the others contradict, and what it shows, as a sentence."""
+    undecided = "The other clicks do not decide it."
+    spec = read_spec(folder)
+    pitch = read_pitch(folder, spec)
+    static = {camera.id: camera for camera in spec.static_cameras}
+    if pitch is None or each.owner not in static:
+        return undecided
+    camera, template = static[each.owner], PitchTemplate.from_spec(pitch)
+    clicked = read_clicked_markings(folder / clicked_file(each.owner), camera, pitch)
+    try:
+        found = calibrate_camera(template, clicked, (camera.width, camera.height))
+    except InputError:
+        return undecided
+    places = [_ground(found.estimate.camera, template, np.array(pixel)) for pixel in each.pixels]
+    off = [float(np.hypot(*(place - template.points[each.names[0]][:2]))) for place in places]
+    meant, other = (0, 1) if off[0] <= off[1] else (1, 0)
+    if not off[other] > max(FAR, FARTHER * off[meant]):
+        return undecided
+    near = {
+        name: float(np.hypot(*(at[:2] - places[other])))
+        for name, at in template.points.items()
+        if name not in each.names
+    }
+    nearest = min(near, key=lambda name: near[name])
+    shown = "x {:.1f}, y {:.1f} m of the world".format(*places[other])
+    if near[nearest] < NAMED:
+        shown += f", near {nearest}"
+    return (
+        f"By the other clicks the one at {_pixel(each.pixels[meant])} is {off[meant]:.1f} m from "
+        f"the label's place, and the one at {_pixel(each.pixels[other])} shows {shown}."
+    )
+
+
+def _ground(camera: Camera, pitch: PitchTemplate, pixel: Floats) -> Floats:
+    """Return where a pixel's ray meets the surface (2,) [m]."""
+    rays = camera.unproject(pixel[None])
+    origin, direction = rays.origins[0], rays.directions[0]
+    height, place = 0.0, origin[:2]
+    for _ in range(3):  # the crown is flat: the second step changes millimetres
+        place = origin[:2] + (height - origin[2]) / direction[2] * direction[:2]
+        height = float(pitch.height(place[0], place[1]))
+    return np.asarray(place)

@@ -1,0 +1,118 @@
+"""Results of a complete run in the browser: the report, overlay videos, and exports to download."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any, Final
+
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import FileResponse
+
+from data_contracts.release import EXPORT_FORMATS
+from flows.reports.clip_video import clip_view, write_clip_video
+from flows.reports.report import write_report
+from flows.results.best_results import clips_of
+from flows.results.export import Origin, export
+from flows.stage import Match
+from flows.web.app_context import PageContext
+from worldpose.store import Run, open_run
+
+KEPT: Final = 12
+"""Files that the server keeps; the oldest is removed for a new one."""
+REPORT_POLICY: Final = (
+    "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'none'"
+)
+"""The report carries its own scripts: the browser gives it no session and no requests."""
+
+
+class _Files:
+    """Files that were drawn on request, each once per run."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="worldpose-results-")
+        self._lock = Lock()  # one at a time: drawing needs memory for all images
+
+    def get(self, run: Run, name: str, draw: Callable[[Path], None]) -> Path:
+        """Return the file `name` of a run, drawn by `draw` if it is not there."""
+        record = run.record
+        unique = hashlib.sha256(f"{record.match_id} {record.run_id} {name}".encode()).hexdigest()
+        file = Path(self._folder.name) / f"{unique}{Path(name).suffix}"
+        with self._lock:
+            if not file.is_file():
+                kept = sorted(file.parent.iterdir(), key=lambda each: each.stat().st_mtime)
+                for each in kept[: max(0, len(kept) - KEPT + 1)]:
+                    each.unlink()
+                with TemporaryDirectory(prefix="worldpose-draft-") as draft:
+                    made = Path(draft) / name
+                    draw(made)
+                    shutil.move(made, file)
+        return file
+
+
+def routes(context: PageContext) -> APIRouter:
+    """Create the routes of the results of a match's latest run."""
+    router = APIRouter(prefix="/api/matches/{match_id}/results")
+    files = _Files()
+
+    def open_latest(match_id: str) -> tuple[Match, Run]:
+        match = context.match(match_id)
+        return match, open_run(context.store.url, match_id, complete=True)
+
+    @router.get("")
+    def results(match_id: str) -> dict[str, Any]:
+        match, run = open_latest(match_id)
+        clips = clips_of(run.record)
+        return {
+            "run": run.record.run_id,
+            "formats": list(EXPORT_FORMATS),
+            "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
+        }
+
+    @router.get("/report")
+    def report(match_id: str) -> FileResponse:
+        match, run = open_latest(match_id)
+
+        def draw(file: Path) -> None:
+            run_id = run.record.run_id
+            write_report(context.store, match, file, run_id=run_id, videos=False)
+
+        return FileResponse(
+            files.get(run, "report.html", draw),
+            media_type="text/html; charset=utf-8",
+            headers={"content-security-policy": REPORT_POLICY},
+        )
+
+    @router.get("/videos/{clip}")
+    def video(match_id: str, clip: str) -> FileResponse:
+        match, run = open_latest(match_id)
+        if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
+            raise HTTPException(404, "no camera of such a clip has a video")
+
+        def draw(file: Path) -> None:
+            write_clip_video(context.store, run, match, clip, file)
+
+        return FileResponse(files.get(run, f"{clip}.mp4", draw), media_type="video/mp4")
+
+    @router.get("/exports/{form}")
+    def export_zip(match_id: str, form: str) -> FileResponse:
+        match, run = open_latest(match_id)
+        if form not in EXPORT_FORMATS:
+            raise HTTPException(404, f"no such format; there are {', '.join(EXPORT_FORMATS)}")
+
+        def draw(file: Path) -> None:
+            folder = file.with_suffix("")
+            export(Origin(run, match.registration), [form], folder)
+            shutil.make_archive(str(folder), "zip", folder)
+
+        name = f"{match.match_id}-{run.record.run_id}-{form}.zip"
+        return FileResponse(
+            files.get(run, f"{form}.zip", draw), media_type="application/zip", filename=name
+        )
+
+    return router

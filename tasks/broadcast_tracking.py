@@ -1,0 +1,121 @@
+"""Task of stage `broadcast_tracking`: people of a moving camera on the pitch, by their feet."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from data_contracts.broadcast_tracking import BROADCAST_TRACKING
+from data_contracts.pitch import PitchSpec
+from data_contracts.tracking import Track
+from data_contracts.work import Work
+from tasks.unit import open_input, unit_task
+from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
+from worldpose.pitch import PitchTemplate
+from worldpose.store import Store
+from worldpose.tracking import GroundPositions, locate_feet, track_on_plane
+
+SURFACE: Final = ("length", "width", "crown")
+"""Entries of pitch.json that give the surface under the feet."""
+
+
+@unit_task
+def broadcast_tracking(work: Work) -> str:
+    """Publish the tracks of the clip's people and their places on the pitch; return the key."""
+    store = Store.open(work.project)
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    inputs = {name.partition("/")[0]: name for name in work.recipe.inputs}
+    calibrated = open_input(store, work, inputs["broadcast_calibration"])
+    camera = inputs.get("broadcast_pooling")
+    moving = calibrated if camera is None else open_input(store, work, camera)
+    detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
+    detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
+    # The surface that the calibration found: people stand on it as the markings lie on it.
+    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SURFACE}
+    known = {name: value for name, value in surface.items() if value is not None}
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"] | known))
+    positions = _locate_people(detections, moving, pitch)
+    size = (pitch.length, pitch.width)
+    tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
+    index = tracks.detection_index[:, 0]
+    found = int(np.isfinite(positions.xy[..., 0]).sum())
+    with store.publish(work) as result:
+        result.write(
+            BROADCAST_TRACKING,
+            arrays={
+                "detection_index": index,
+                "ground": tracks.xy.astype(np.float32),
+                "ground_velocity": tracks.velocity.astype(np.float32),
+                "ground_covariance": tracks.covariance.astype(np.float32),
+                "ground_height": tracks.height.astype(np.float32),
+            },
+            coordinates={
+                "frame": np.arange(first, first + count),
+                "person": np.arange(index.shape[1], dtype=np.int32),
+            },
+            attributes={
+                "clip_id": work.recipe.unit,
+                "tracks": [_track(number, seen, first) for number, seen in enumerate(index.T)],
+            },
+        )
+        if sources["has_estimates"]:
+            result.warnings.append(
+                f"{work.recipe.name}: the monocular poses of the clip are not used, as bodies need "
+                "people that static cameras triangulate. Add static cameras, or take the file out."
+            )
+        result.figures["people"] = float(index.shape[1])
+        if found:
+            result.figures["unmatched_share"] = 1.0 - np.count_nonzero(index >= 0) / found
+        if index.shape[1]:
+            variance = np.trace(tracks.covariance, axis1=-2, axis2=-1)
+            result.figures["plane_std_m"] = float(np.sqrt(np.nanmedian(variance)))
+        else:
+            result.warnings.append(
+                f"{work.recipe.name} found no person on the pitch: {found} detections have feet "
+                "there. Check the camera in the report, and the detections."
+            )
+    return work.key
+
+
+def _locate_people(
+    detections: xr.Dataset, camera: xr.Dataset, pitch: PitchTemplate
+) -> GroundPositions:
+    """Return the places of a moving camera's detections, as those of one camera."""
+    moving, uncertainty = moving_from_arrays(
+        {str(name): array.values for name, array in camera.data_vars.items()}
+    )
+    covariance, cameras = static_covariance(moving, uncertainty), moving.camera
+    arrays = [detections[name].values for name in ("keypoints", "confidence", "boxes")]
+    parts = []
+    for frame in range(len(moving)):
+        now = slice(frame, frame + 1)
+        keypoints, confidence, boxes = (array[now, None] for array in arrays)
+        parts.append(
+            locate_feet(
+                cameras[now],
+                keypoints,
+                confidence,
+                pitch,
+                boxes=boxes,
+                camera_covariance=covariance[now],
+            )
+        )
+    names = ("xy", "noise", "calibration", "height")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return GroundPositions(**joined)
+
+
+def _track(person: int, index: NDArray[np.int16], first: int) -> dict[str, Any]:
+    seen = np.flatnonzero(index >= 0)
+    return Track(
+        person=person,
+        first_frame=first + int(seen[0]),
+        last_frame=first + int(seen[-1]),
+        frames_seen=len(seen),
+        views=1.0,
+        kind="plane",
+    ).model_dump(mode="json")

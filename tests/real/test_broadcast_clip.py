@@ -1,0 +1,71 @@
+"""A real broadcast clip alone, with clicked key frames; skipped where the data is absent.
+
+WORLDPOSE_TEST_DATA names a folder with `broadcast_clip` (benchmarks/broadcast_clip.py fetch).
+"""
+
+import csv
+import importlib.util
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import succeed
+
+DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "broadcast_clip"
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "broadcast_clip.py"
+
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no broadcast_clip"
+)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    spec = importlib.util.spec_from_file_location("broadcast_clip", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def found(bench):
+    return bench.calibrate(DATA)
+
+
+@pytest.mark.parametrize("name", ["drawn_first.json", "drawn_second.json"])
+def test_lines_drawn_by_hand_in_further_frames_are_met_within_a_pixel(bench, found, name):
+    drawn = bench.read_drawn(name)
+    assert len(drawn.key_frames) == 6
+    off = np.array([row[2] for row in bench.distances(found, bench.estimated_pitch(found), drawn)])
+    assert len(off) > 150
+    assert np.mean(np.abs(off)) < 0.4  # seen: 0.20 of 512 columns
+    nominal = bench.distances(found, bench.PitchTemplate.standard(), drawn)
+    assert np.mean([abs(row[2]) for row in nominal]) < 1.0  # seen: 0.56
+
+
+def test_the_stated_error_covers_the_lines_that_miss(bench, found):
+    rows = bench.distances(found, bench.estimated_pitch(found), bench.read_drawn(bench.FIRST))
+    off, stated = (np.array([row[column] for row in rows]) for column in (2, 3))
+    assert np.mean(np.abs(off) < 2.0 * np.hypot(stated, 0.3)) > 0.9
+    # The main camera of a league stadium, at the halfway line.
+    center, std = found.camera.center, np.sqrt(np.diag(found.uncertainty.clip))[:3]
+    assert abs(center[0]) < 5.0
+    assert 10.0 < center[2] < 25.0
+    assert (std > [0.1, 0.1, 0.05]).all()
+
+
+def test_the_clip_alone_gives_a_camera_and_people_on_the_pitch(bench, tmp_path):
+    match, project = tmp_path / "match", ("--project", tmp_path / "project")
+    match.mkdir()
+    bench.write_match(DATA, match)
+    succeed("run", match, *project, timeout=1800)
+    export = ("export", "broadcast-clip", *project, "--format", "positions")
+    succeed(*export, "--out", tmp_path / "out")
+    with (tmp_path / "out/positions/goal.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    people = {row["person"] for row in rows}
+    by_frame = len(rows) / bench.FRAMES
+    assert len(people) >= 10
+    assert by_frame >= 10.0
+    assert all(20.0 < float(row["x_m"]) < 55.0 for row in rows if row["frame"] == "25")

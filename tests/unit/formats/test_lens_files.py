@@ -1,0 +1,145 @@
+"""Lenses without a pose, in the files of other tools."""
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+
+MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([[-0.31, 0.12, 0.001, -0.002, -0.03]])
+SIZES = {"left": (1920, 1080), "right": (1280, 720)}
+
+
+def write_opencv(file, **further):
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Mon 1 Jan 2024")
+    for name, value in further.items():
+        storage.write(name, value)
+    storage.write("camera_matrix", MATRIX)
+    storage.write("distortion_coefficients", DISTORTION)
+    storage.write("avg_reprojection_error", 0.31)
+    storage.release()
+    return [file]
+
+
+def write_npy(folder):
+    np.save(folder / "matrix.npy", MATRIX)
+    np.save(folder / "dist.npy", DISTORTION)
+    return [folder / "matrix.npy", folder / "dist.npy"]
+
+
+def write_npz(folder):
+    np.savez(folder / "lens.npz", mtx=MATRIX, dist=DISTORTION, rvecs=np.zeros((9, 3, 1)))
+    return [folder / "lens.npz"]
+
+
+def write_toml(folder):
+    text = f"""[cameras.7]
+name = "left"
+size = [1920, 1080]
+matrix = {MATRIX.tolist()}
+distortions = {DISTORTION[0].tolist()}
+error = 0.4
+"""
+    (folder / "config.toml").write_text(text)
+    return [folder / "config.toml"]
+
+
+WRITERS = {
+    "xml": lambda folder: write_opencv(folder / "lens.xml"),
+    "yml": lambda folder: write_opencv(folder / "lens.yml", image_width=1920, image_height=1080),
+    "json": lambda folder: write_opencv(folder / "lens.json"),
+    "npy": write_npy,
+    "npz": write_npz,
+    "toml": write_toml,
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_every_kind_of_file_gives_the_same_lens(kind, tmp_path):
+    lens = read_lenses(WRITERS[kind](tmp_path), "left", SIZES)["left"]
+    assert lens.focal_px == 1402.0
+    assert lens.principal_point_px == (970.0, 530.0)
+    assert lens.distortion == tuple(DISTORTION[0].tolist())
+    assert lens.focal_std_px == pytest.approx(14.02)
+    assert lens.principal_point_std_px == pytest.approx(9.6)
+    assert lens.distortion_std == 0.005
+
+
+def test_a_lens_is_scaled_to_images_of_the_same_shape_and_no_others(tmp_path):
+    files = write_opencv(tmp_path / "lens.yml", image_width=1920, image_height=1080)
+    small = read_lenses(files, "right", SIZES)["right"]
+    assert small.focal_px == pytest.approx(1402.0 * 2 / 3)
+    # The centre of pixel 970 is 970.5 px from the image's edge.
+    assert small.principal_point_px[0] == pytest.approx(970.5 * 2 / 3 - 0.5)
+    assert small.distortion == tuple(DISTORTION[0].tolist())
+    with pytest.raises(InputError, match=r"expected 1440 x 1080 px.*found 1920 x 1080"):
+        read_lenses(files, "right", {"right": (1440, 1080)})
+
+
+def test_written_lenses_are_read_back_with_their_deviations(tmp_path):
+    lens = read_lenses(write_npz(tmp_path), "left", SIZES)
+    lens["left"] = lens["left"].model_copy(update={"focal_std_px": 3.25, "distortion_std": 0.001})
+    write_lens_toml(tmp_path / "lenses.toml", lens)
+    assert read_lens_toml(tmp_path / "lenses.toml", SIZES) == lens
+
+
+BAD = {
+    "no camera": (write_npz, None, r"--camera left"),
+    "unknown camera": (write_npz, "middle", r"match\.yaml: left, right.*'middle'"),
+    "matrix alone": (lambda folder: write_npy(folder)[:1], "left", "distortion coefficients"),
+    "distortion alone": (lambda folder: write_npy(folder)[1:], "left", "3 x 3 camera matrix"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_an_incomplete_lens_is_refused_with_what_it_lacks(case, tmp_path):
+    write, camera, said = BAD[case]
+    with pytest.raises(InputError, match=said):
+        read_lenses(write(tmp_path), camera, SIZES)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("lens.yml", b"matrix: [1, 2", "FileStorage"),
+        (
+            "lens.xml",
+            b'<?xml version="1.0"?><opencv_storage><a>1</a></opencv_storage>',
+            "3 x 3 camera matrix",
+        ),
+        ("lens.npz", b"PK\x03\x04 torn", "npz"),
+        ("lens.npy", b"\x93NUMPY", "arrays of numbers"),
+        ("lens.txt", b"1400", r"found '\.txt'"),
+    ],
+)
+def test_a_broken_file_is_one_clear_error(name, content, said, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        read_lenses([tmp_path / name], "left", SIZES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"dist": np.zeros(8) + 0.1}, "zero beyond the fifth"),
+        ({"mtx": np.diag([1400.0, 1600.0, 1.0])}, "square pixels"),
+        ({"mtx": np.diag([0.001, 0.001, 1.0])}, "focal length"),
+        ({"mtx": np.full((3, 3), np.nan)}, "finite numbers"),
+        ({"dist": np.zeros((5, 5, 5))}, "125 numbers"),
+    ],
+)
+def test_an_impossible_lens_is_refused(changes, said, tmp_path):
+    np.savez(tmp_path / "lens.npz", **{"mtx": MATRIX, "dist": DISTORTION, **changes})
+    with pytest.raises(InputError, match=said):
+        read_lenses([tmp_path / "lens.npz"], "left", SIZES)
+
+
+def test_a_lens_in_the_place_of_a_calibration_says_where_lenses_go(tmp_path):
+    (file,) = write_toml(tmp_path)
+    with pytest.raises(InputError, match=r"found a lens alone.*worldpose import --lens"):
+        read_calibration(file)
+    assert read_lens_toml(file, SIZES)["left"].focal_px == 1402.0

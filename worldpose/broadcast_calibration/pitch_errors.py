@@ -1,0 +1,171 @@
+"""Errors of a pitch template: its survey or paint, and a size and crown that nobody measured (M3).
+
+A pitch without a survey has its markings where the Laws of the Game put them, within the accuracy
+of the painter, on a surface whose crown is a matter of local practice. The fit of a clip estimates
+all three with priors, so that the camera's covariance includes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats, Integers
+from data_contracts.pitch import PitchSpec
+from worldpose.broadcast_calibration.evidence import PointEvidence
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import law_points
+
+_PRIOR_COUNT = 6.0
+"""Coordinates that the prior spread of the paint is worth in its estimate [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PitchErrors:
+    """Standard deviations of a pitch template.
+
+    Attributes:
+        surveyed: (points,) mask of the template's points whose place is surveyed.
+        survey_m: of a surveyed point, each axis [m].
+        paint_m: of any other point, each axis [m].
+        size_m: (3,) of length, width, crown [m]; 0 = known.
+        by_size: (points, 2) change of x by the length, and of y by the width [1].
+        half_width: of the pitch [m].
+    """
+
+    surveyed: NDArray[np.bool_]
+    survey_m: float
+    paint_m: float
+    size_m: Floats
+    by_size: Floats
+    half_width: float
+
+    @classmethod
+    def of(cls, pitch: PitchTemplate, settings: BroadcastCalibrationSettings) -> PitchErrors:
+        """Return the prior errors of a template."""
+        base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
+        nothing = (0.0, 0.0, 0.0)
+        change = [
+            np.subtract(larger.get(name, nothing), base.get(name, nothing)) for name in pitch.points
+        ]
+        spread = {
+            "length": settings.pitch_size_std_m,
+            "width": settings.pitch_size_std_m,
+            "crown": settings.crown_std_m,
+        }
+        return cls(
+            surveyed=np.array([name in pitch.surveyed for name in pitch.points]),
+            survey_m=settings.survey_error_m,
+            paint_m=max(settings.paint_error_m, settings.survey_error_m),
+            size_m=np.array(
+                [each if name in pitch.assumed else 0.0 for name, each in spread.items()]
+            ),
+            by_size=np.array(change)[:, :2],
+            half_width=0.5 * pitch.width,
+        )
+
+    @property
+    def point_m(self) -> Floats:
+        """Standard deviations (points,) of each point, each axis [m]."""
+        return np.where(self.surveyed, self.survey_m, self.paint_m)
+
+    def shares(self, ends: Integers, shares: Floats) -> Floats:
+        """Return displacements (n, 2) [m] of places per standard deviation of their points.
+
+        Args:
+            ends: (n, 2) indices of the points; -1 = none.
+            shares: (n, 2) displacement of the place by these points [m/m].
+        """
+        return np.where(ends >= 0, self.point_m[ends] * shares, 0.0)
+
+    def displacement_by_size(self, ends: Integers, shares: Floats, world: Floats) -> Floats:
+        """Return displacements (n, 3) [m] of places per standard deviation of the pitch's size.
+
+        Args:
+            ends: (n, 2) indices of the points that define a place; -1 = none.
+            shares: (n, 2) displacement of the place by these points [m/m].
+            world: (n, 3) the places [m], world.
+        """
+        weight = np.where(ends >= 0, shares, 0.0)
+        plan = (weight[..., None] * self.by_size[ends]).sum(axis=1)
+        sink = -((world[:, 1:2] / self.half_width) ** 2)
+        return np.concatenate([plan, sink], axis=1) * self.size_m
+
+    def rescale(self, points: PointEvidence, before: PitchErrors) -> PointEvidence:
+        """Return evidence of other errors of the same pitch with the spreads of these."""
+        ratio = np.append(self.point_m / before.point_m, 1.0)  # -1 = none
+        return replace(points, shares=points.shares * ratio[points.ends])
+
+    def learn_paint(self, offsets: Floats, variance: Floats, points: Integers) -> PitchErrors:
+        """Return the errors with the spread of the paint that a fit shows.
+
+        MacKay's fixed point: the sum of squared offsets over the number of coordinates that the
+        evidence determines.
+
+        Args:
+            offsets: (n, 3) estimated paint errors [standard deviations].
+            variance: (n, 3) their posterior variance [standard deviations^2].
+            points: (n,) indices of the template's points.
+        """
+        chosen = ~self.surveyed[points]
+        if not chosen.any():
+            return self
+        squares = float((offsets[chosen] ** 2).sum())
+        determined = float((1.0 - variance[chosen]).sum())
+        factor = (_PRIOR_COUNT + squares) / (_PRIOR_COUNT + determined)
+        return replace(self, paint_m=max(self.paint_m * float(np.sqrt(factor)), self.survey_m))
+
+
+@dataclass(frozen=True, eq=False)
+class PitchFit:
+    """The pitch and the noise that a clip's fit shows.
+
+    Attributes:
+        points: places (3,) [m], world, of the template's points without survey that the clip's
+            markings rest on.
+        size: (3,) length, width, crown [m].
+        size_std: (3,) of these [m]; 0 = given.
+        paint_m: spread of markings without survey about the Laws, each axis [m]; 0 = all surveyed.
+        line_noise: deviation of a line's sample over its assumed one [1].
+        click_noise: the same of clicks [1].
+    """
+
+    points: Mapping[str, Floats]
+    size: Floats
+    size_std: Floats
+    paint_m: float
+    line_noise: float
+    click_noise: float
+
+    @property
+    def spec(self) -> PitchSpec | None:
+        """The pitch of the estimated size with the estimated markings; None if all is given."""
+        if not (self.size_std.any() or self.points):
+            return None
+        length, width, crown = self.size.tolist()
+        points = {name: tuple(place.tolist()) for name, place in self.points.items()}
+        return PitchSpec(
+            length=length, width=width, crown=max(crown, 0.0), points=points, any_size=True
+        )
+
+    @property
+    def describe(self) -> tuple[str, ...]:
+        """Sentences for the report."""
+        said = [
+            f"the {name} of the pitch is {value:.2f} m with a standard deviation of {std:.2f} m"
+            for name, value, std in zip(
+                ("length", "width", "crown"), self.size, self.size_std, strict=True
+            )
+            if std > 0.0
+        ]
+        if self.paint_m > 0.0:
+            said.append(f"markings differ from the Laws by {self.paint_m:.3f} m per axis")
+        said.append(
+            f"samples of lines err by {self.line_noise:.2f} and clicks by {self.click_noise:.2f} "
+            "of their assumed deviation"
+        )
+        return tuple(said)

@@ -1,0 +1,227 @@
+"""Parts of a frame that a detector sees enlarged: people too small for it, and groups of people.
+
+A detector finds people best at the heights of its training. Where a calibrated camera shows people
+smaller, or the first pass over a frame finds small people, further passes over enlarged tiles
+replace it for them. Frames of tall people need no such pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Image
+from worldpose.detection.interfaces import Detector, People
+from worldpose.detection.suppression import suppress
+from worldpose.geometry import Camera
+from worldpose.geometry.boxes import box_iou
+from worldpose.pitch import PitchTemplate
+
+STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
+"""Heights below which people are seen enlarged [px], and the enlargement [1]."""
+TILE: Final = 1024
+"""Longest side of an enlarged tile without its margin [px]: bounds memory."""
+BLEND: Final = 1.25
+"""Factor by which heights of both passes overlap [1]: nobody at the limit is lost."""
+STANDING: Final = 1.8
+"""Height of an upright person [m]."""
+GRID: Final = 2.0
+"""Distance of the positions on the pitch at which people are expected [m]."""
+PEOPLE_HEIGHTS: Final = (100.0, 160.0)
+"""The enlarged heights of a group's people [px], one pass per height: the detector is trained on
+heights up to 160; where one pass merges two heads, the other may separate them."""
+ZOOMS: Final = (1.25, 3.0)
+"""A group that needs less enlargement is large enough; none is enlarged more [1]."""
+MIN_GROUP_SCORE: Final = 0.25
+"""Boxes from this score on form a group, and tell the size of a frame's people [1]."""
+SAME_PERSON_IOU: Final = 0.6
+"""Boxes that overlap more are one person's [1, intersection over union]."""
+MIN_NEIGHBOUR_IOU: Final = 0.15
+"""Neighbours in a group overlap more [1, intersection over union]."""
+GROUP_MARGIN: Final = 0.25
+"""Margin within which people still belong to a group, as a share of its people's height [1]."""
+HEIGHT_RANGE: Final = (0.5, 2.0)
+"""Shortest and tallest box in a group, as a share of its people's height [1]."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a frame that is seen enlarged.
+
+    Attributes:
+        corner: left, upper pixel of the crop.
+        end: right, lower pixel, not included.
+        zoom: enlargement [1].
+        inner: x0, y0, x1, y1 of the region that holds the centres of its people [px].
+        heights: of people that count in it, bounds not included [px].
+        replaced: height below which earlier people with centres in `inner` are dropped [px].
+    """
+
+    corner: tuple[int, int]
+    end: tuple[int, int]
+    zoom: float
+    inner: Floats
+    heights: tuple[float, float]
+    replaced: float = 0.0
+
+    def crop(self, image: Image) -> Image:
+        """Return the enlarged crop of the frame."""
+        import cv2  # late: it takes 0.2 s, and planning a run does not need it
+
+        (left, top), (right, bottom) = self.corner, self.end
+        part = image[top:bottom, left:right]
+        size = (round(self.zoom * (right - left)), round(self.zoom * (bottom - top)))
+        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+
+    def to_frame(self, people: People) -> People:
+        """Return the part's people among those found in `crop`, in the frame's pixels."""
+        sides = np.array(self.end) - self.corner
+        scale = np.tile(sides / np.round(self.zoom * sides), 2)
+        boxes = (people.boxes + 0.5) * scale - 0.5 + np.tile(self.corner, 2)
+        tall = boxes[:, 3] - boxes[:, 1]
+        mine = self._holds(boxes) & (tall > self.heights[0]) & (tall < self.heights[1])
+        return People(boxes[mine], people.scores[mine])
+
+    def merge(self, earlier: People, seen: People) -> People:
+        """Return earlier people of the frame and those found in `crop`, without those replaced."""
+        kept = ~self._holds(earlier.boxes)
+        kept |= earlier.boxes[:, 3] - earlier.boxes[:, 1] >= self.replaced
+        found = self.to_frame(seen)
+        return People(
+            np.concatenate([earlier.boxes[kept], found.boxes]),
+            np.concatenate([earlier.scores[kept], found.scores]),
+        )
+
+    def _holds(self, boxes: Floats) -> Flags:
+        """Return whether the centres of boxes lie in `inner` (people,)."""
+        middles = 0.5 * (boxes[:, :2] + boxes[:, 2:])
+        return np.asarray(np.all((middles >= self.inner[:2]) & (middles < self.inner[2:]), axis=1))
+
+
+@runtime_checkable
+class SeesParts(Detector, Protocol):
+    """A detector that looks at parts of frames enlarged, where people are small."""
+
+    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
+        """Return the people in each image, as `detect`.
+
+        Args:
+            images: of one size.
+            parts: where people are expected small, from the camera; empty where they are not.
+        """
+
+
+def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]) -> list[Part]:
+    """Return the tiles around a frame's people, if half of them are smaller than a limit.
+
+    The surest people decide; where none is sure, all do.
+
+    Args:
+        people: detections in the whole frame.
+        shape: height, width of the frame [px].
+        step: of `STEPS`.
+    """
+    each = suppress(people, SAME_PERSON_IOU)
+    tall = each.boxes[:, 3] - each.boxes[:, 1]
+    sure = each.scores >= MIN_GROUP_SCORE
+    if not len(tall) or np.median(tall[sure] if sure.any() else tall) >= step[0]:
+        return []
+    return _tile(each.boxes[tall < 2.0 * step[0]], shape, step)
+
+
+def expect_small(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Part]:
+    """Return the tiles in which a calibrated camera shows people on the pitch too small.
+
+    Args:
+        camera: the camera.
+        pitch: its lines and its surface.
+        margin: around the pitch [m].
+    """
+    half = np.array([pitch.length, pitch.width]) / 2
+    x, y = np.meshgrid(
+        *(np.linspace(-(to + margin), to + margin, round(2 * (to + margin) / GRID)) for to in half)
+    )
+    ground = pitch.height(np.clip(x, -half[0], half[0]), np.clip(y, -half[1], half[1]))
+    feet = np.stack([x, y, ground], axis=-1).reshape(-1, 3)
+    low = camera.project(feet)
+    high = camera.project(feet + np.array([0.0, 0.0, STANDING]))
+    tall = np.linalg.norm(high - low, axis=1)
+    middle = 0.5 * (low + high)
+    width, height = (int(side) for side in camera.image_size)
+    with np.errstate(invalid="ignore"):
+        shown = np.all((middle >= 0.0) & (middle <= [width, height]), axis=1)
+    bounds = [limit for limit, _ in STEPS[1:]] + [0.0]
+    parts = []
+    for step, least in zip(STEPS, bounds, strict=True):
+        asked = shown & (tall < step[0]) & (tall >= least)
+        side = 0.5 * tall[asked, None]
+        boxes = np.concatenate([middle[asked] - side, middle[asked] + side], axis=1)
+        parts += _tile(boxes, (height, width), step)
+    return parts
+
+
+def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> list[Part]:
+    """Return equal tiles that cover boxes of small people with a margin; none without a box."""
+    if not len(boxes):
+        return []
+    (limit, zoom), size = step, np.array([shape[1], shape[0]])
+    low = np.maximum(boxes[:, :2].min(axis=0) - limit, -0.5)
+    high = np.minimum(boxes[:, 2:].max(axis=0) + limit, size - 0.5)
+    counts = np.ceil(zoom * (high - low) / TILE).astype(int)
+    x, y = (np.linspace(low[axis], high[axis], counts[axis] + 1) for axis in (0, 1))
+    parts = []
+    for row in range(counts[1]):
+        for column in range(counts[0]):
+            inner = np.array([x[column], y[row], x[column + 1], y[row + 1]])
+            wide = inner + np.array([-limit, -limit, limit, limit])
+            if not np.any(np.all((boxes[:, 2:] > wide[:2]) & (boxes[:, :2] < wide[2:]), axis=1)):
+                continue
+            corner = np.maximum(np.floor(wide[:2]), 0).astype(int)
+            end = np.minimum(np.ceil(wide[2:]), size).astype(int)
+            parts.append(
+                Part(
+                    corner=(corner[0], corner[1]),
+                    end=(end[0], end[1]),
+                    zoom=zoom,
+                    inner=inner,
+                    heights=(0.0, BLEND * limit),
+                    replaced=limit / BLEND,
+                )
+            )
+    return parts
+
+
+def find_groups(people: People, shape: tuple[int, ...]) -> list[Part]:
+    """Return the groups that need a second detection pass, one entry per enlargement.
+
+    Args:
+        people: detections in the whole frame.
+        shape: height, width of the frame [px].
+    """
+    from scipy.sparse.csgraph import connected_components  # late, as cv2
+
+    sure = suppress(people, SAME_PERSON_IOU)
+    boxes = sure.boxes[sure.scores >= MIN_GROUP_SCORE]
+    count, member = connected_components(box_iou(boxes, boxes) > MIN_NEIGHBOUR_IOU, directed=False)
+    size = np.array([shape[1], shape[0]])
+    found = []
+    for number in range(count):
+        own = boxes[member == number]
+        tall = float(np.median(own[:, 3] - own[:, 1]))
+        low, high = own[:, :2].min(axis=0), own[:, 2:].max(axis=0)
+        inner = np.concatenate([low - GROUP_MARGIN * tall, high + GROUP_MARGIN * tall])
+        corner = np.maximum(np.floor(low - 2.0 * GROUP_MARGIN * tall), 0).astype(int)
+        end = np.minimum(np.ceil(high + 2.0 * GROUP_MARGIN * tall), size).astype(int)
+        # No second pass costs more than the first.
+        widest = float(np.sqrt(np.prod(size) / np.prod(end - corner)))
+        zooms = {min(height / tall, ZOOMS[1], widest) for height in PEOPLE_HEIGHTS if len(own) > 1}
+        heights = (HEIGHT_RANGE[0] * tall, HEIGHT_RANGE[1] * tall)
+        found += [
+            Part((corner[0], corner[1]), (end[0], end[1]), zoom, inner, heights)
+            for zoom in sorted(zooms)
+            if zoom >= ZOOMS[0]
+        ]
+    return found

@@ -1,0 +1,278 @@
+"""Readers and a writer of lenses without a pose: OpenCV FileStorage, npy and npz, TOML.
+
+In the TOML form each table has `size`, `matrix` and `distortions` as in calibration.toml, no
+`rotation` and no `translation`, and optionally the deviations `focal_std_px`,
+`principal_point_std_px` and `distortion_std`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from data_contracts.arrays import Floats
+from data_contracts.cameras import LensCalibration
+from worldpose.errors import InputError
+from worldpose.formats.archives import read_npz
+from worldpose.formats.calibration_files import (
+    calibration_error,
+    camera_tables,
+    read_optics,
+    require_optics,
+)
+from worldpose.formats.files import SETTINGS_BYTES, require_file
+
+FOCAL_STD: Final = 0.01
+"""Relative deviation of a focal length whose file states none [1]: board calibrations with a dozen
+images repeat within 1 %."""
+PRINCIPAL_POINT_STD: Final = 0.005
+"""The same of the principal point, in image widths [1]."""
+DISTORTION_STD: Final = 0.005
+"""The same of the image corner's displacement, relative to its distance from the centre [1]: boards
+seldom reach the corners."""
+MATRIX_NAMES: Final = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx", "K", "matrix")
+DISTORTION_NAMES: Final = (
+    *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs"),
+    *("dist_coefs", "dist", "distortions", "distortion", "D"),
+)
+ARRAY_BYTES: Final = 1 << 26
+"""Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
+SQUARE: Final = 0.02
+"""Largest difference of fx and fy of square pixels [1]; their mean is used."""
+
+
+def read_lenses(
+    files: Sequence[Path], camera: str | None, sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, LensCalibration]:
+    """Return lenses by camera.
+
+    Args:
+        files: one TOML file with a table for each camera; or, for one camera, an OpenCV XML, YAML
+            or JSON file, an npz file, or two npy files, one of them the 3 x 3 matrix.
+        camera: the camera of a file that names none; None = a TOML file with names.
+        sizes: width and height of each camera's images [px]. A lens of a file with another size
+            and the same shape of image is scaled.
+
+    Raises:
+        InputError: a file is unreadable, of another kind, without matrix or distortion; the pixels
+            are not square; the image sizes do not fit; a camera is unknown or not named.
+    """
+    first = files[0]
+    if first.suffix.lower() == ".toml":
+        return read_lens_toml(first, sizes, camera)
+    if camera is None:
+        raise InputError(
+            str(first),
+            expected="the camera of this lens",
+            found="a file without a name for it",
+            todo=f"Name it: --camera {next(iter(sizes), 'NAME')}.",
+        )
+    if camera not in sizes:
+        raise _unknown_camera(str(first), camera, sizes)
+    given: dict[str, Any] = {}
+    for file in files:
+        given |= _read_file(file)
+    where = ", ".join(map(str, files))
+    matrix = _pick(where, given, MATRIX_NAMES, "a 3 x 3 camera matrix")
+    distortion = np.ravel(_pick(where, given, DISTORTION_NAMES, "distortion coefficients"))
+    size = _image_size(given, sizes[camera])
+    table = {
+        "size": list(size),
+        "matrix": np.asarray(matrix, dtype=np.float64).tolist(),
+        "distortions": distortion.tolist(),
+    }
+    return {camera: _lens(where, camera, table, sizes[camera])}
+
+
+def read_lens_toml(
+    file: Path, sizes: Mapping[str, tuple[int, int]], camera: str | None = None
+) -> dict[str, LensCalibration]:
+    """Return the lenses of a TOML file by camera; `rotation` and `translation` are ignored.
+
+    Args:
+        file: a table for each camera.
+        sizes: as in `read_lenses`; the file may have further cameras.
+        camera: the only camera to read; None = all.
+
+    Raises:
+        InputError: as in `read_lenses`.
+    """
+    found = {}
+    for where, name, table in camera_tables(file):
+        if camera is not None and name != camera:
+            continue
+        if name not in sizes:
+            raise _unknown_camera(where, name, sizes)
+        if name in found:
+            raise calibration_error(where, "a name of its own", f"{name!r} a second time")
+        found[name] = _lens(where, name, table, sizes[name])
+    if not found:
+        raise calibration_error(str(file), f"camera {camera}" if camera else "a camera", "none")
+    return found
+
+
+def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
+    """Write lenses in the form that `read_lens_toml` reads; numbers keep all digits."""
+    lines = []
+    for name, lens in lenses.items():
+        (cx, cy), f = lens.principal_point_px, lens.focal_px
+        lines += [
+            f'["{name}"]',
+            f"size = {list(lens.image_size)}",
+            f"matrix = {[[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]}",
+            f"distortions = {list(lens.distortion)}",
+            f"focal_std_px = {lens.focal_std_px}",
+            f"principal_point_std_px = {lens.principal_point_std_px}",
+            f"distortion_std = {lens.distortion_std}",
+            "",
+        ]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _read_file(file: Path) -> dict[str, Any]:
+    """Return the arrays and numbers of a file by name."""
+    suffix = file.suffix.lower()
+    bytes_there = require_file(file)
+    if bytes_there > SETTINGS_BYTES:
+        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{bytes_there}")
+    try:
+        if suffix == ".npy":
+            array = np.load(file, allow_pickle=False)
+            return {"K" if array.shape == (3, 3) else "dist": array}
+    except (OSError, ValueError, EOFError) as error:
+        raise calibration_error(str(file), "arrays of numbers", str(error)) from error
+    if suffix == ".npz":
+        return dict(read_npz(file, ARRAY_BYTES))
+    if suffix in (".xml", ".yml", ".yaml", ".json"):
+        return _read_file_storage(file)
+    raise InputError(
+        str(file),
+        expected="a lens file: .toml, OpenCV's .xml, .yml, .yaml or .json, .npy or .npz",
+        found=repr(file.suffix),
+        todo="Save the camera matrix and the distortion coefficients in one of these forms.",
+    )
+
+
+def _read_file_storage(file: Path) -> dict[str, Any]:
+    import cv2  # late: it takes 0.2 s, and few commands read such a file
+
+    try:
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        names = storage.root().keys() if storage.isOpened() else []
+        found: dict[str, Any] = {}
+        for name in names:
+            node = storage.getNode(name)
+            if node.isMap() and node.mat() is not None:
+                found[name] = np.asarray(node.mat(), dtype=np.float64)
+            elif node.isInt() or node.isReal():
+                found[name] = float(node.real())
+        storage.release()
+    except (cv2.error, SystemError) as error:
+        said = str(error).splitlines()[0]
+        raise calibration_error(str(file), "a file of OpenCV's FileStorage", said) from error
+    if not found:
+        raise calibration_error(str(file), "matrices of OpenCV's FileStorage", "none")
+    return found
+
+
+def _pick(where: str, given: Mapping[str, Any], names: Sequence[str], what: str) -> NDArray[Any]:
+    """Return the entry with one of the usual names."""
+    for name in names:
+        if name in given:
+            return np.asarray(given[name])
+    raise InputError(
+        where,
+        expected=f"{what} ({', '.join(names)})",
+        found=", ".join(sorted(given)) or "nothing",
+        todo="Add it to the file, or give the file that has it: --lens may come twice.",
+    )
+
+
+def _image_size(given: Mapping[str, Any], otherwise: tuple[int, int]) -> tuple[int, int]:
+    """Return the image size in a file, or the camera's own if the file has none."""
+    for wide, high in (("image_width", "image_height"), ("image_Width", "image_Height")):
+        if wide in given and high in given:
+            return int(given[wide]), int(given[high])
+    for name in ("image_size", "size", "imageSize"):
+        if name in given and np.size(given[name]) == 2:
+            width, height = np.ravel(given[name]).tolist()
+            return int(width), int(height)
+    return otherwise
+
+
+def _lens(
+    where: str, name: str, table: Mapping[str, Any], size: tuple[int, int]
+) -> LensCalibration:
+    """Return the lens of a table at the size of the camera's images."""
+    optics = read_optics(where, table)
+    require_optics(where, optics.size, optics.focal, optics.principal_point)
+    fx, fy = optics.focal.tolist()
+    if abs(fx - fy) > SQUARE * fx:
+        raise calibration_error(
+            f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
+        )
+    scale = _scale(where, optics.size, size)
+    focal = 0.5 * (fx + fy) * scale
+    # Pixel centres are whole numbers, so that the image's corner is at -0.5.
+    middle = (optics.principal_point + 0.5) * scale - 0.5
+    deviations = {
+        "focal_std_px": _deviation(where, table, "focal_std_px", scale, FOCAL_STD * focal),
+        "principal_point_std_px": _deviation(
+            where, table, "principal_point_std_px", scale, PRINCIPAL_POINT_STD * size[0]
+        ),
+        "distortion_std": _deviation(where, table, "distortion_std", 1.0, DISTORTION_STD),
+    }
+    try:
+        return LensCalibration(
+            id=name,
+            image_size=size,
+            focal_px=focal,
+            principal_point_px=(float(middle[0]), float(middle[1])),
+            distortion=tuple(optics.distortion.tolist()),
+            **deviations,
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        entry = ".".join(map(str, first["loc"]))
+        raise calibration_error(
+            f"{where}.{entry}", str(first["msg"]), str(first["input"])
+        ) from error
+
+
+def _deviation(
+    where: str, table: Mapping[str, Any], key: str, scale: float, otherwise: float
+) -> float:
+    value = table.get(key)
+    if value is None:
+        return otherwise
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise calibration_error(f"{where}.{key}", "a number", repr(value))
+    return float(value) * scale
+
+
+def _scale(where: str, size: Floats, own: tuple[int, int]) -> float:
+    """Return pixels of the camera's image per pixel of the calibrated one."""
+    scale = np.array(own) / size
+    if abs(scale[0] - scale[1]) > 0.002 * scale[0]:
+        raise InputError(
+            f"{where}: size",
+            expected=f"{own[0]} x {own[1]} px, the camera's images, or the same shape",
+            found=f"{size[0]:g} x {size[1]:g}",
+            todo="Give a lens that was calibrated in images of the video's shape: a crop has "
+            "another principal point.",
+        )
+    return float(scale[0])
+
+
+def _unknown_camera(where: str, name: str, sizes: Mapping[str, object]) -> InputError:
+    return InputError(
+        where,
+        expected=f"a static camera of match.yaml: {', '.join(sizes)}",
+        found=repr(name),
+        todo="Correct the name, or read one camera alone: --camera NAME.",
+    )
