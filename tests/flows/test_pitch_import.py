@@ -94,6 +94,6 @@ def test_clicks_of_an_annotation_tool_go_into_a_match_by_the_command(tmp_path):
     command = ["import", "--clicks", str(file), "--out", str(folder)]
     assert "one image per static camera" in worldpose(*command).err
     done = succeed(*command, "--camera", "east")
-    assert "'halfway_far' is clicked more than once. Which one is meant?" in done.err
+    assert "'halfway_far' is clicked at (10, 20) and at (30, 40). Which one is meant?" in done.err
     assert (folder / "annotations" / "static_calibration" / "east.json").is_file()
     assert worldpose(*command, "--fps", "25").code == 2
