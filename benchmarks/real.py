@@ -150,7 +150,7 @@ def pair_feet(
 
 
 def score_static_pair(folder: Path, frames: int | None) -> Metrics:
-    """Return metrics of both cameras' clicks, and of the feet of people whom both see."""
+    """Return metrics of both cameras' clicks, and of the feet of people in both images."""
     files = [
         f"{side}_{name}" for side in static_pair.SIDES for name in ("camera.mp4", "keypoints.xml")
     ]

@@ -182,7 +182,7 @@ def read_catalog(file: Path | None) -> dict[str, Checkpoint]:
 def pull(checkpoint: Checkpoint, folder: Path, progress: Progress) -> Path:
     """Download the missing files of a checkpoint, check them, and return its folder in the cache.
 
-    What an interrupted pull has downloaded stays in a hidden folder, and the next pull goes on
+    What an interrupted pull has downloaded stays in a hidden folder, and the next pull resumes
     there. A file with another digest is removed.
 
     Raises:
@@ -260,7 +260,7 @@ def _fetch_file(
     except (OSError, HTTPException) as error:
         raise WorldposeError(
             f"{name}: downloading {url} failed: {type(error).__name__}: {error}. Run the command "
-            "again: it goes on where it stopped."
+            "again: it resumes where it stopped."
         ) from error
     found = _digest(path)
     if found != file.sha256:

@@ -103,7 +103,7 @@ def pull_model(
 ) -> None:
     """Download a checkpoint, check its SHA-256, and keep it in the cache.
 
-    An interrupted download goes on with the next call. No other command downloads anything.
+    The next call resumes an interrupted download. No other command downloads anything.
 
     Example: worldpose models pull rtdetr-v2-r18
     """

@@ -1,4 +1,4 @@
-"""Which of two clicks with one label is meant: what the other clicks of the image say."""
+"""Compares two clicks with one label: what the other clicks of the image say."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def test_the_local_hub_speaks_the_protocol_that_the_hubs_own_client_expects(hub,
 
 def test_an_interrupted_pull_shows_nothing_and_goes_on_where_it_stopped(hub, tmp_path):
     hub.cut_after = 1_500_000
-    with pytest.raises(WorldposeError, match="goes on where it stopped"):
+    with pytest.raises(WorldposeError, match="resumes where it stopped"):
         pull(checkpoint(), tmp_path, quiet)
     assert not (tmp_path / "toy").exists()
     hub.cut_after = None

@@ -1,4 +1,4 @@
-"""A complete run is looked at and downloaded on the page of its match."""
+"""The page of a match shows and downloads the results of a complete run."""
 
 import io
 import zipfile

@@ -99,7 +99,7 @@ def write_stills(folder):
 
 
 def write_mvor(folder):
-    """One moment: one person whom three cameras see without any error."""
+    """One moment: one person, seen by three cameras without any error."""
     folder.mkdir()
     rng = np.random.default_rng(1)
     joints = np.array([0.3, 0.2, 1.2]) + rng.uniform(-0.3, 0.3, (17, 3))

@@ -59,10 +59,10 @@ class BroadcastCalibrationSettings(Record):
     """The same of a point that has its place from the Laws of the Game [m], plan and height: prior,
     which the clip's own markings correct."""
     crown_std_m: float = Field(default=0.1, ge=0, le=1)
-    """Of a crown that nobody measured, from the standard 0.2 m, standard deviation [m]: prior. The
+    """Of an unmeasured crown, from the standard 0.2 m, standard deviation [m]: prior. The
     pitches of two real cameras have about 0.1 m; 0 = as given."""
     pitch_size_std_m: float = Field(default=0.1, ge=0, le=10)
-    """Of a length or width that nobody measured, from 105 and 68 m, standard deviation [m]: prior.
+    """Of an unmeasured length or width, from 105 and 68 m, standard deviation [m]: prior.
     Top competitions prescribe this size; 0 = as given. A pitch of another size needs pitch.json."""
     field_weight: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the loss of markings (M3; the paper's 1)."""

@@ -25,7 +25,7 @@ STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 TILE: Final = 1024
 """Longest side of an enlarged tile without its margin [px]: bounds memory."""
 BLEND: Final = 1.25
-"""Factor by which heights of both passes overlap [1]: nobody at the limit is lost."""
+"""Factor by which heights of both passes overlap [1]: no person at the limit is lost."""
 STANDING: Final = 1.8
 """Height of an upright person [m]."""
 GRID: Final = 2.0

@@ -170,7 +170,7 @@ class PitchTemplate:
     surveyed: frozenset[str] = frozenset()
     """Names of the points with a surveyed position; the others have that of the Laws."""
     assumed: frozenset[str] = frozenset()
-    """Those of `length`, `width`, `crown` that nobody measured: there is no surveyed point, and
+    """Those of `length`, `width`, `crown` without a measurement: there is no surveyed point, and
     they have the values of the standard pitch."""
 
     @classmethod

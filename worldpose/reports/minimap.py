@@ -22,7 +22,7 @@ RADIUS_PX: Final = 8
 def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
     """Yield the pitch from above, an image (height, width, 3) RGB per frame of `positions`.
 
-    A disc is a triangulated person, a ring one whom the feet alone place; the label is the roster
+    A disc is a triangulated person, a ring one placed by the feet alone; the label is the roster
     id, or else the person's number. Images have even sides.
     """
     half = 0.5 * np.array([pitch.length, pitch.width]) + MARGIN_M

@@ -43,7 +43,7 @@ PART_OVERLAP: Final = 0.3
 """Share of the smaller box from which two boxes may be of one person [1]. Second boxes of a person
 on the real pair: 0.3 to 1.0; people apart: 0."""
 COVER_HEIGHT_M: Final = 1.7
-"""Height of a person whom a camera should see [m]."""
+"""Height of a person that a camera should see [m]."""
 MIN_COVER_SIZE: Final = 0.6
 """Such a camera shows the person at least this large, relative to the camera that does see it."""
 PIXEL_STD: Final = 1.0

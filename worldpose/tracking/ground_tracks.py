@@ -196,7 +196,7 @@ def track_on_plane(
         margin_m: people always farther outside than this are bystanders [m].
         triangulated: people who are triangulated in some frames; None = none.
         covering: (frames, cameras, detections), cameras that should see a person there; None =
-            not known. People whom few of them see are dropped.
+            not known. People seen by few of them are dropped.
     """
     frames, cameras = positions.xy.shape[:2]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)

@@ -62,7 +62,7 @@ def test_small_people_are_seen_in_enlarged_tiles_and_tall_ones_are_not():
         np.testing.assert_allclose(tile.to_frame(seen(tile, box)).boxes, [box], atol=1e-9)
     tall = [(x, 400.0, x + 20.0, 440.0) for x in np.arange(100.0, 1900.0, 50.0)]
     assert find_small(people(*small, *tall), SHAPE, step) == []
-    # Where nobody is sure, everybody tells the size.
+    # If no box is sure, all boxes give the size.
     assert find_small(people(*small, score=0.1), SHAPE, step)
     assert find_small(people(), SHAPE, step) == []
 
@@ -78,7 +78,7 @@ def test_an_enlarged_tile_replaces_small_people_and_keeps_tall_ones():
     small, moved = (300.0, 300.0, 310.0, 320.0), (301.0, 300.0, 311.0, 321.0)
     tall, other = (295.0, 280.0, 320.0, 340.0), (900.0, 300.0, 910.0, 320.0)
     merged = tile.merge(people(small, tall, other), seen(tile, moved, tall))
-    # The tile is no judge of tall people, nor of anybody outside of it.
+    # The tile is no judge of tall people, nor of people outside of it.
     np.testing.assert_allclose(merged.boxes, [tall, other, moved], atol=1e-9)
 
 
