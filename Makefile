@@ -34,7 +34,7 @@ demo demo-quick demo-match: install
 	@$(BIN)/worldpose simulate $(MATCH) --out demo/match
 	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
 	@$(BIN)/worldpose run demo/match --project demo/project $(RUN)
-	@echo "3/4  figures against truth"
+	@echo "3/4  metrics against truth"
 	@$(BIN)/worldpose evaluate --prediction demo/match --reference demo/match/reference --project demo/project
 	@echo "4/4  the report"
 	@$(BIN)/worldpose report demo/match --project demo/project --out demo/report.html

@@ -161,7 +161,7 @@ def evaluate(
         for name, _, value, meaning in score_rows(scores.evaluation)
         if not name.startswith("cameras.")
     ]
-    print_table("against the reference", ("figure", ">value", "meaning"), rows)
+    print_table("against the reference", ("metric", ">value", "meaning"), rows)
     people = {f"{person.person_id}": person for person in scores.people}
     _print_rows("person", _PERSON_COLUMNS, people)
     cameras = {camera.camera_id: camera.errors for camera in scores.cameras}

@@ -134,7 +134,7 @@ def _print(versions: list[NetVersion], folder: Path) -> None:
         (v.net, v.figure, f"{v.before:.3f}", f"{v.after:.3f}", str(len(v.held_out)), _verdict(v))
         for v in versions
     ]
-    columns = ("net", "figure", ">before", ">after", ">held-out pictures", "")
+    columns = ("net", "metric", ">before", ">after", ">held-out images", "")
     print_table("fine-tuning", columns, rows)
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:

@@ -292,7 +292,7 @@ def print_iterations(store: Store, found: Iterations) -> None:
     marks = marks_of(store, found)
     rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in KINDS]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
-    print_table("iterations", ("figure", *heads), rows)
+    print_table("iterations", ("metric", *heads), rows)
     line("b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)")
     line(
         f"iteration {found.kept.number} stands, as run {found.record.run_id}: {found.ended}; "

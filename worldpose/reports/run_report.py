@@ -245,7 +245,7 @@ def _record(run: RunRecord, seconds: Mapping[str, float]) -> tuple[Table, ...]:
         Table("What was run", ("", ""), tuple(_about(run))),
         Table("Settings other than the defaults", settings, tuple(_settings(run))),
         Table("Units of work", ("unit", "", ">seconds"), tuple(_units(run, seconds))),
-        Table("Quality metrics", ("unit", "figure", ">value"), tuple(_figures(run))),
+        Table("Quality metrics", ("unit", "metric", ">value"), tuple(_figures(run))),
     )
 
 
