@@ -21,7 +21,16 @@ from worldpose.detection.bundled_nets import (
     place_net,
     precision,
 )
-from worldpose.detection.enlargement import STEPS, Part, find_groups, find_small
+from worldpose.detection.enlargement import (
+    SIZING_ZOOM,
+    STEPS,
+    Part,
+    choose_reduction,
+    find_groups,
+    find_small,
+    resize,
+    restore_size,
+)
 from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.detection.suppression import suppress
 
@@ -34,8 +43,9 @@ NMS_IOU: Final = 0.7
 class BundledDetector:
     """A net that detects the centres of people and the sides of their boxes.
 
-    The detector runs again on enlarged tiles where people are small, then on enlarged crops of
-    groups of people who occlude one another.
+    Without a camera, a pass over the reduced frame tells the size of its people: a frame of large
+    people is seen reduced. The detector runs again on enlarged tiles where people are small, then
+    on enlarged crops of groups of people who occlude one another.
     """
 
     def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
@@ -55,6 +65,16 @@ class BundledDetector:
         return [self._people(image, parts) for image in images]
 
     def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
+        if parts is None:
+            size = (image.shape[1], image.shape[0])
+            sized = self._detect(resize(image, SIZING_ZOOM))
+            zoom = choose_reduction(restore_size(sized, size, SIZING_ZOOM))
+            if zoom < 1.0:
+                return restore_size(self._find_all(resize(image, zoom), None), size, zoom)
+        return self._find_all(image, parts)
+
+    def _find_all(self, image: Image, parts: Sequence[Part] | None) -> People:
+        """Return the people in an image, with passes over its parts."""
         found = self._detect(image)
         if parts is None:
             for step in STEPS:

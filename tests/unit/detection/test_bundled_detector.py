@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from worldpose.detection.enlargement import expect_small, find_groups, find_small
+from worldpose.detection.bundled_detector import BundledDetector
+from worldpose.detection.enlargement import (
+    choose_reduction,
+    expect_small,
+    find_groups,
+    find_small,
+    resize,
+    restore_size,
+)
 from worldpose.detection.interfaces import People
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
@@ -109,3 +117,51 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
         found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
         assert found == wanted
+
+
+def test_a_frame_of_large_people_is_seen_reduced():
+    for height, zoom in ((99.0, 1.0), (101.0, 0.5), (199.0, 0.5), (201.0, 0.25)):
+        boxes = [(x, 100.0, x + 30.0, 100.0 + height) for x in (100.0, 300.0, 500.0)]
+        assert choose_reduction(people(*boxes)) == zoom
+    # Two unsure boxes of fragments do not make the people small.
+    large = people((100.0, 100.0, 160.0, 310.0))
+    parts = people(*[(x, 100.0, x + 9.0, 130.0) for x in (120.0, 140.0)], score=0.1)
+    both = People(
+        np.concatenate([large.boxes, parts.boxes]), np.concatenate([large.scores, parts.scores])
+    )
+    assert choose_reduction(both) == 0.25
+    assert choose_reduction(people()) == 1.0
+
+
+def test_boxes_of_a_reduced_frame_lie_where_people_are():
+    picture = np.zeros((301, 411, 3), dtype=np.uint8)
+    picture[40:90, 36:56] = 255
+    rows, columns = np.nonzero(resize(picture, 0.5)[..., 0] > 127)
+    seen_at = (columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5)
+    back = restore_size(people(seen_at), (411, 301), 0.5)
+    np.testing.assert_allclose(back.boxes, [[35.5, 39.5, 55.5, 89.5]], atol=0.7)
+
+
+class SizesSeen(BundledDetector):
+    """Records the sizes of the images that the net sees; finds a person of a given height."""
+
+    def __init__(self, height):
+        self.height, self.shapes = height, []
+
+    def _detect(self, image):
+        zoom = image.shape[0] / SHAPE[0]
+        self.shapes.append(image.shape[:2])
+        return people(tuple(zoom * side for side in (500.0, 300.0, 560.0, 300.0 + self.height)))
+
+
+def test_the_detector_looks_at_the_size_that_suits_the_people():
+    image = np.zeros(SHAPE, dtype=np.uint8)
+    for height, last in ((60.0, (1080, 1920)), (150.0, (540, 960)), (260.0, (270, 480))):
+        detector = SizesSeen(height)
+        (found,) = detector.detect([image])
+        assert detector.shapes == [(540, 960), last]
+        np.testing.assert_allclose(found.boxes, [[500.0, 300.0, 560.0, 300.0 + height]], atol=2.0)
+    # A calibrated camera tells the sizes: there is no second look.
+    detector = SizesSeen(150.0)
+    detector.detect_parts([image], [])
+    assert detector.shapes == [(1080, 1920)]
