@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import ClipArray, Floats
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.geometry import Camera, projection
-from worldpose.triangulation.detections import ClipDetections, shift_in_time
+from worldpose.triangulation.detections import shift_in_time
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
@@ -77,7 +77,7 @@ class CameraClocks:
 
 def estimate_clocks(
     cameras: Camera,
-    detections: ClipDetections,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TriangulationSettings,
 ) -> CameraClocks:
@@ -99,10 +99,7 @@ def estimate_clocks(
     parts = _choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
-        sums = [
-            _sum_equations(rig, detections.read(part.start, part.stop), late, fps, loose)
-            for part in parts
-        ]
+        sums = [_sum_equations(rig, detections[part], late, fps, loose) for part in parts]
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
         # A common offset moves people along their path and changes no residual.
@@ -171,7 +168,7 @@ def _common_score(sums: list[_Sums]) -> Floats:
 
 def _sum_equations(
     rig: Rig,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     late: Floats,
     fps: float,
     settings: TriangulationSettings,

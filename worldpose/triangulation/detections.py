@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import ClipArray, Flags, Floats, Integers
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import ClipArray, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 
@@ -17,61 +16,35 @@ CHUNK: Final = 512
 """Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""
 
 
-@dataclass(frozen=True, eq=False)
-class ClipDetections:
-    """Detections of tracked people, loaded one chunk of frames at a time.
+def read_frames(
+    detections: KeypointDetections[ClipArray], frames: slice | Integers, late: Floats | None
+) -> KeypointDetections:
+    """Return the detections of some frames of a clip, on the common clock.
 
-    Attributes:
-        keypoints: (frames, cameras, detections, 17, 2) [px].
-        confidence: (frames, cameras, detections, 17).
-        detection_index: (frames, cameras, persons).
+    Args:
+        detections: of the clip, as detected.
+        frames: from a first frame to before a last one, or single frames.
         late: (cameras,) [frame], clock offsets to correct; None = no correction.
     """
-
-    keypoints: ClipArray
-    confidence: ClipArray
-    detection_index: ClipArray
-    late: Floats | None = None
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return self.confidence.shape[0]
-
-    def read(self, first: int, last: int) -> TrackedDetections:
-        """Return the detections of the frames from `first` to before `last`."""
-        late = np.zeros(1) if self.late is None else np.nan_to_num(self.late)
-        reach = math.ceil(float(np.abs(late).max(initial=0.0)))
-        start = max(0, first - reach)
-        wide = slice(start, last + reach)
-        detections = TrackedDetections(
-            self.keypoints[wide], self.confidence[wide], self.detection_index[wide]
-        )
-        if reach:
-            detections = shift_in_time(detections, late)
-        return detections[first - start : last - start]
-
-    def read_frames(self, frames: Integers) -> TrackedDetections:
-        """Return the detections of single frames; those of no frame if `frames` is empty."""
-        if not len(frames):
-            return self.read(0, 0)
-        each = [self.read(frame, frame + 1) for frame in frames.tolist()]
-        return TrackedDetections(
-            np.concatenate([one.keypoints for one in each]),
-            np.concatenate([one.confidence for one in each]),
-            np.concatenate([one.detection_index for one in each]),
-        )
-
-    def have_views(self, views: int) -> Flags:
-        """Return whether at least `views` cameras saw each person (frames, persons)."""
-        parts = [
-            (self.detection_index[start : start + CHUNK] >= 0).sum(axis=1) >= views
-            for start in range(0, max(1, self.frames), CHUNK)
-        ]
-        return np.concatenate(parts)
+    offsets = np.zeros(1) if late is None else np.nan_to_num(late)
+    reach = math.ceil(float(np.abs(offsets).max(initial=0.0)))
+    if not reach:
+        return detections[frames]
+    if isinstance(frames, slice):
+        start = max(0, frames.start - reach)
+        shifted = shift_in_time(detections[start : frames.stop + reach], offsets)
+        return shifted[frames.start - start : frames.stop - start]
+    each = [read_frames(detections, slice(frame, frame + 1), late) for frame in frames.tolist()]
+    if not each:
+        return read_frames(detections, slice(0, 0), late)
+    return KeypointDetections.from_keypoints(
+        np.concatenate([one.keypoints for one in each]),
+        np.concatenate([one.confidence for one in each]),
+        np.concatenate([one.detection_index for one in each]),
+    )
 
 
-def shift_in_time(detections: TrackedDetections, late: Floats) -> TrackedDetections:
+def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetections:
     """Return the detections shifted to the common clock, one per person and camera.
 
     Keypoints are interpolated linearly between two frames and are missing unless both have them.
@@ -105,11 +78,11 @@ def shift_in_time(detections: TrackedDetections, late: Floats) -> TrackedDetecti
             array[:, camera] = moved
     seen = np.isfinite(weights).any(axis=-1)
     index = np.where(seen, np.arange(persons), -1).astype(np.int16)
-    return TrackedDetections(pixels, weights, index)
+    return KeypointDetections.from_keypoints(pixels, weights, index)
 
 
 def check_shapes(
-    cameras: Camera, detections: TrackedDetections, camera_covariance: Floats | None
+    cameras: Camera, detections: KeypointDetections, camera_covariance: Floats | None
 ) -> None:
     """Require arrays of matching shapes, and valid indices.
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -77,7 +77,7 @@ class NoiseModel:
 
 def learn_noise(
     rig: Rig,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     shift: Floats,
     noise: tuple[float, float],
     limit: float,

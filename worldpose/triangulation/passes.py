@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry import Camera
 from worldpose.triangulation.detections import check_shapes
@@ -104,7 +104,7 @@ class Triangulation:
 
 def triangulate_joints(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: Floats | None = None,
     model: DetectorModel | None = None,
@@ -169,7 +169,7 @@ def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
 
 def learn_detector(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> DetectorModel:
@@ -191,7 +191,7 @@ class _Passes:
 
 def _run_passes(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None,
     known: DetectorModel | None,
