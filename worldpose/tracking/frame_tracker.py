@@ -9,7 +9,6 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry import Camera
-from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.joins import (
     Candidate,
@@ -20,7 +19,13 @@ from worldpose.tracking.joins import (
     fit_track_ends,
     join_costs,
 )
-from worldpose.tracking.pair_births import Pairs, group_pairs, judge_pairs
+from worldpose.tracking.pair_births import (
+    CameraGates,
+    CameraVisibility,
+    Pairs,
+    group_pairs,
+    judge_pairs,
+)
 from worldpose.tracking.person import Person, Sighting, separations
 from worldpose.tracking.ray_matching import (
     intersect_people,

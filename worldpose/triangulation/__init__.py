@@ -12,8 +12,7 @@ from worldpose.triangulation.chunking import (
     reconstruct_chunks,
     reconstruct_joints,
 )
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
-from worldpose.triangulation.detections import shift_in_time
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.passes import Triangulation, triangulate_joints
 from worldpose.triangulation.reports import TriangulationReport

@@ -17,13 +17,13 @@ from data_contracts.arrays import ClipArray, Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
-from worldpose.triangulation.detections import CHUNK, check_shapes, read_frames
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, read_frames
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
 from worldpose.triangulation.passes import (
     DetectorModel,
     Triangulation,
+    check_shapes,
     learn_detector,
     sample_frames,
     triangulate_joints,
@@ -37,6 +37,8 @@ from worldpose.triangulation.smoothing import (
     smooth_joints,
 )
 
+CHUNK: Final = 512
+"""Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""
 MARGIN: Final = 2.0
 """Margin on either side for smoothing [s]: frames farther away move a joint by less than the step
 that ends the iteration, across gaps too."""

@@ -29,8 +29,8 @@ from worldpose.triangulation.batched_gauss_newton import (
     USED,
     weigh,
 )
-from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Observations, Rig, gather, linearize
+from worldpose.triangulation.solving import consensus
 
 BINS: Final = 8
 """Confidence classes with equally many observations."""
