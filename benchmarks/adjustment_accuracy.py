@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -53,17 +53,15 @@ def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Cl
     covariance = np.stack([each.estimate.covariance for each in known.values()])
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
-    placed = triangulate_joints(cameras, TrackedDetections(*arrays, index), settings, covariance)
+    detections = KeypointDetections.from_keypoints(*arrays, index, scene.truth.frames)
+    placed = triangulate_joints(cameras, detections, settings, covariance)
     surveyed = PitchTemplate.from_spec(scene.surveyed)
     return Clip(
         cameras=cameras,
         covariance=covariance,
         clicks=tuple(Clicks.of(each, surveyed) for each in known.values()),
-        frame=scene.truth.frames,
         fps=fps,
-        keypoints=seen.keypoints,
-        confidence=seen.confidence,
-        detection_index=index.astype(np.int64),
+        detections=detections,
         joints=placed.joints,
         views=placed.views.astype(np.int64),
         triangulation=settings,
@@ -121,7 +119,7 @@ def main() -> None:
         begin = time.process_time()
         adjusted = adjust_cameras(clip)
         spent = time.process_time() - begin
-        moments = np.linspace(0, len(clip.frame) - 1, MOMENTS).astype(int)
+        moments = np.linspace(0, len(clip.detections.frame) - 1, MOMENTS).astype(int)
         places = scene.truth.joints[moments][:, :, 15:17].mean(axis=2).reshape(-1, 3)
         places[:, 2] = painted.height(places[:, 0], places[:, 1])
         true = Camera.stack([scene.cameras[name] for name in known])

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
@@ -45,7 +45,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scene, simulate_scene
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints, undo_swaps
 
 BODY = load_open_body()
 SETTINGS, TRIANGULATION = BodyFittingSettings(), TriangulationSettings()
@@ -87,7 +87,7 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, scenario.fps, TrackingSettings()).detection_index
     placed = reconstruct_joints(
-        cameras, TrackedDetections(*arrays, index), scenario.fps, TRIANGULATION
+        cameras, KeypointDetections.from_keypoints(*arrays, index), scenario.fps, TRIANGULATION
     ).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     begin = time.process_time()
@@ -152,18 +152,17 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     arrays = (seen.keypoints, seen.confidence)
     index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
     full = reconstruct_joints(
-        cameras, TrackedDetections(*arrays, index), fps, TRIANGULATION
+        cameras, KeypointDetections.from_keypoints(*arrays, index), fps, TRIANGULATION
     ).triangulation.joints
     who, away = nearest(full, scene.truth.joints)
     index = index[:, :, away < 0.5].copy()
     who = who[away < 0.5]
     dark = thin_out(scene, index, left, seed)
-    placed = reconstruct_joints(
-        cameras, TrackedDetections(*arrays, index), fps, TRIANGULATION
-    ).triangulation
+    detections = KeypointDetections.from_keypoints(*arrays, index)
+    placed = reconstruct_joints(cameras, detections, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
-    right = unswap(seen.keypoints, index, placed.exchanged)
-    static = find_ray_constraints(cameras, right, index, joints)
+    unswapped = undo_swaps(detections, placed.exchanged)
+    static = find_ray_constraints(cameras, unswapped, joints)
     ground = PitchTemplate.from_spec(scene.surveyed).height
 
     def fit(views: list[RayConstraints], monocular: MonocularPoses | None = None) -> BodyFit:

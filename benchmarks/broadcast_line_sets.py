@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pitch_lines
+from soccernet import soccernet_markings
 
 from data_contracts.broadcast_calibration import KeyFrame
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.errors import WorldposeError
-from worldpose.formats.soccernet import soccernet_markings
 from worldpose.geometry import Camera
 
 _, SIZE = pitch_lines.SETS["wc14"]

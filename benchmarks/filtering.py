@@ -14,7 +14,7 @@ import argparse
 
 import numpy as np
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body import find_body
 from worldpose.body_fitting import (
     BodyFittingSettings,
@@ -37,7 +37,7 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
 from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints, unswap
+from worldpose.triangulation import TriangulationSettings, reconstruct_joints, undo_swaps
 
 PLANTED = 0.06
 """Share of joints with planted gross errors."""
@@ -72,11 +72,11 @@ def count_rejected(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     cameras = Camera.stack(list(scene.given.values()))
     tracks = track_people(cameras, keypoints, confidence, scenario.fps, TrackingSettings())
     settings, how = TriangulationSettings(), BodyFittingSettings()
-    detections = TrackedDetections(keypoints, confidence, tracks.detection_index)
+    detections = KeypointDetections.from_keypoints(keypoints, confidence, tracks.detection_index)
     placed = reconstruct_joints(cameras, detections, scenario.fps, settings).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
-    right = unswap(keypoints, tracks.detection_index, placed.exchanged)
-    alone = find_ray_constraints(cameras, right, tracks.detection_index, placed.joints)
+    unswapped = undo_swaps(detections, placed.exchanged)
+    alone = find_ray_constraints(cameras, unswapped, placed.joints)
     fit = fit_bodies(
         find_body(how.body_model),
         ClipEvidence(
@@ -92,9 +92,7 @@ def count_rejected(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     sure = perceived_covariance(fit.covariance, placed.common_bias)
     views = view_bodies(cameras, perceived_joints(fit.joints, fit.offsets), sure)
     suspects = TriangulatedDetections(
-        keypoints,
-        confidence,
-        tracks.detection_index,
+        detections,
         placed.offsets,
         placed.exchanged,
         np.zeros(seen.person.shape, dtype=bool),

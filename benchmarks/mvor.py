@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints
@@ -122,7 +122,9 @@ def measure(
         found = np.empty((0, 8, 3))
         used = (tracks.detection_index[0] >= 0).sum(axis=0)
         if len(tracks.person):
-            detections = TrackedDetections(image[..., :2], image[..., 2], tracks.detection_index)
+            detections = KeypointDetections.from_keypoints(
+                image[..., :2], image[..., 2], tracks.detection_index
+            )
             placed = reconstruct_joints(cameras, detections, 25.0, TriangulationSettings())
             found = placed.triangulation.joints[0][:, COCO].astype(np.float64)
         off = np.linalg.norm(truth[:, None] - found, axis=-1)

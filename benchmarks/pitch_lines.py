@@ -23,10 +23,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from soccernet import soccernet_markings
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.formats.soccernet import soccernet_markings
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (

@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from joint_regions import JOINT_GROUPS, region_counts
 from numpy.typing import NDArray
 
 from data_contracts.run import RunRecord
@@ -47,7 +48,6 @@ from flows.settings import selected_stages
 from flows.stage import Stage
 from worldpose.evaluation import evaluate_joints
 from worldpose.evaluation.matching import joint_distances, match_people
-from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
 from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from common import stadium_rig
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -76,7 +76,7 @@ def main() -> None:
 
     def ours(confidence: np.ndarray, settings: TriangulationSettings) -> np.ndarray:
         result = triangulate_joints(
-            cameras, TrackedDetections(keypoints, confidence, index), settings
+            cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), settings
         )
         return result.joints.reshape(-1, 3)
 

@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -63,7 +63,9 @@ def score_ways(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]
     for way in WAYS:
         placed = triangulate_joints(
             cameras,
-            TrackedDetections(seen.keypoints, seen.confidence, tracks.detection_index),
+            KeypointDetections.from_keypoints(
+                seen.keypoints, seen.confidence, tracks.detection_index
+            ),
             TriangulationSettings(offsets=way),
         )
         found = JointTracks(scene.truth.frames, np.asarray(tracks.person), placed.joints)

@@ -23,14 +23,14 @@ Image = NDArray[np.uint8]
 
 
 class ClipArray(Protocol):
-    """An array that can be sliced along frames, its first dimension; NumPy's arrays can."""
+    """An array that can be read by frames, its first dimension; NumPy's arrays can."""
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape, with frames first."""
 
-    def __getitem__(self, frames: slice, /) -> NDArray[Any]:
-        """Return the values of a chunk of frames."""
+    def __getitem__(self, frames: slice | Integers, /) -> NDArray[Any]:
+        """Return the values of some frames."""
 
 
 Missing = Literal["nan", "-1", "0", "none"]

@@ -4,26 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypeVar
 
-from data_contracts.arrays import AnyFloats, ArrayLayout, Flags, Integers
+from data_contracts.arrays import AnyFloats, ArrayLayout, ClipArray, Flags, Integers
 from data_contracts.conventions import COCO17
+
+Array = TypeVar("Array", bound=ClipArray, default=AnyFloats, covariant=True)
+"""Arrays of detections: NumPy's by default, or `ClipArray`, which also admits those of a store."""
 
 
 def _no_frames() -> Integers:
     return np.empty(0, dtype=np.int64)
 
 
+def _no_people() -> NDArray[np.integer]:
+    return np.empty((0, 0, 0), dtype=np.int16)
+
+
 @dataclass(frozen=True, eq=False)
-class KeypointDetections:
-    """Detected people, the record from a detector to the store.
+class KeypointDetections(Generic[Array]):
+    """Detected people, the record of keypoints from a detector to triangulation and filtering.
 
     The leading dimensions `...` are (frames, detections) for one camera, (frames, cameras,
     detections) for several cameras, and (detections,) for one image. Missing entries are NaN.
-    After tracking, `TrackedDetections` also holds which detection is which person.
+
+    The arrays of a `KeypointDetections[ClipArray]` can lie in a store; a slice of its frames, or an
+    array of their indices, reads them into a `KeypointDetections` in memory.
 
     Attributes:
         keypoints: (..., 17, 2) [px], COCO-17; NaN where not found.
@@ -32,36 +42,49 @@ class KeypointDetections:
         score: (...) in (0, 1], confidence of each person.
         frame: (frames,) int64, frame numbers, rising; empty if the place of a row is its number,
             and for one image.
+        detection_index: (frames, cameras, persons), each tracked person's detection; -1 = not seen.
+            No frames before tracking.
     """
 
-    keypoints: AnyFloats
-    confidence: AnyFloats
-    boxes: AnyFloats
-    score: AnyFloats
+    keypoints: Array
+    confidence: Array
+    boxes: Array
+    score: Array
     frame: Integers = field(default_factory=_no_frames)
+    detection_index: NDArray[np.integer] = field(default_factory=_no_people)
 
-    @classmethod
-    def from_keypoints(cls, keypoints: AnyFloats, confidence: AnyFloats) -> KeypointDetections:
+    @staticmethod
+    def from_keypoints(
+        keypoints: AnyFloats,
+        confidence: AnyFloats,
+        detection_index: NDArray[np.integer] | None = None,
+        frame: Integers | None = None,
+    ) -> KeypointDetections:
         """Return detections without boxes and scores, which are NaN and read-only."""
         shape = confidence.shape[:-1]
         nan = np.array(np.nan, dtype=confidence.dtype)
-        return cls(
-            keypoints, confidence, np.broadcast_to(nan, (*shape, 4)), np.broadcast_to(nan, shape)
+        return KeypointDetections(
+            keypoints,
+            confidence,
+            np.broadcast_to(nan, (*shape, 4)),
+            np.broadcast_to(nan, shape),
+            _no_frames() if frame is None else frame,
+            _no_people() if detection_index is None else detection_index,
         )
 
-    @classmethod
-    def empty(cls) -> KeypointDetections:
+    @staticmethod
+    def empty() -> KeypointDetections:
         """Return the detections of an image without people."""
-        return cls.from_keypoints(np.empty((0, 17, 2)), np.empty((0, 17)))
+        return KeypointDetections.from_keypoints(np.empty((0, 17, 2)), np.empty((0, 17)))
 
-    @classmethod
-    def from_arrays(cls, stored: Mapping[Any, Any]) -> KeypointDetections:
+    @staticmethod
+    def from_arrays(stored: Mapping[Any, Any]) -> KeypointDetections:
         """Return stored detections.
 
         Args:
             stored: arrays by name, those of `KEYPOINT_ARRAYS` and `frame`.
         """
-        return cls(
+        return KeypointDetections(
             keypoints=np.asarray(stored["keypoints"]),
             confidence=np.asarray(stored["confidence"]),
             boxes=np.asarray(stored["boxes"]),
@@ -69,11 +92,11 @@ class KeypointDetections:
             frame=np.asarray(stored["frame"]),
         )
 
-    @classmethod
-    def concatenate(cls, parts: Sequence[KeypointDetections]) -> KeypointDetections:
+    @staticmethod
+    def concatenate(parts: Sequence[KeypointDetections]) -> KeypointDetections:
         """Return the detections of all parts, which have the same frames (and cameras)."""
         axis = parts[0].score.ndim - 1
-        return cls(
+        return KeypointDetections(
             keypoints=np.concatenate([part.keypoints for part in parts], axis=axis),
             confidence=np.concatenate([part.confidence for part in parts], axis=axis),
             boxes=np.concatenate([part.boxes for part in parts], axis=axis),
@@ -81,8 +104,8 @@ class KeypointDetections:
             frame=parts[0].frame,
         )
 
-    @classmethod
-    def stack(cls, cameras: Sequence[KeypointDetections]) -> KeypointDetections:
+    @staticmethod
+    def stack(cameras: Sequence[KeypointDetections]) -> KeypointDetections:
         """Return the detections of several cameras as (frames, cameras, detections).
 
         Args:
@@ -98,19 +121,32 @@ class KeypointDetections:
             for c, each in enumerate(cameras):
                 rows = np.searchsorted(frame, each.frame)
                 stacked[name][rows, c, : each.score.shape[1]] = each.arrays()[name]
-        return cls(frame=frame, **stacked)
+        return KeypointDetections(frame=frame, **stacked)
 
-    def __getitem__(self, frames: slice | NDArray[np.intp]) -> KeypointDetections:
-        """Return the detections of some rows of the frame dimension."""
+    def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
+        """Return the detections of some rows of the frame dimension, in memory."""
         return KeypointDetections(
             keypoints=self.keypoints[frames],
             confidence=self.confidence[frames],
             boxes=self.boxes[frames],
             score=self.score[frames],
             frame=self.frame[frames] if len(self.frame) else self.frame,
+            detection_index=self.detection_index[frames]
+            if len(self.detection_index)
+            else self.detection_index,
         )
 
-    def select(self, detections: slice | NDArray[np.intp] | Flags) -> KeypointDetections:
+    def assign_people(self, detection_index: NDArray[np.integer]) -> KeypointDetections[Array]:
+        """Return the detections of tracked people; argument as the attribute."""
+        return replace(self, detection_index=detection_index)
+
+    def select_person(self, person: int) -> KeypointDetections[Array]:
+        """Return the same detections with one tracked person alone."""
+        return self.assign_people(self.detection_index[:, :, person : person + 1])
+
+    def select(
+        self: KeypointDetections, detections: slice | NDArray[np.intp] | Flags
+    ) -> KeypointDetections:
         """Return some detections of every frame (and camera), by index or by mask."""
         return KeypointDetections(
             keypoints=self.keypoints[..., detections, :, :],
@@ -120,7 +156,7 @@ class KeypointDetections:
             frame=self.frame,
         )
 
-    def without(self, keypoints: Flags) -> KeypointDetections:
+    def without(self: KeypointDetections, keypoints: Flags) -> KeypointDetections:
         """Return the detections without the marked keypoints (..., 17), which become NaN."""
         return replace(
             self,
@@ -128,7 +164,7 @@ class KeypointDetections:
             confidence=np.where(keypoints, np.nan, self.confidence),
         )
 
-    def reindex(self, frame: Integers) -> KeypointDetections:
+    def reindex(self: KeypointDetections, frame: Integers) -> KeypointDetections:
         """Return the detections on exactly these rising frames (n,); missing frames are NaN."""
         kept = self[np.flatnonzero(np.isin(self.frame, frame))]
         row = np.searchsorted(frame, kept.frame)
@@ -138,7 +174,7 @@ class KeypointDetections:
             padded[name][row] = array
         return KeypointDetections(frame=frame, **padded)
 
-    def arrays(self) -> dict[str, AnyFloats]:
+    def arrays(self: KeypointDetections) -> dict[str, AnyFloats]:
         """Return the arrays by their names in a store, `KEYPOINT_ARRAYS`."""
         return {
             "keypoints": self.keypoints,
@@ -146,32 +182,6 @@ class KeypointDetections:
             "boxes": self.boxes,
             "score": self.score,
         }
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedDetections:
-    """Detected keypoints of all cameras in some frames, and which detection is which person.
-
-    Attributes:
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less leaves a keypoint
-            out.
-        detection_index: (frames, cameras, persons), each person's detection; -1 = not seen.
-    """
-
-    keypoints: AnyFloats
-    confidence: AnyFloats
-    detection_index: NDArray[np.integer]
-
-    def __getitem__(self, frames: slice | NDArray[np.integer]) -> TrackedDetections:
-        """Return some frames."""
-        return TrackedDetections(
-            self.keypoints[frames], self.confidence[frames], self.detection_index[frames]
-        )
-
-    def select_person(self, person: int) -> TrackedDetections:
-        """Return the same detections with one person alone."""
-        return replace(self, detection_index=self.detection_index[:, :, person : person + 1])
 
 
 KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {

@@ -20,9 +20,9 @@ from data_contracts.records import (
 )
 from data_contracts.static_calibration import Pixel
 
-Origin = Literal["automatic", "corrected", "filled", "rejected"]
-"""Origin of a value: computed from observations, computed from corrected observations, filled by
-the motion model alone, or computed and rejected in a review."""
+Origin = Literal["automatic", "corrected", "rejected"]
+"""Origin of a result: computed from observations, computed from corrected observations, or computed
+and rejected in a review."""
 
 
 class ReviewRequest(Record):

@@ -26,7 +26,7 @@ def main() -> None:
     seen = wp.KeypointDetections.stack([wp.read_observations(files[name]) for name in names])
 
     tracks = wp.track_people(cameras, seen.keypoints, seen.confidence, float(fps))
-    people = wp.TrackedDetections(seen.keypoints, seen.confidence, tracks.detection_index)
+    people = seen.assign_people(tracks.detection_index)
     found = wp.reconstruct_joints(cameras, people, float(fps))
     joints = found.triangulation
 

@@ -33,7 +33,7 @@ def main() -> None:
     tracks = wp.track_people(
         cameras, seen.keypoints, seen.confidence, fps, pitch_size=(pitch.length, pitch.width)
     )
-    people = wp.TrackedDetections(seen.keypoints, seen.confidence, tracks.detection_index)
+    people = seen.assign_people(tracks.detection_index)
     first = wp.reconstruct_joints(cameras, people, fps, camera_covariance=covariance)
 
     adjusted = wp.adjust_cameras(
@@ -41,11 +41,8 @@ def main() -> None:
             cameras=cameras,
             covariance=covariance,
             clicks=tuple(wp.Clicks.of(known, pitch) for known in calibrations),
-            frame=seen.frame,
             fps=fps,
-            keypoints=seen.keypoints,
-            confidence=seen.confidence,
-            detection_index=tracks.detection_index,
+            detections=people,
             joints=first.triangulation.joints,
             views=first.triangulation.views,
             triangulation=wp.TriangulationSettings(),
@@ -59,8 +56,8 @@ def main() -> None:
         cameras, people, fps, camera_covariance=adjusted.covariance
     ).triangulation
 
-    keypoints = wp.unswap(seen.keypoints, people.detection_index, joints.exchanged)
-    rays = wp.find_ray_constraints(cameras, keypoints, people.detection_index, joints.joints)
+    unswapped = wp.undo_swaps(people, joints.exchanged)
+    rays = wp.find_ray_constraints(cameras, unswapped, joints.joints)
     evidence = wp.ClipEvidence(joints.joints, joints.covariance, fps, joints.common_bias, [rays])
     bodies = wp.fit_bodies(wp.find_body(), evidence, ground=pitch.height)
     tracked = wp.JointTracks(seen.frame, tracks.person, bodies.joints, bodies.covariance)

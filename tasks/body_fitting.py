@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Recipe, Work
 from tasks.clip_inputs import ClipInputs, open_clip
@@ -21,7 +22,6 @@ from worldpose.body_fitting import (
     BodyFittingSettings,
     ClipEvidence,
     MonocularPoses,
-    Pictures,
     RayConstraints,
     Shape,
     far_offsets,
@@ -33,7 +33,7 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
-from worldpose.triangulation import unswap
+from worldpose.triangulation import undo_swaps
 
 
 @unit_task
@@ -52,9 +52,7 @@ class ClipPeople:
 
     Attributes:
         clip: cameras, frames and clock.
-        keypoints: (frames, cameras, detections, 17, 2) [px], as triangulated: left-right swaps are
-            corrected.
-        detection_index: (frames, cameras, persons), index among the detections; -1 = not seen.
+        detections: of these people, as triangulated: left-right swaps are undone.
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
@@ -62,8 +60,7 @@ class ClipPeople:
     """
 
     clip: ClipInputs
-    keypoints: NDArray[np.floating]
-    detection_index: NDArray[np.integer]
+    detections: KeypointDetections
     person: NDArray[np.integer]
     joints: Floats
     covariance: Floats
@@ -75,11 +72,10 @@ def open_people(store: Store, work: Work) -> ClipPeople:
     clip = open_clip(store, work)
     placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
     tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
-    index = tracks["detection_index"].values
+    detections = clip.detections[:].assign_people(tracks["detection_index"].values)
     return ClipPeople(
         clip,
-        unswap(clip.keypoints[:], index, placed["exchanged"].values),
-        index,
+        undo_swaps(detections, placed["exchanged"].values),
         placed["person"].values,
         placed["joints"].values,
         placed["covariance"].values,
@@ -111,9 +107,7 @@ def fit_people(
         ground = PitchTemplate.from_spec(PitchSpec.model_validate(pitch)).height
     settings = BodyFittingSettings.model_validate(recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
-    alone = find_ray_constraints(
-        people.clip.cameras, people.keypoints, people.detection_index, people.joints
-    )
+    alone = find_ray_constraints(people.clip.cameras, people.detections, people.joints)
     fit = fit_bodies(
         model,
         ClipEvidence(
@@ -155,7 +149,7 @@ def publish_fit(
             "joint_offsets": fit.offsets,
             **(further or {}),
         },
-        coordinates={"frame": people.clip.frame, "person": people.person},
+        coordinates={"frame": people.detections.frame, "person": people.person},
         attributes={"body_model": model.name},
     )
     far = far_offsets(fit.offsets, people.common_bias)
@@ -169,8 +163,8 @@ def publish_fit(
             f"{joints}. One of the two is wrong there: compare both with the images, or export "
             "--stage retriangulation."
         )
-    pictures = Pictures(people.clip.cameras, people.keypoints, people.detection_index)
-    report = report_fit(fit, people.joints, people.clip.fps, pictures)
+    static = people.clip.cameras, people.detections
+    report = report_fit(fit, people.joints, people.clip.fps, static)
     result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))
 
 

@@ -49,7 +49,6 @@ class _People:
     """Tracked people in selected frames of all clips.
 
     Attributes:
-        frame: (frames,) match frames, clip by clip.
         clip_frames: match frames by clip.
         fps: frames per second.
         person: (persons,) ids; the same id in two clips can be two people, and no code here
@@ -59,11 +58,10 @@ class _People:
         views: (frames, persons, 17).
     """
 
-    frame: NDArray[np.int64]
     clip_frames: dict[str, NDArray[np.int64]]
     fps: float
     person: NDArray[np.int64]
-    detection_index: NDArray[np.int64]
+    detection_index: NDArray[np.int16]
     joints: NDArray[np.float64]
     views: NDArray[np.int64]
 
@@ -88,16 +86,15 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
         for clip, frame in frames.items()
     ]
     person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))
-    frame = np.concatenate(list(frames.values()))
+    number = sum(map(len, frames.values()))
     count = len(sources["cameras"])
     people = _People(
-        frame=frame,
         clip_frames=frames,
         fps=float(sources["fps"]) / stride,
         person=person,
-        detection_index=np.full((len(frame), count, len(person)), -1),
-        joints=np.full((len(frame), len(person), 17, 3), np.nan),
-        views=np.zeros((len(frame), len(person), 17), dtype=np.int64),
+        detection_index=np.full((number, count, len(person)), -1, dtype=np.int16),
+        joints=np.full((number, len(person), 17, 3), np.nan),
+        views=np.zeros((number, len(person), 17), dtype=np.int64),
     )
     last = 0
     for tracks, joints in zip(tracked, placed, strict=True):
@@ -124,11 +121,8 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         cameras=opened.cameras,
         covariance=np.stack([_covariance(camera) for camera in known]),
         clicks=tuple(_clicks(camera, template) for camera in known),
-        frame=people.frame,
         fps=people.fps,
-        keypoints=opened.keypoints[:],
-        confidence=opened.confidence[:],
-        detection_index=people.detection_index,
+        detections=opened.detections[:].assign_people(people.detection_index),
         joints=people.joints,
         views=people.views,
         triangulation=load_triangulation_settings(store, work, next(iter(sources["clips"]))),

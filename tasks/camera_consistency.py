@@ -33,8 +33,8 @@ def camera_consistency(work: Work) -> str:
         found = check_consistency(
             clip.cameras,
             _covariance(store, work, names),
-            clip.keypoints,
-            clip.confidence,
+            clip.detections.keypoints,
+            clip.detections.confidence,
             clip.fps,
             settings,
             ground=sources["ground"],

@@ -11,7 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray
+from data_contracts.arrays import ClipArray, Integers
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.redetection import redetection_name
 from data_contracts.work import Work
 from tasks.unit import open_input
@@ -25,8 +26,8 @@ PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
 
 
-class StoredDetections:
-    """One array of all cameras' detections, padded to the same number and read in pages.
+class StoredArray:
+    """One array of all cameras' detections in a store, padded to the same number, read in pages.
 
     Rejected keypoints count as not detected. Filtering results of a detection index do not apply to
     people redetected at that index since.
@@ -64,14 +65,13 @@ class StoredDetections:
         self._shift = shift
         self._page = lru_cache(PAGES)(self._read)
 
-    def __getitem__(self, frames: slice) -> NDArray[np.float64]:
-        """Return a slice of frames as float64; NaN beyond a camera's number of detections."""
-        first, last, _ = frames.indices(self.shape[0])
-        out = np.empty((max(0, last - first), *self.shape[1:]))
-        for number in range(first // PAGE, -(-last // PAGE)):
-            start, stop = max(first, number * PAGE), min(last, (number + 1) * PAGE)
-            page = self._page(number)
-            out[start - first : stop - first] = page[start - number * PAGE : stop - number * PAGE]
+    def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
+        """Return some frames as float64; NaN beyond a camera's number of detections."""
+        row = np.arange(self.shape[0])[frames]
+        out = np.empty((len(row), *self.shape[1:]))
+        for number in np.unique(row // PAGE).tolist():
+            here = row // PAGE == number
+            out[here] = self._page(number)[row[here] - number * PAGE]
         return out
 
     def _read(self, number: int) -> NDArray[np.float32]:
@@ -124,28 +124,32 @@ def _mark_redetected(
 
 @dataclass(frozen=True)
 class ClipInputs:
-    """Observations in some frames.
+    """Static cameras of a clip and their detections, which are read on access.
 
     Attributes:
         camera_ids: in the order of every camera dimension.
         cameras: (cameras,) batch.
         camera_covariance: (cameras, 12, 12) of the parameters; None unless known for all.
-        frame: (frames,) match frames.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN if not detected.
-        confidence: (frames, cameras, detections, 17); NaN if not detected.
+        detections: (frames, cameras, detections) of all cameras, with match frames.
         fps: frames per second of match time.
     """
 
     camera_ids: tuple[str, ...]
     cameras: Camera
     camera_covariance: NDArray[np.float64] | None
-    frame: NDArray[np.int64]
-    keypoints: ClipArray
-    confidence: ClipArray
+    detections: KeypointDetections[ClipArray]
     fps: float
 
+    def assign_people(self, detection_index: NDArray[np.integer]) -> ClipInputs:
+        """Return the clip with tracked people (frames, cameras, persons)."""
+        return replace(self, detections=self.detections.assign_people(detection_index))
 
-NOTHING = {"keypoints": np.nan, "confidence": np.nan, "found_again": -1, "shift": 0.0}
+
+NOTHING = {
+    **dict.fromkeys(("keypoints", "confidence", "boxes", "score"), np.nan),
+    "found_again": -1,
+    "shift": 0.0,
+}
 """Fill values of padded detections."""
 ADJUSTED = "bundle_adjustment/cameras"
 """All static cameras after adjustment to people."""
@@ -179,13 +183,6 @@ def open_clip(
     return _make_inputs(store, work, frame, seen, rejected, shift, redetected=redetected)
 
 
-def open_boxes(store: Store, work: Work) -> ClipArray:
-    """Open the boxes (frames, cameras, detections, 4) [px] of the clip of `work`."""
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    return StoredDetections(_open_cameras(store, work, slice(first, first + count - 1)), "boxes")
-
-
 def load_dropped_boxes(store: Store, work: Work) -> NDArray[np.bool_] | None:
     """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
     before = f"filtering/{work.recipe.unit}"
@@ -217,8 +214,7 @@ def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]
     some = _make_inputs(
         store, work, frame, seen, filtered_before["rejected"], filtered_before["shift"]
     )
-    keypoints, confidence = some.keypoints[: len(frame)], some.confidence[: len(frame)]
-    return replace(some, keypoints=keypoints, confidence=confidence)
+    return replace(some, detections=some.detections[: len(frame)])
 
 
 def _open_cameras(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
@@ -288,9 +284,13 @@ def _make_inputs(
         camera_ids=camera_ids,
         cameras=cameras,
         camera_covariance=covariance,
-        frame=frame,
-        keypoints=StoredDetections(seen, "keypoints", rejected, shift, redetected=redetected),
-        confidence=StoredDetections(seen, "confidence", rejected, redetected=redetected),
+        detections=KeypointDetections[ClipArray](
+            keypoints=StoredArray(seen, "keypoints", rejected, shift, redetected=redetected),
+            confidence=StoredArray(seen, "confidence", rejected, redetected=redetected),
+            boxes=StoredArray(seen, "boxes", redetected=redetected),
+            score=StoredArray(seen, "score", redetected=redetected),
+            frame=frame,
+        ),
         fps=float(sources["fps"]),
     )
 

@@ -9,7 +9,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.filtering import FILTERING
-from data_contracts.keypoints import TrackedDetections
 from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, load_dropped_boxes, open_clip
 from tasks.spool import open_spool
@@ -32,7 +31,7 @@ from worldpose.filtering import (
 )
 from worldpose.review.identities import select_triangulated
 from worldpose.store import Store
-from worldpose.triangulation import ClipDetections, TriangulationSettings
+from worldpose.triangulation import TriangulationSettings
 
 PART = 128
 """Frames per chunk: 200 MB with 25 people and 16 cameras."""
@@ -45,7 +44,7 @@ def filtering(work: Work) -> str:
     settings = FilteringSettings.model_validate(work.recipe.settings)
     with store.publish(work) as result, open_spool(store) as spool:
         case = _open(store, work)
-        chosen = _evenly(len(case.clip.frame), settings.max_held_out_frames)
+        chosen = _evenly(len(case.clip.detections.frame), settings.max_held_out_frames)
         views, motion, suspects = case.at(chosen)
         systematic = learn_systematic_errors(
             case.clip.cameras,
@@ -54,7 +53,7 @@ def filtering(work: Work) -> str:
             motion,
             suspects,
             settings,
-            case.clip.fps * len(chosen) / len(case.clip.frame),
+            case.clip.fps * len(chosen) / len(case.clip.detections.frame),
         )
         held = np.zeros(len(case.clip.camera_ids))
         if case.first:
@@ -63,8 +62,8 @@ def filtering(work: Work) -> str:
         spread = learn_keypoint_spread(views, placed.subtract(systematic.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
-        for first in range(0, len(case.clip.frame), PART):
-            frames = np.arange(first, min(first + PART, len(case.clip.frame)))
+        for first in range(0, len(case.clip.detections.frame), PART):
+            frames = np.arange(first, min(first + PART, len(case.clip.detections.frame)))
             views, motion, suspects = case.at(frames)
             shift = systematic.shift(motion, views)
             placed = suspects.subtract_clock_offsets(held, motion.image_motion)
@@ -72,7 +71,7 @@ def filtering(work: Work) -> str:
             counts += _counts(judged, suspects)
             rejected += [
                 judged.rejected.sum(axis=(0, 2, 3)),
-                np.isfinite(suspects.confidence).sum(axis=(0, 2, 3)),
+                np.isfinite(suspects.detections.confidence).sum(axis=(0, 2, 3)),
             ]
             spool.add(
                 {
@@ -88,7 +87,7 @@ def filtering(work: Work) -> str:
             FILTERING,
             arrays=spool.arrays()
             | {"view_bias": systematic.view_bias.coefficient, "clock_late": systematic.late},
-            coordinates={"frame": case.clip.frame, "person": case.person},
+            coordinates={"frame": case.clip.detections.frame, "person": case.person},
             attributes={"camera": list(case.clip.camera_ids)},
         )
         names = ("judged", "keypoints_rejected", "boxes_dropped", "boxes_of_others", "boxes_found")
@@ -106,9 +105,8 @@ class _Case:
     """A clip with its fitted bodies, read in chunks.
 
     Attributes:
-        clip: all detections, without earlier rejections.
+        clip: all detections, without earlier rejections, of tracked people.
         person: (persons,) ids.
-        index: (frames, cameras, persons).
         joints: (frames, persons, 17, 3) [m], world, body joints by the detector's definition.
         step: (frames, persons, 17, 3) [m], motion per frame; NaN if unknown.
         covariance: (frames, persons, 17, 3, 3) [m^2].
@@ -120,7 +118,6 @@ class _Case:
 
     clip: ClipInputs
     person: NDArray[np.integer]
-    index: NDArray[np.integer]
     joints: NDArray[np.float64]
     step: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -137,14 +134,12 @@ class _Case:
         """Project the bodies into all images; return views, motion, and the detections to test."""
         motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
         views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
-        detections = _read_frames(self.clip, self.index, frames)
+        detections = self.clip.detections[frames]
         placed = self.placed.isel(frame=frames)
         boxes = detections.confidence.shape[:3]
         before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
         suspects = TriangulatedDetections(
-            detections.keypoints,
-            detections.confidence,
-            detections.detection_index,
+            detections,
             placed["offsets"].values.astype(np.float64),
             placed["exchanged"].values,
             before,
@@ -164,9 +159,10 @@ def _open(store: Store, work: Work) -> _Case:
     placed = open_input(store, work, f"retriangulation/{unit}")
     joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
     return _Case(
-        clip=open_clip(store, work, filtered=False, shifted=False),
+        clip=open_clip(store, work, filtered=False, shifted=False).assign_people(
+            tracks["detection_index"].values
+        ),
         person=tracks["person"].values,
-        index=tracks["detection_index"].values,
         joints=joints,
         step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
         covariance=perceived_covariance(bodies["covariance"].values, placed["common_bias"].values),
@@ -178,9 +174,9 @@ def _open(store: Store, work: Work) -> _Case:
 
 def _counts(judged: Judgement, suspects: TriangulatedDetections) -> list[float]:
     """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned."""
-    frame, camera, person = np.nonzero(suspects.detection_index >= 0)
+    frame, camera, person = np.nonzero(suspects.detections.detection_index >= 0)
     taken = np.full(judged.fits.shape, -1)
-    taken[frame, camera, suspects.detection_index[frame, camera, person]] = person
+    taken[frame, camera, suspects.detections.detection_index[frame, camera, person]] = person
     moved = (judged.fits >= 0) & (judged.fits != taken)
     return [
         float(np.isfinite(judged.mahalanobis_distance).sum()),
@@ -197,12 +193,12 @@ def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) 
     The systematic errors of cameras are estimated in every iteration, and redetected people are not
     evaluated, so that iterations are comparable.
     """
-    clip = open_clip(store, work)
+    clip = open_clip(store, work).assign_people(case.clip.detections.detection_index)
     whole = open_clip(store, work, filtered=False, redetected=False)
     found = measure_held_out(
         clip.cameras,
-        _read_frames(clip, case.index.astype(np.int16), frames),
-        _read_frames(whole, case.index, frames).keypoints,
+        clip.detections[frames],
+        whole.detections.keypoints[frames],
         case.triangulation,
     )
     if found is None:
@@ -213,15 +209,3 @@ def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) 
 def _evenly(frames: int, most: int) -> NDArray[np.int64]:
     """Return at most `most` evenly spaced frames."""
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
-
-
-def _read_frames(
-    clip: ClipInputs, index: NDArray[np.integer], frames: NDArray[np.int64]
-) -> TrackedDetections:
-    """Return the detections of some frames; `index` is that of the whole clip."""
-    first, last = int(frames[0]), int(frames[-1]) + 1
-    if last - first == len(frames):
-        return TrackedDetections(
-            clip.keypoints[first:last], clip.confidence[first:last], index[first:last]
-        )
-    return ClipDetections(clip.keypoints, clip.confidence, index).read_frames(frames)

@@ -165,9 +165,11 @@ def _open(store: Store, work: Work) -> _Case:
     seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
     noise = load_triangulation_settings(store, work, clip).noise
     suspects = TriangulatedDetections(
-        detected.keypoints[:, None].astype(np.float64),
-        detected.confidence[:, None].astype(np.float64),
-        np.where(index < count, index, -1)[:, None],
+        KeypointDetections.from_keypoints(
+            detected.keypoints[:, None].astype(np.float64),
+            detected.confidence[:, None].astype(np.float64),
+            np.where(index < count, index, -1)[:, None],
+        ),
         offsets,
         placed["exchanged"].values,
         dropped[:, None],
@@ -188,7 +190,7 @@ def _open(store: Store, work: Work) -> _Case:
 
 def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
     """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
-    if np.count_nonzero(suspects.detection_index >= 0) * len(COCO17) < FEW:
+    if np.count_nonzero(suspects.detections.detection_index >= 0) * len(COCO17) < FEW:
         return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
     return learn_keypoint_spread(views, suspects)
 

@@ -49,7 +49,7 @@ def refitting(work: Work) -> str:
         views: list[RayConstraints] = []
         monocular_poses: MonocularPoses | None = None
         if f"broadcast_calibration/{unit}" in work.recipe.inputs:
-            pictures = _pictures(store, work, people.clip.frame)
+            pictures = _pictures(store, work, people.detections.frame)
             views = [_view(store, work, pictures, joints)]
             monocular_poses = _read_monocular_poses(work, pictures, joints)
         weight = BodyFittingSettings.model_validate(before.settings).shape_weight

@@ -12,7 +12,7 @@ from data_contracts.arrays import Singles
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
 from data_contracts.work import Work
-from tasks.clip_inputs import ClipInputs, open_boxes, open_clip
+from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import figures_of, open_uncorrected, unit_task
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import (
@@ -83,7 +83,7 @@ def _ground_arrays(store: Store, work: Work, people: Identities) -> dict[str, ND
     if pitch is None or not people.on_plane.any():
         return {}
     clip = open_clip(store, work)
-    positions = _locate_feet(store, work, clip, pitch)
+    positions = _locate_feet(clip, pitch)
     index = np.where(people.on_plane[:, None], people.detection_index, -1)
     middle = triangulated_places(people.joints)
     clocks = _estimate_clocks(positions, clip, pitch, people.joints)
@@ -119,15 +119,15 @@ def _track_people(store: Store, work: Work) -> Tracked:
     settings = TrackingSettings.model_validate(work.recipe.settings)
     tracks = track_people(
         clip.cameras,
-        clip.keypoints,
-        clip.confidence,
+        clip.detections.keypoints,
+        clip.detections.confidence,
         clip.fps,
         settings,
         pitch_size=None if pitch is None else (pitch.length, pitch.width),
         people=sources["people"],
     )
     found = Identities(
-        frame=np.asarray(clip.frame),
+        frame=clip.detections.frame,
         cameras=tuple(clip.camera_ids),
         person=tracks.person,
         detection_index=tracks.detection_index,
@@ -143,15 +143,15 @@ def _track_people(store: Store, work: Work) -> Tracked:
         reason = diagnose_no_people(
             clip.cameras,
             clip.camera_ids,
-            clip.keypoints,
-            clip.confidence,
+            clip.detections.keypoints,
+            clip.detections.confidence,
             clip.fps,
             settings,
             ground=pitch is not None,
             births=tracks.report.births,
         )
         said = f"{work.recipe.name} found no person: {reason.message}"
-    plane = None if pitch is None else _track_on_plane(store, work, clip, pitch, found)
+    plane = None if pitch is None else _track_on_plane(clip, pitch, found)
     if plane is not None:
         found, further, clocks = plane
         if not len(tracks.person):
@@ -178,20 +178,18 @@ def _pitch(work: Work) -> PitchTemplate | None:
     return None if given is None else PitchTemplate.from_spec(PitchSpec(any_size=True, **given))
 
 
-def _locate_feet(
-    store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate
-) -> GroundPositions:
+def _locate_feet(clip: ClipInputs, pitch: PitchTemplate) -> GroundPositions:
     """Return people's foot positions by camera."""
-    boxes = open_boxes(store, work)
-    parts = [slice(start, start + BLOCK) for start in range(0, len(clip.frame), BLOCK)]
+    frames = len(clip.detections.frame)
+    parts = [clip.detections[start : start + BLOCK] for start in range(0, frames, BLOCK)]
     return GroundPositions.concatenate(
         [
             locate_feet(
                 clip.cameras,
-                clip.keypoints[part],
-                clip.confidence[part],
+                part.keypoints,
+                part.confidence,
                 pitch,
-                boxes=boxes[part],
+                boxes=part.boxes,
                 camera_covariance=clip.camera_covariance,
             )
             for part in parts
@@ -214,14 +212,14 @@ def _estimate_clocks(
 
 
 def _track_on_plane(
-    store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate, found: Identities
+    clip: ClipInputs, pitch: PitchTemplate, found: Identities
 ) -> tuple[Identities, dict[str, float], str] | None:
     """Add the people who are not triangulated, tracked by their feet.
 
     Returns:
         The people, metrics, and a sentence on clocks; None without any of them.
     """
-    positions = _locate_feet(store, work, clip, pitch)
+    positions = _locate_feet(clip, pitch)
     clocks = _estimate_clocks(positions, clip, pitch, found.joints)
     detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]))
     frame, camera, person = np.nonzero(found.detection_index >= 0)

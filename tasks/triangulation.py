@@ -19,7 +19,6 @@ from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import (
     CameraClocks,
-    ClipDetections,
     Smoothing,
     Triangulation,
     TriangulationSettings,
@@ -53,12 +52,11 @@ def write_joints(
     layout: GroupLayout,
 ) -> None:
     """Triangulate the clip of `work` in chunks of frames, and write the joints."""
-    clip = open_clip(store, work)
     tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
     index = tracks["detection_index"].values
-    detections = ClipDetections(clip.keypoints, clip.confidence, index)
-    covariance = camera_errors(work, clip)
-    model, detections = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
+    clip = open_clip(store, work).assign_people(index)
+    detections, covariance = clip.detections, camera_errors(work, clip)
+    model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
     with open_spool(store) as spool:
         chunks = reconstruct_chunks(clip.cameras, detections, model, clip.fps, settings, covariance)
@@ -71,7 +69,7 @@ def write_joints(
             arrays=spool.arrays()
             | clock_arrays(model.clocks)
             | {"common_bias": model.detector.common_bias},
-            coordinates={"frame": clip.frame, "person": tracks["person"].values},
+            coordinates={"frame": clip.detections.frame, "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids)},
         )
     agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from data_contracts.broadcast_calibration import KeyFrame as KeyFrame
     from data_contracts.keypoints import KeypointDetections as KeypointDetections
-    from data_contracts.keypoints import TrackedDetections as TrackedDetections
     from data_contracts.pitch import PitchSpec as PitchSpec
     from data_contracts.static_calibration import ClickedMarkings as ClickedMarkings
     from worldpose.body import find_body as find_body
@@ -64,7 +63,7 @@ if TYPE_CHECKING:
     from worldpose.triangulation import TriangulationSettings as TriangulationSettings
     from worldpose.triangulation import reconstruct_joints as reconstruct_joints
     from worldpose.triangulation import triangulate_joints as triangulate_joints
-    from worldpose.triangulation import unswap as unswap
+    from worldpose.triangulation import undo_swaps as undo_swaps
     from worldpose.video import open_video as open_video
 
     __version__: str
@@ -90,7 +89,6 @@ _MODULES: Final = {
     "PitchTemplate": "worldpose.pitch",
     "Rigid": "worldpose.geometry",
     "StaticCalibrationSettings": "worldpose.static_calibration",
-    "TrackedDetections": "data_contracts.keypoints",
     "TrackingSettings": "worldpose.tracking",
     "TriangulationSettings": "worldpose.triangulation",
     "adjust_cameras": "worldpose.bundle_adjustment",
@@ -112,7 +110,7 @@ _MODULES: Final = {
     "reconstruct_joints": "worldpose.triangulation",
     "track_people": "worldpose.tracking",
     "triangulate_joints": "worldpose.triangulation",
-    "unswap": "worldpose.triangulation",
+    "undo_swaps": "worldpose.triangulation",
     "write_joints": "worldpose.formats",
 }
 """Module of each name, imported on first use: `import worldpose` alone takes a few milliseconds."""
@@ -138,7 +136,6 @@ __all__ = [
     "PitchTemplate",
     "Rigid",
     "StaticCalibrationSettings",
-    "TrackedDetections",
     "TrackingSettings",
     "TriangulationSettings",
     "__version__",
@@ -161,7 +158,7 @@ __all__ = [
     "reconstruct_joints",
     "track_people",
     "triangulate_joints",
-    "unswap",
+    "undo_swaps",
     "write_joints",
 ]
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body import find_body
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.bundle_adjustment import (
@@ -165,18 +165,16 @@ def _clip(
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
     fps = SCENARIOS[SCENARIO].fps
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
-    placed = triangulate_joints(
-        cameras, TrackedDetections(keypoints, confidence, tracks.detection_index), _OURS
+    detections = KeypointDetections.from_keypoints(
+        keypoints, confidence, tracks.detection_index, scene.truth.frames
     )
+    placed = triangulate_joints(cameras, detections, _OURS)
     return Clip(
         cameras=cameras,
         covariance=np.stack([known.estimate.covariance for known in calibrations.values()]),
         clicks=tuple(Clicks.of(known, pitch) for known in calibrations.values()),
-        frame=scene.truth.frames,
         fps=fps,
-        keypoints=keypoints,
-        confidence=confidence,
-        detection_index=tracks.detection_index.astype(np.int64),
+        detections=detections,
         joints=placed.joints,
         views=placed.views.astype(np.int64),
         triangulation=_OURS,
@@ -194,9 +192,7 @@ def _score(
     bodies: bool = False,
 ) -> Score:
     """Score cameras and the joints triangulated with them, or bodies fitted to these joints."""
-    index = clip.detection_index.astype(np.int16)
-    detections = TrackedDetections(clip.keypoints, clip.confidence, index)
-    placed = triangulate_joints(cameras, detections, settings, covariance)
+    placed = triangulate_joints(cameras, clip.detections, settings, covariance)
     joints = placed.joints
     if bodies:
         how = BodyFittingSettings()
@@ -204,8 +200,8 @@ def _score(
         model = find_body(how.body_model)
         evidence = ClipEvidence(joints, placed.covariance, clip.fps, placed.common_bias)
         joints = fit_bodies(model, evidence, how, floor).joints
-    people = np.arange(index.shape[2])
-    found, _ = evaluate_joints(JointTracks(clip.frame, people, joints), scene.truth, fps=clip.fps)
+    tracks = JointTracks(clip.detections.frame, np.arange(joints.shape[1]), joints)
+    found, _ = evaluate_joints(tracks, scene.truth, fps=clip.fps)
     estimated = {name: cameras[c] for c, name in enumerate(names)}
     pitch = PitchTemplate.from_spec(SCENARIOS[SCENARIO].pitch)
     errors, _ = evaluate_cameras(estimated, scene.cameras, pitch)

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
-from data_contracts.review import Correction, Edit, Origin, ReviewDecision, ReviewRequest
+from data_contracts.review import (
+    Correction,
+    Edit,
+    MovedPoint,
+    Origin,
+    RedrawnMarking,
+    ReviewDecision,
+    ReviewRequest,
+)
 from data_contracts.run import RunRecord, WaitingUnit
 from flows.gates import GATES
 from flows.left_out import left_out_cameras
@@ -18,7 +26,9 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
-from worldpose.review import Journal, last_decision, requests_by_id, say, unit_origins
+from worldpose.review import Journal, last_decision, requests_by_id, say
+from worldpose.review.detections import DETECTION_EDITS
+from worldpose.review.identities import IDENTITY_EDITS
 from worldpose.store import Store, recipe_key
 
 State = Literal["waits", "corrected", "approve", "reject", "superseded"]
@@ -285,6 +295,48 @@ def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origi
         if decision is not None and decision.verdict == "reject":
             rejected.add(name)
     return unit_origins(made_from, match.corrections, rejected)
+
+
+def unit_origins(
+    made_from: Mapping[str, Collection[str]],
+    applied: Iterable[Correction],
+    rejected: Collection[str],
+) -> dict[str, Origin]:
+    """Return the origin of each unit's result, by `stage/unit`.
+
+    A rejection propagates to all units computed from the rejected one; a correction marks only the
+    unit with corrected evidence, and units computed from it are automatic.
+
+    Args:
+        made_from: for each unit, its input units.
+        applied: the corrections in the results.
+        rejected: units whose last verdict is a rejection.
+    """
+    corrected = set()
+    for edit in (correction.edit for correction in applied):
+        if isinstance(edit, MovedPoint | RedrawnMarking):
+            stage = "static_calibration" if edit.frame is None else "broadcast_calibration"
+            corrected.add(f"{stage}/{edit.camera}")
+        elif isinstance(edit, IDENTITY_EDITS):
+            corrected.add(f"tracking/{edit.clip}")
+        elif isinstance(edit, DETECTION_EDITS):
+            corrected |= _seen_by(edit.camera, made_from)
+    refused = set(rejected)
+    while more := {
+        unit for unit, sources in made_from.items() if unit not in refused and refused & {*sources}
+    }:
+        refused |= more
+    return {
+        unit: "rejected" if unit in refused else "corrected" if unit in corrected else "automatic"
+        for unit in made_from
+    }
+
+
+def _seen_by(camera: str, units: Collection[str]) -> set[str]:
+    """Return the units of a camera's detections: its detection units, or else its ingest unit."""
+    found = f"detection/{camera}"
+    detected = {unit for unit in units if unit == found or unit.startswith(f"{found}.")}
+    return detected or {f"ingest/{camera}"}
 
 
 def resume(store: Store, match: Match) -> list[str]:

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from tasks.clip_inputs import PAGE, StoredDetections
+from tasks.clip_inputs import PAGE, StoredArray
 
 
 def array(values, *dims):
@@ -29,8 +29,8 @@ def test_rejected_keypoints_are_gone_and_lasting_errors_taken_off():
         rng.random((frames, 2, 2, 17, 2), dtype=np.float32),
         *("camera", "detection", "joint", "axis"),
     )
-    plain = StoredDetections(cameras, "keypoints")[5:frames]
-    taken = StoredDetections(cameras, "keypoints", rejected, shift)[5:frames]
+    plain = StoredArray(cameras, "keypoints")[5:frames]
+    taken = StoredArray(cameras, "keypoints", rejected, shift)[5:frames]
     assert np.isnan(taken[rejected.values[5:]]).all()
     kept = ~rejected.values[5:] & np.isfinite(plain[..., 0])
     np.testing.assert_allclose(taken[kept], plain[kept] - shift.values[5:][kept], atol=1e-6)
@@ -52,11 +52,11 @@ def test_who_was_looked_for_again_is_taken_as_he_was_found_this_time():
     rejected = array(np.ones((2, 1, 3, 17), dtype=bool), "camera", "detection", "joint")
     rejected[:, :, 0] = False
     shift = array(np.full((2, 1, 3, 17, 2), 5.0), "camera", "detection", "joint", "axis")
-    taken = StoredDetections([camera], "keypoints", rejected, shift)[0:2]
+    taken = StoredArray([camera], "keypoints", rejected, shift)[0:2]
     assert taken.shape == (2, 1, 2, 17, 2)
     np.testing.assert_array_equal(taken[:, 0, 0], 95.0)
     assert np.isnan(taken[0, 0, 1]).all()
     np.testing.assert_array_equal(taken[1, 0, 1], 98.0)
-    detected = StoredDetections([camera], "keypoints", redetected=False)[0:2]
+    detected = StoredArray([camera], "keypoints", redetected=False)[0:2]
     np.testing.assert_array_equal(detected[:, 0, 0], 100.0)
     assert np.isnan(detected[:, 0, 1]).all()

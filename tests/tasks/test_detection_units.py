@@ -82,12 +82,12 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     }
     for work, frames in ((early, np.arange(2, 14)), (late, np.arange(20, 30))):
         clip = open_clip(store, work)
-        assert clip.keypoints.shape == (len(frames), 2, 1, 17, 2)
-        shown = clip.keypoints[:][:, :, 0, 0, 0]
+        assert clip.detections.keypoints.shape == (len(frames), 2, 1, 17, 2)
+        shown = clip.detections.keypoints[:][:, :, 0, 0, 0]
         expected = frames[:, None] + list(OFFSETS.values()) + 0.0
         expected[expected[:, 1] > 30, 1] = np.nan
         np.testing.assert_array_equal(shown, expected)
-        assert clip.frame.tolist() == frames.tolist()
+        assert clip.detections.frame.tolist() == frames.tolist()
     # All clips at once, as bundle adjustment takes them.
     chosen = {"early": np.array([3, 7]), "late": np.array([21, 28])}
     recipe = late.recipe.model_copy(
@@ -101,7 +101,7 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     )
     both = open_frames(store, Work(**{**dict(late), "recipe": recipe}), chosen)
     np.testing.assert_array_equal(
-        both.keypoints[:, :, 0, 0, 0], [[3, 6], [7, 10], [21, 24], [28, np.nan]]
+        both.detections.keypoints[:, :, 0, 0, 0], [[3, 6], [7, 10], [21, 24], [28, np.nan]]
     )
     figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
     assert figures.figures["unreadable_share"] == pytest.approx(0.2)

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from tasks import body_fitting, refitting
 from tasks.clip_inputs import ClipInputs
 from worldpose.body_fitting.monocular import MonocularEstimates
@@ -43,11 +44,12 @@ def test_legs_that_triangulation_exchanged_are_exchanged_for_bodies_too(monkeypa
         ),
         "tracking/clip": stored(detection_index=index),
     }
-    clip = ClipInputs(("a", "b"), None, None, np.arange(4), seen, None, 50.0)
+    detections = KeypointDetections.from_keypoints(seen, seen[..., 0], frame=np.arange(4))
+    clip = ClipInputs(("a", "b"), None, None, detections, 50.0)
     monkeypatch.setattr(body_fitting, "open_clip", lambda *_: clip)
     monkeypatch.setattr(body_fitting, "open_input", lambda store, work, name: results[name])
     people = body_fitting.open_people(None, SimpleNamespace(recipe=SimpleNamespace(unit="clip")))
-    np.testing.assert_array_equal(people.keypoints, truth)
+    np.testing.assert_array_equal(people.detections.keypoints, truth)
 
 
 @pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])

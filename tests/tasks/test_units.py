@@ -22,7 +22,7 @@ from worldpose.formats import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import import_lenses, read_match
 from worldpose.ingest.footage import write_still
-from worldpose.store import Store, explain_difference, recipe_key
+from worldpose.store import Store, recipe_differences, recipe_key
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def test_a_clicked_camera_says_how_well_it_is_known(clicked, tiny):
 def test_how_far_cameras_misplace_people_is_learned_from_the_second_iteration_on(clicked):
     store, match, _ = clicked
     stated = np.ones((3, 12, 12))
-    clip = ClipInputs(("a", "b", "c"), None, stated, np.arange(5), None, None, 50.0)
+    clip = ClipInputs(("a", "b", "c"), None, stated, None, 50.0)
     told = {
         (iteration, unit.recipe.stage): camera_errors(unit.work(store.url, match, "0001"), clip)
         for iteration in (1, 2)
@@ -149,7 +149,8 @@ def test_a_moved_click_reaches_its_camera_and_what_sees_through_it_alone(clicked
     )
     assert changed == {camera, "bundle_adjustment/cameras", *(f"{stage}/clip" for stage in clip)}
     # What `worldpose why` and `worldpose diff` say.
-    (reason,) = explain_difference(before[camera].recipe, after[camera].recipe)
+    (difference,) = recipe_differences(before[camera].recipe, after[camera].recipe)
+    reason = str(difference)
     assert f"annotations/static_calibration/{file.name}.points.{point['name']}[0]: " in reason
     assert reason.endswith(f" -> {point['xy'][0]}")
 

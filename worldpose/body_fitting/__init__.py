@@ -8,7 +8,6 @@ from worldpose.body_fitting.body_fit import (
     BodyFit,
     BodyFittingReport,
     ClipEvidence,
-    Pictures,
     fit_bodies,
     report_fit,
 )
@@ -43,7 +42,6 @@ __all__ = [
     "ClipEvidence",
     "MonocularEstimates",
     "MonocularPoses",
-    "Pictures",
     "RayConstraints",
     "Shape",
     "constrain_to_rays",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
@@ -338,20 +339,11 @@ class BodyFittingReport(Record):
     """Root mean square third derivative of the body's keypoints [m/s^3]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Pictures:
-    """Detections of tracked people in static cameras."""
-
-    cameras: Camera
-    """Batch (cameras,)."""
-    keypoints: NDArray[np.floating]
-    """(frames, cameras, detections, 17, 2) [px], left-right swaps undone; NaN where not found."""
-    detection_index: NDArray[np.integer]
-    """(frames, cameras, persons), index of the detection; -1 = not seen."""
-
-
 def report_fit(
-    fit: BodyFit, joints: Floats, fps: float, pictures: Pictures | None = None
+    fit: BodyFit,
+    joints: Floats,
+    fps: float,
+    seen: tuple[Camera, KeypointDetections] | None = None,
 ) -> BodyFittingReport:
     """Return the metrics of a fit.
 
@@ -359,7 +351,8 @@ def report_fit(
         fit: bodies of one clip.
         joints: (frames, persons, 17, 3) [m], world, input of the fit.
         fps: [1/s].
-        pictures: detections behind the joints.
+        seen: static cameras (cameras,) and the detections behind the joints, left-right swaps
+            undone.
     """
     perceived = fit.joints + np.einsum("fpab,jb->fpja", body_axes(fit.joints), fit.offsets)
     away = np.linalg.norm(joints - perceived, axis=-1)
@@ -375,7 +368,7 @@ def report_fit(
         offset_rms_m=float(np.sqrt(np.mean(fit.offsets**2))),
         residual_m=tuple(_median(away[:, person]) for person in persons),
         reprojection_px=tuple(
-            None if pictures is None else _median(_reprojection(perceived, pictures, person))
+            None if seen is None else _median(_reprojection(perceived, seen, person))
             for person in persons
         ),
         bone_spread_m=tuple(_spread(limbs[:, person]) for person in persons),
@@ -387,14 +380,17 @@ def report_fit(
     )
 
 
-def _reprojection(perceived: Floats, pictures: Pictures, person: int) -> Floats:
+def _reprojection(
+    perceived: Floats, seen: tuple[Camera, KeypointDetections], person: int
+) -> Floats:
     """Return distances of one person's keypoints (frames, cameras, 17) [px]; NaN where not seen."""
-    place = pictures.detection_index[:, :, person]
+    cameras, detections = seen
+    place = detections.detection_index[:, :, person]
     frame, camera = np.nonzero(place >= 0)
-    seen = np.full((*place.shape, 17, 2), np.nan)
-    seen[frame, camera] = pictures.keypoints[frame, camera, place[frame, camera]]
-    image = pictures.cameras.project(perceived[:, None, person])
-    return np.asarray(np.linalg.norm(image - seen, axis=-1))
+    own = np.full((*place.shape, 17, 2), np.nan)
+    own[frame, camera] = detections.keypoints[frame, camera, place[frame, camera]]
+    image = cameras.project(perceived[:, None, person])
+    return np.asarray(np.linalg.norm(image - own, axis=-1))
 
 
 def _median(values: Floats) -> float | None:

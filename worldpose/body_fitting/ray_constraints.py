@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body_fitting.pose_space import interpolate_gaps
 from worldpose.geometry import Camera
 
@@ -38,10 +39,7 @@ class RayConstraints:
 
 
 def find_ray_constraints(
-    cameras: Camera,
-    keypoints: NDArray[np.floating],
-    detection_index: NDArray[np.integer],
-    joints: Floats,
+    cameras: Camera, detections: KeypointDetections, joints: Floats
 ) -> RayConstraints:
     """Return the lines of sight of joints that exactly one camera sees.
 
@@ -50,17 +48,17 @@ def find_ray_constraints(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px], left-right swaps undone; NaN where not
-            found.
-        detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
+        detections: of tracked people, left-right swaps undone.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """
-    frames, count, persons = detection_index.shape
+    index = detections.detection_index
+    frames, count, persons = index.shape
     origins = np.full(joints.shape, np.nan)
     directions = np.full(joints.shape, np.nan)
-    frame, camera, person = np.nonzero(detection_index >= 0)
+    frame, camera, person = np.nonzero(index >= 0)
     own = np.full((frames, count, persons, 17, 2), np.nan)
-    own[frame, camera, person] = keypoints[frame, camera, detection_index[frame, camera, person]]
+    place = index[frame, camera, person]
+    own[frame, camera, person] = detections.keypoints[frame, camera, place]
     there = np.isfinite(own).all(-1)
     alone = (there.sum(axis=1) == 1) & ~np.isfinite(joints).all(-1)
     frame, person, joint = np.nonzero(alone)

@@ -160,17 +160,6 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
     return _fit_turn(both, followed, 4)
 
 
-def turn_only(both: MovingCamera, followed: Followed) -> Turned:
-    """Return the second of two frames with a fitted rotation and its given lens.
-
-    Args:
-        both: two frames; the second's rotation is ignored.
-        followed: points of the first in the second.
-    """
-    both = replace(both, rotation=np.repeat(both.rotation[:1], 2, axis=0))
-    return _fit_turn(both, followed, 3)
-
-
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
     """Return predicted minus observed pixels of followed points (n, 2)."""
     residual = np.full((len(followed.start), 2), np.nan)

@@ -120,7 +120,7 @@ def adjust_cameras(
     proposed = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views
     )
-    used = np.flatnonzero(np.isin(clip.frame, settings.chosen_frames))
+    used = np.flatnonzero(np.isin(clip.detections.frame, settings.chosen_frames))
     used = used if settings.chosen_frames else proposed
     judged = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views, used
@@ -173,9 +173,9 @@ def adjust_cameras(
             + ("" if fixed[c] else _describe_motion(motion[c]))
             for c in range(count)
         ),
-        proposed=clip.frame[proposed],
-        used=clip.frame[used],
-        judged=clip.frame[judged],
+        proposed=clip.detections.frame[proposed],
+        used=clip.detections.frame[used],
+        judged=clip.detections.frame[judged],
         noise=adjuster.noise,
         verdict=first,
         evidence=evidence,
@@ -218,7 +218,7 @@ class _Adjuster:
         judged: Integers,
     ) -> None:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
-        people = np.ones(clip.detection_index.shape[2], dtype=np.bool_)
+        people = np.ones(clip.detections.detection_index.shape[2], dtype=np.bool_)
         self.observations = select_observations(
             clip, used, people, clip.cameras, settings.min_views
         )
@@ -394,7 +394,7 @@ class _Adjuster:
 
     def _groups(self, frames: int) -> Integers:
         """Return the group (frames, persons) of each person; time intervals for a single person."""
-        persons = self.clip.detection_index.shape[2]
+        persons = self.clip.detections.detection_index.shape[2]
         folds = self.settings.folds
         if persons > 1:
             return np.tile(np.arange(persons) % min(folds, persons), (frames, 1))
@@ -468,9 +468,9 @@ def _refuse_all(
         covariance=clip.covariance,
         accepted=np.zeros(count, dtype=np.bool_),
         reasons=(f"refused: {reason}",) * count,
-        proposed=clip.frame[proposed],
-        used=clip.frame[used],
-        judged=clip.frame[judged],
+        proposed=clip.detections.frame[proposed],
+        used=clip.detections.frame[used],
+        judged=clip.detections.frame[judged],
         noise=KeypointNoise(),
         verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan),
         evidence=Evidence(0.0, 0.0, 0.0, 0.0, 0.0),

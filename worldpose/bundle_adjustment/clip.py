@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import StaticCalibration
@@ -60,11 +60,8 @@ class Clip:
         covariance: (cameras, 12, 12) of a step, in the order of `PARAMETERS`; all zero for a given
             camera.
         clicks: of every camera.
-        frame: (frames,) match frames.
         fps: frames per second.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); NaN where not found.
-        detection_index: (frames, cameras, persons); -1 = not seen.
+        detections: (frames, cameras, detections) of tracked people, with match frames.
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) inlier cameras.
         triangulation: settings that made the joints.
@@ -76,11 +73,8 @@ class Clip:
     cameras: Camera
     covariance: Floats
     clicks: tuple[Clicks, ...]
-    frame: Integers
     fps: float
-    keypoints: AnyFloats
-    confidence: AnyFloats
-    detection_index: NDArray[np.integer]
+    detections: KeypointDetections
     joints: Floats
     views: NDArray[np.integer]
     triangulation: TriangulationSettings
@@ -96,7 +90,7 @@ class Clip:
     @cached_property
     def distance(self) -> Floats:
         """Median depth (cameras,) of people in each camera [m]; NaN without people."""
-        frame, camera, person = np.nonzero(self.detection_index >= 0)
+        frame, camera, person = np.nonzero(self.detections.detection_index >= 0)
         found = np.isfinite(self.joints[..., 0])
         number = np.maximum(found.sum(axis=-1), 1)[..., None]
         place = np.where(found[..., None], self.joints, 0.0).sum(axis=-2) / number
@@ -137,23 +131,15 @@ class Observations(NamedTuple):
     """(n,) stated standard deviation per axis [px]."""
 
 
-def keypoints_by_person(
-    keypoints: AnyFloats,
-    confidence: AnyFloats,
-    detection_index: NDArray[np.integer],
-) -> tuple[Floats, Floats]:
+def keypoints_by_person(detections: KeypointDetections) -> tuple[Floats, Floats]:
     """Return keypoints (frames, cameras, persons, 17, 2) and their confidence, by person.
 
     NaN and 0 where the person is not seen.
-
-    Args:
-        keypoints: (frames, cameras, detections, 17, 2) [px].
-        confidence: (frames, cameras, detections, 17).
-        detection_index: (frames, cameras, persons).
     """
+    keypoints, confidence = detections.keypoints, detections.confidence
     frames, cameras = np.ogrid[: len(keypoints), : keypoints.shape[1]]
-    place = (frames[..., None], cameras[..., None], detection_index)
-    seen = (detection_index >= 0)[..., None] & (confidence[place] > 0.0)
+    place = (frames[..., None], cameras[..., None], detections.detection_index)
+    seen = (detections.detection_index >= 0)[..., None] & (confidence[place] > 0.0)
     seen &= np.isfinite(keypoints[place]).all(axis=-1)
     return (
         np.where(seen[..., None], keypoints[place], np.nan),
@@ -173,8 +159,7 @@ def select_observations(
         cameras: (cameras,) batch that predicts the size of people in the image.
         min_views: minimum inlier cameras of a joint.
     """
-    index = clip.detection_index[frames]
-    image, confidence = keypoints_by_person(clip.keypoints[frames], clip.confidence[frames], index)
+    image, confidence = keypoints_by_person(clip.detections[frames])
     joints = clip.joints[frames]
     good = np.isfinite(joints[..., 0]) & (clip.views[frames] >= min_views)
     good &= np.broadcast_to(people, good.shape[:2])[..., None]
@@ -208,17 +193,12 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
         clip: the clip.
         frames: (k,) indices of frames to learn the noise from.
     """
-    settings = clip.triangulation
+    settings, detections = clip.triangulation, clip.detections
     if settings.learn_noise and len(frames):
-        detections = TrackedDetections(
-            clip.keypoints[frames],
-            clip.confidence[frames],
-            clip.detection_index[frames].astype(np.int16),
-        )
-        noise = triangulate_joints(clip.cameras, detections, settings).noise
-        precision = noise.precision(clip.confidence)
+        noise = triangulate_joints(clip.cameras, detections[frames], settings).noise
+        precision = noise.precision(detections.confidence)
     else:
-        precision = np.where(clip.confidence > 0.0, clip.confidence, 0.0)
+        precision = np.where(detections.confidence > 0.0, detections.confidence, 0.0)
     max_precision = max(float(precision.max(initial=0.0)), 1e-12)
     exact = {
         "learn_noise": False,
@@ -227,7 +207,9 @@ def learn_confidence(clip: Clip, frames: Integers) -> Clip:
         "joint_noise_m": settings.joint_noise_m / np.sqrt(max_precision),
     }
     return replace(
-        clip, confidence=precision / max_precision, triangulation=settings.model_copy(update=exact)
+        clip,
+        detections=replace(detections, confidence=precision / max_precision),
+        triangulation=settings.model_copy(update=exact),
     )
 
 
@@ -319,8 +301,8 @@ def _count_keypoints(clip: Clip, min_views: int) -> Floats:
     cell = np.floor(place / _CELL).astype(np.int64)
     _, cell_of = np.unique(cell.reshape(-1, 2), axis=0, return_inverse=True)
     cell_of = cell_of.reshape(number.shape)
-    frames, cameras, _ = clip.detection_index.shape
+    frames, cameras, _ = clip.detections.detection_index.shape
     offered = np.zeros((frames, cameras, int(cell_of.max(initial=0)) + 1))
-    f, c, p = np.nonzero(clip.detection_index >= 0)
+    f, c, p = np.nonzero(clip.detections.detection_index >= 0)
     np.add.at(offered, (f, c, cell_of[f, p]), number[f, p])
     return offered.reshape(frames, -1)

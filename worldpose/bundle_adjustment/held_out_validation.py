@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
@@ -59,14 +58,15 @@ def held_out_errors(
         people: (k, persons) bool, held-out people.
         robust_scale: of Cauchy's loss [standard deviations].
     """
-    keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
-    index = np.where(people[:, None], clip.detection_index[frames], -1).astype(np.int16)
-    loss = np.full((*index.shape, keypoints.shape[-2]), np.nan)
+    detections = clip.detections[frames]
+    index = np.where(people[:, None], detections.detection_index, -1).astype(np.int16)
+    loss = np.full((*index.shape, detections.confidence.shape[-1]), np.nan)
     error = loss.copy()
     judges = np.flatnonzero(people.any(axis=0))
-    image, weight = keypoints_by_person(keypoints, confidence, index[:, :, judges].astype(np.int64))
+    judged = detections.assign_people(index[:, :, judges])
+    image, weight = keypoints_by_person(judged)
     for c in range(len(cameras.focal)):
-        joints = _triangulate(clip, cameras, c, keypoints, confidence, index[:, :, judges])
+        joints = _triangulate(clip, cameras, c, judged)
         predicted, noise = project_joints(
             cameras[c : c + 1], joints, weight[:, c : c + 1], clip.triangulation
         )
@@ -76,9 +76,7 @@ def held_out_errors(
         loss[:, c, judges] = robust_scale**2 * np.log1p(squared / robust_scale**2)
     loss[~np.isfinite(error)] = np.nan
     joints = np.full((len(frames), index.shape[2], *loss.shape[3:], 3), np.nan)
-    joints[:, judges] = _triangulate(
-        clip, cameras, None, keypoints, confidence, index[:, :, judges]
-    )
+    joints[:, judges] = _triangulate(clip, cameras, None, judged)
     return HeldOutErrors(loss, error, joints)
 
 
@@ -91,26 +89,16 @@ def triangulate_without(clip: Clip, cameras: Camera, camera: int, frames: Intege
         camera: the camera to leave out.
         frames: (k,) indices of frames.
     """
-    index = clip.detection_index[frames].astype(np.int16)
-    return _triangulate(
-        clip, cameras, camera, clip.keypoints[frames], clip.confidence[frames], index
-    )
+    return _triangulate(clip, cameras, camera, clip.detections[frames])
 
 
 def _triangulate(
-    clip: Clip,
-    cameras: Camera,
-    camera: int | None,
-    keypoints: AnyFloats,
-    confidence: AnyFloats,
-    index: NDArray[np.int16],
+    clip: Clip, cameras: Camera, camera: int | None, detections: KeypointDetections
 ) -> Floats:
-    others = index.copy()
+    others = detections.detection_index.copy()
     if camera is not None:
         others[:, camera] = -1
-    return triangulate_joints(
-        cameras, TrackedDetections(keypoints, confidence, others), clip.triangulation
-    ).joints
+    return triangulate_joints(cameras, detections.assign_people(others), clip.triangulation).joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +239,7 @@ def find_contradictions(
         held: errors of people in every camera against joints from the other cameras.
         settings: the prior of given cameras.
     """
-    keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
-    image, weight = keypoints_by_person(keypoints, confidence, clip.detection_index[frames])
+    image, weight = keypoints_by_person(clip.detections[frames])
     joints = clip.joints[frames]
     _, noise = project_joints(clip.cameras, joints, weight, clip.triangulation)
     known = known_covariance(clip, settings)

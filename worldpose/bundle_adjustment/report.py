@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
-from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment.adjustment import BundleAdjustment
 from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, project_joints
 from worldpose.bundle_adjustment.problems import KeypointNoise
@@ -59,7 +58,7 @@ def adjustment_arrays(
         "held_out_error": adjusted.verdict.error,
         "marking_error": np.stack(errors, axis=1),
         "weak_step": np.stack([direction.step for direction in weak]),
-        "outlier_frame": clip.frame[outliers.frame],
+        "outlier_frame": clip.detections.frame[outliers.frame],
         "outlier_camera": outliers.camera,
         "outlier_person": person[outliers.person].astype(np.int64),
         "outlier_joint": outliers.joint,
@@ -168,9 +167,13 @@ def keypoint_outliers(
     """
     parts = [
         _find_outliers(
-            clip, cameras, noise, limit, np.arange(first, min(first + _BLOCK, len(clip.frame)))
+            clip,
+            cameras,
+            noise,
+            limit,
+            np.arange(first, min(first + _BLOCK, len(clip.detections.frame))),
         )
-        for first in range(0, len(clip.frame), _BLOCK)
+        for first in range(0, len(clip.detections.frame), _BLOCK)
     ]
     rows = np.concatenate([np.empty((0, 5)), *parts])
     order = np.lexsort((*rows[:, 3::-1].T, -rows[:, 4]))[:longest]
@@ -182,14 +185,9 @@ def _find_outliers(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, frames: Integers
 ) -> Floats:
     """Return rows (n, 5) of frame, camera, person, joint and Mahalanobis distance."""
-    keypoints, confidence = clip.keypoints[frames], clip.confidence[frames]
-    index = clip.detection_index[frames]
-    joints = triangulate_joints(
-        cameras,
-        TrackedDetections(keypoints, confidence, index.astype(np.int16)),
-        clip.triangulation,
-    ).joints
-    image, weight = keypoints_by_person(keypoints, confidence, index)
+    detections = clip.detections[frames]
+    joints = triangulate_joints(cameras, detections, clip.triangulation).joints
+    image, weight = keypoints_by_person(detections)
     predicted, stated = project_joints(cameras, joints, weight, clip.triangulation)
     off = np.linalg.norm(predicted - image, axis=-1) / (noise.scale * stated)
     off[~np.isfinite(off)] = np.nan

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import AnyFloats, Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -36,7 +36,7 @@ class HeldOut:
 
 def measure_held_out(
     cameras: Camera,
-    used: TrackedDetections,
+    used: KeypointDetections,
     detected: AnyFloats,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,

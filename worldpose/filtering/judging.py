@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.views import BodyViews, Residuals
@@ -84,10 +84,11 @@ _PARTS: Final = tuple(EXCHANGED_PARTS.values())
 
 
 @dataclass(frozen=True, eq=False)
-class TriangulatedDetections(TrackedDetections):
+class TriangulatedDetections:
     """Tracked detections in some frames, with the results of their triangulation.
 
     Attributes:
+        detections: (frames, cameras, detections) of tracked people.
         offsets: (frames, cameras, persons, 2) [px], offset of a person's detection in an image from
             the person's position by all cameras.
         exchanged: (frames, cameras, persons, 3), body parts with a corrected left-right swap.
@@ -95,6 +96,7 @@ class TriangulatedDetections(TrackedDetections):
         noise: stated standard deviation of keypoints, [px] and [m].
     """
 
+    detections: KeypointDetections
     offsets: Floats
     exchanged: Flags
     dropped: Flags
@@ -106,7 +108,8 @@ class TriangulatedDetections(TrackedDetections):
         Args:
             shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
         """
-        return replace(self, keypoints=self.keypoints - self.assign_to_detections(shift))
+        keypoints = self.detections.keypoints - self.assign_to_detections(shift)
+        return replace(self, detections=replace(self.detections, keypoints=keypoints))
 
     def subtract_clock_offsets(
         self, clock_offsets: Floats, image_motion: Floats
@@ -130,12 +133,13 @@ class TriangulatedDetections(TrackedDetections):
         Args:
             shift: (frames, cameras, persons, 17, 2) [px], of the bodies' joints; NaN = unknown.
         """
-        frame, camera, person = np.nonzero(self.detection_index >= 0)
+        frame, camera, person = np.nonzero(self.detections.detection_index >= 0)
         order = _order_joints(self.exchanged[frame, camera, person])
         own = np.zeros((len(frame), *shift.shape[3:]))
         np.put_along_axis(own, order[..., None], shift[frame, camera, person], axis=1)
-        out = np.zeros(self.keypoints.shape)
-        out[frame, camera, self.detection_index[frame, camera, person]] = np.nan_to_num(own)
+        out = np.zeros(self.detections.keypoints.shape)
+        place = self.detections.detection_index[frame, camera, person]
+        out[frame, camera, place] = np.nan_to_num(own)
         return out
 
 
@@ -224,7 +228,7 @@ def body_residuals(
     """
     unshifted = replace(suspects, offsets=np.zeros_like(suspects.offsets))
     rows, (frame, camera, person), order = _pair_with_bodies(views, unshifted)
-    place = suspects.detection_index[frame, camera, person]
+    place = suspects.detections.detection_index[frame, camera, person]
     wrong = np.take_along_axis(judged.rejected[frame, camera, place], order, axis=1)
     wrong |= (judged.fits[frame, camera, place] != person)[:, None]
     missed = np.where(wrong[..., None], np.nan, rows.pixels - rows.image)
@@ -250,14 +254,14 @@ def judge_detections(
     Note:
         Paper, supplement, "SMPL Fitting", last paragraph; its similarity of bones (M4).
     """
-    shape = suspects.confidence.shape
+    shape = suspects.detections.confidence.shape
     fits = np.full(shape[:3], -1, dtype=np.int16)
     similarity = np.full(shape[:3], np.nan, dtype=np.float32)
     distance = np.full(shape, np.nan, dtype=np.float32)
     dropped = np.zeros(shape[:3], dtype=np.bool_)
 
     rows, (frame, camera, person), order = _pair_with_bodies(views, suspects)
-    place = suspects.detection_index[frame, camera, person].astype(np.int64)
+    place = suspects.detections.detection_index[frame, camera, person].astype(np.int64)
     away = rows.mahalanobis_distance(spread)
     alike = rows.similarity()
     count, fitting = _count_fitting(away, settings)
@@ -273,7 +277,7 @@ def judge_detections(
     taken = np.zeros(shape[:3], dtype=np.bool_)
     taken[at] = True
     open_ = dropped | ~taken
-    open_ &= np.isfinite(suspects.keypoints[..., 0]).sum(-1) >= settings.min_keypoints
+    open_ &= np.isfinite(suspects.detections.keypoints[..., 0]).sum(-1) >= settings.min_keypoints
     for n in np.unique(np.nonzero(open_)[0]):
         others = _find_best_bodies(n, open_[n], views, suspects, spread, settings)
         at = n, others.camera, others.detection
@@ -281,7 +285,7 @@ def judge_detections(
     dropped = (dropped | suspects.dropped) & (fits < 0)
     with np.errstate(invalid="ignore"):
         rejected = distance > settings.max_deviation
-    rejected |= dropped[..., None] & np.isfinite(suspects.confidence)
+    rejected |= dropped[..., None] & np.isfinite(suspects.detections.confidence)
     return Judgement(fits, similarity, distance, rejected, dropped)
 
 
@@ -289,13 +293,14 @@ def _pair_with_bodies(
     views: BodyViews, suspects: TriangulatedDetections
 ) -> tuple[_Pairs, tuple[Places, Places, Places], Places]:
     """Return detections with the bodies of their tracked persons, and the order of their joints."""
-    frame, camera, person = np.nonzero(suspects.detection_index >= 0)
-    place = suspects.detection_index[frame, camera, person]
+    frame, camera, person = np.nonzero(suspects.detections.detection_index >= 0)
+    place = suspects.detections.detection_index[frame, camera, person]
     order = _order_joints(suspects.exchanged[frame, camera, person])
     pixels = (
-        suspects.keypoints[frame, camera, place] - suspects.offsets[frame, camera, person, None]
+        suspects.detections.keypoints[frame, camera, place]
+        - suspects.offsets[frame, camera, person, None]
     )
-    confidence = suspects.confidence[frame, camera, place]
+    confidence = suspects.detections.confidence[frame, camera, place]
     pixels = np.take_along_axis(pixels, order[..., None], axis=1)
     confidence = np.take_along_axis(confidence, order, axis=1)
     at = frame, camera, person
@@ -378,8 +383,8 @@ def _find_best_bodies(
     rows = _compare(
         views,
         (np.full(len(people), n), cameras, people),
-        suspects.keypoints[n, cameras, places],
-        suspects.confidence[n, cameras, places],
+        suspects.detections.keypoints[n, cameras, places],
+        suspects.detections.confidence[n, cameras, places],
         suspects.noise,
     )
     away, alike = rows.mahalanobis_distance(spread), rows.similarity()

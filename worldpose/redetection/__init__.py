@@ -7,13 +7,13 @@ Output: the people searched for, the estimator's results, and the accepted ones.
 from worldpose.redetection.search_results import (
     Expected,
     MissingPeople,
+    RedetectionSettings,
     Verdicts,
     find_detected_people,
     judge_search_results,
     search_missing_people,
     select_missing_people,
 )
-from worldpose.redetection.settings import RedetectionSettings
 
 __all__ = [
     "Expected",

@@ -112,7 +112,7 @@ def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections
         name: np.pad(array, [(0, 0), (0, 1)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan)
         for name, array in found.arrays().items()
     }
-    return KeypointDetections(frame=found.frame, **widened)
+    return KeypointDetections.from_arrays({"frame": found.frame, **widened})
 
 
 def _row(found: KeypointDetections, frame: int) -> int | None:

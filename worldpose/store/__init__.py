@@ -10,7 +10,6 @@ from worldpose.store.paths import ResultId
 from worldpose.store.recipes import (
     RecipeDifference,
     code_version,
-    explain_difference,
     libraries,
     recipe_differences,
     recipe_key,
@@ -30,7 +29,6 @@ __all__ = [
     "Store",
     "code_version",
     "collect",
-    "explain_difference",
     "libraries",
     "list_pins",
     "open_run",

@@ -189,15 +189,6 @@ def recipe_differences(old: Recipe, new: Recipe) -> list[RecipeDifference]:
     return found
 
 
-def explain_difference(old: Recipe, new: Recipe) -> list[str]:
-    """Return one line per difference between `old` and `new`; empty if equal.
-
-    Lines read `setting gate.max_distance: 0.5 -> 0.7` or `module worldpose.tracking.tracker:
-    3f2a... -> 77b1...`; a missing side reads `absent`.
-    """
-    return [str(each) for each in recipe_differences(old, new)]
-
-
 def _changes(
     kind: DifferenceKind, old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Iterator[RecipeDifference]:

@@ -5,7 +5,6 @@ and camera, quick joints [m], and a summary of each track.
 """
 
 from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
-from worldpose.tracking.doubts import describe_doubts
 from worldpose.tracking.feet import GroundPositions, count_covering_cameras, locate_feet
 from worldpose.tracking.ground_tracks import (
     GroundTracks,
@@ -14,6 +13,7 @@ from worldpose.tracking.ground_tracks import (
     track_on_plane,
     triangulated_places,
 )
+from worldpose.tracking.joins import describe_doubts
 from worldpose.tracking.people_selection import roster_limit
 from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
 from worldpose.tracking.settings import TrackingSettings

@@ -20,9 +20,8 @@ import numpy as np
 
 from data_contracts.arrays import ClipArray, Flags, Floats
 from worldpose.geometry import Camera
-from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
 from worldpose.tracking.epipolar import size_ratios
-from worldpose.tracking.pair_births import judge_pairs
+from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings
 
 SAMPLES: Final = 24

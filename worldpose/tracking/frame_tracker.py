@@ -9,11 +9,23 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry import Camera
-from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
-from worldpose.tracking.doubts import Takeover, find_takeovers
 from worldpose.tracking.epipolar import associate
-from worldpose.tracking.joins import Candidate, End, choose_joins, fit_track_ends, join_costs
-from worldpose.tracking.pair_births import Pairs, group_pairs, judge_pairs
+from worldpose.tracking.joins import (
+    Candidate,
+    End,
+    Takeover,
+    choose_joins,
+    find_takeovers,
+    fit_track_ends,
+    join_costs,
+)
+from worldpose.tracking.pair_births import (
+    CameraGates,
+    CameraVisibility,
+    Pairs,
+    group_pairs,
+    judge_pairs,
+)
 from worldpose.tracking.person import Person, Sighting, separations
 from worldpose.tracking.ray_matching import (
     intersect_people,

@@ -4,22 +4,210 @@ Two rays nearly meet wherever two cameras look at people of one height, so a sma
 rays is not enough. The odds of a pair weigh its rays' distance, the size and proportions of the
 triangulated skeleton, cameras that should see a person there and have no detection, and all other
 pairs that could contain one of the two detections.
+
+What cameras should see comes from their statistics. If a camera misses a person, a fixed gate wide
+enough for badly calibrated cameras would admit a neighbour's detection: the distances of matched
+detections give each camera's gate.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility
+from worldpose.compiled import compile_kernel
+from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import is_person, pair_distances, size_ratios
 from worldpose.tracking.person import Sighting, separations
 from worldpose.tracking.ray_matching import intersect_people
 from worldpose.tracking.settings import TrackingSettings
+
+MIN_COVERED_JOINTS: Final = 4
+"""Keypoints on a body's image from which on a camera has a detection there [1]."""
+BODY_WIDTH: Final = 0.2
+"""A ray that passes a joint within this distance is on the body [m]."""
+MIN_INSIDE: Final = 0.8
+"""Share of a body's joints in the image from which a camera should see it [1]."""
+FARTHER: Final = 1.25
+"""Range of a camera over the largest distance of people it has shown [1]."""
+MAX_HISTORY: Final = 300
+"""Most matched detections of a camera that its median distance uses."""
+MIN_HISTORY: Final = 10
+"""Least number of matches for a median."""
+RAY_NOISE: Final = (0.03, 0.05, 0.13)
+"""Standard deviation of the distance between two rays of one joint: least, while unknown, and
+greatest [m]. MVOR's median is 0.05 m, Shelf's 0.02 m."""
+
+
+class CameraVisibility:
+    """Expected visibility and misses of cameras, learned from known people.
+
+    Attributes:
+        centers: (cameras, 3) [m], world.
+        reach: (cameras,) greatest distance of a person that the camera showed [m].
+        shown: (cameras,) number of people that the camera should have shown [1].
+        missed: (cameras,) of these, people without a detection [1].
+    """
+
+    def __init__(self, cameras: Camera) -> None:
+        self.centers = np.ascontiguousarray(cameras.center)
+        self._cameras = cameras
+        count = len(self.centers)
+        self.reach = np.zeros(count)
+        self.shown, self.missed = np.zeros(count), np.zeros(count)
+
+    def should_see(self, joints: Floats) -> Flags:
+        """Return which cameras (cameras, n) should see bodies (n, 17, 3) [m].
+
+        Most joints must be in the image, and the camera must have shown people at a similar
+        distance. NaN joints do not count.
+        """
+        n, joint_count, _ = joints.shape
+        image = self._cameras.project(joints.reshape(-1, 3)).reshape(-1, n, joint_count, 2)
+        size = self._cameras.image_size[:, None, None]
+        with np.errstate(invalid="ignore"):
+            inside = ((image >= 0.0) & (image <= size)).all(axis=-1).sum(axis=-1)
+        known = np.isfinite(joints[..., 0]).sum(axis=1)
+        return np.asarray((inside >= MIN_INSIDE * known) & (known > 0) & self._in_reach(joints))
+
+    def _in_reach(self, joints: Floats) -> Flags:
+        """Return whether bodies (n, 17, 3) are within each camera's range (cameras, n)."""
+        away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
+        return np.asarray(away <= FARTHER * self.reach[:, None])
+
+    def learn(
+        self,
+        joints: Floats,
+        directions: Floats,
+        weights: Floats,
+        seen: Flags,
+    ) -> None:
+        """Update with the known people of one frame.
+
+        Args:
+            joints: (n, 17, 3) [m], world; NaN where unknown, not all of one person.
+            directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
+            weights: (cameras, detections, 17); 0 where not seen.
+            seen: (cameras, n) whether the camera shows the person.
+        """
+        away = np.linalg.norm(np.nanmean(joints, axis=1) - self.centers[:, None], axis=-1)
+        self.reach = np.maximum(self.reach, np.where(seen, away, 0.0).max(axis=1, initial=0.0))
+        expected = self.should_see(joints)
+        self.shown += expected.sum(axis=1)
+        empty = expected & ~seen
+        if empty.any():
+            empty &= ~find_covered_bodies(joints, self.centers, directions, weights)
+            self.missed += empty.sum(axis=1)
+
+    def misses_score(
+        self,
+        joints: Floats,
+        directions: Floats,
+        weights: Floats,
+        own: Flags,
+    ) -> Floats:
+        """Return the log probability (n,) that cameras miss bodies which they should see.
+
+        A camera that cannot see the position adds nothing, and neither does one with a detection
+        there, which may occlude the body.
+
+        Args:
+            joints: (n, 17, 3) [m], world.
+            directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
+            weights: (cameras, detections, 17); 0 where not seen.
+            own: (cameras, n) cameras whose detections the body is from.
+        """
+        if not len(joints):
+            return np.zeros(0)
+        empty = self.should_see(joints) & ~own
+        if empty.any():
+            empty &= ~find_covered_bodies(joints, self.centers, directions, weights)
+        rate = np.log((self.missed + 1.0) / (self.shown + 2.0))
+        return np.asarray(np.where(empty, rate[:, None], 0.0).sum(axis=0))
+
+
+@compile_kernel
+def find_covered_bodies(
+    joints: Floats,
+    centers: Floats,
+    directions: Floats,
+    weights: Floats,
+) -> Flags:
+    """Return in which cameras a detection lies on the image of bodies (cameras, n).
+
+    Args:
+        joints: (n, 17, 3) [m], world; NaN where unknown.
+        centers: (cameras, 3) [m], world.
+        directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
+        weights: (cameras, detections, 17); 0 where not seen.
+    """
+    cameras, detections, count, _ = directions.shape
+    covered = np.zeros((cameras, len(joints)), np.bool_)
+    for c in range(cameras):
+        for body in range(len(joints)):
+            for detection in range(detections):
+                on = 0
+                for k in range(count):
+                    if not weights[c, detection, k] > 0.0:
+                        continue
+                    u, v, w = directions[c, detection, k]
+                    for joint in range(len(joints[body])):
+                        if math.isnan(joints[body, joint, 0]):
+                            continue
+                        x = joints[body, joint, 0] - centers[c, 0]
+                        y = joints[body, joint, 1] - centers[c, 1]
+                        z = joints[body, joint, 2] - centers[c, 2]
+                        along = x * u + y * v + z * w
+                        if along > 0.0 and x * x + y * y + z * z - along**2 <= BODY_WIDTH**2:
+                            on += 1
+                            break
+                if on >= MIN_COVERED_JOINTS:
+                    covered[c, body] = True
+                    break
+    return covered
+
+
+class CameraGates:
+    """Distances of each camera's detections to the people that they were matched with.
+
+    Attributes:
+        usual: (cameras,) medians [m]; infinite with too few matches.
+        usual_pair: median distance of the rays of two detections that are each other's nearest
+            [m]; infinite with too few.
+    """
+
+    def __init__(self, cameras: int) -> None:
+        self.usual = np.full(cameras, np.inf)
+        self.usual_pair = np.inf
+        self._pairs: deque[float] = deque(maxlen=MAX_HISTORY)
+        self._known: list[deque[float]] = [deque(maxlen=MAX_HISTORY) for _ in range(cameras)]
+
+    def learn(self, distance: Floats) -> None:
+        """Add the ray distances (cameras, persons) [m] of a frame's matches; NaN = none."""
+        for camera, known in enumerate(self._known):
+            known.extend(distance[camera][np.isfinite(distance[camera])].tolist())
+            if len(known) >= MIN_HISTORY:
+                self.usual[camera] = np.median(known)
+
+    def learn_pairs(self, distance: Floats) -> None:
+        """Add ray distances (pairs,) [m] of detections that are each other's nearest."""
+        self._pairs.extend(distance.tolist())
+        if len(self._pairs) >= MIN_HISTORY:
+            self.usual_pair = float(np.median(self._pairs))
+
+    def pair_noise(self, first: Integers, second: Integers) -> Floats:
+        """Return the standard deviation of the distance of two cameras' rays (n,) [m]."""
+        low, unknown, high = RAY_NOISE
+        usual = 1.4 * np.hypot(self.usual[first], self.usual[second])
+        usual = np.where(np.isfinite(usual), usual, self.usual_pair)
+        # The median of Rayleigh's distribution is 1.18 times its scale.
+        return np.asarray(np.where(np.isfinite(usual), np.clip(0.85 * usual, low, high), unknown))
+
 
 SIZE_SPREAD: Final = 0.15
 """Standard deviation of the logarithm of a person's size from one frame [1]."""

@@ -15,9 +15,8 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.tracking.doubts import Takeover, lasting_takeovers
 from worldpose.tracking.frame_tracker import FrameTracker
-from worldpose.tracking.joins import Candidate
+from worldpose.tracking.joins import Candidate, Takeover, lasting_takeovers
 from worldpose.tracking.people_selection import join_people
 from worldpose.tracking.person import Person
 from worldpose.tracking.settings import TrackingSettings

@@ -12,9 +12,8 @@ from worldpose.triangulation.chunking import (
     reconstruct_chunks,
     reconstruct_joints,
 )
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
-from worldpose.triangulation.detections import ClipDetections, shift_in_time
-from worldpose.triangulation.left_right_swaps import unswap
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
+from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.passes import Triangulation, triangulate_joints
 from worldpose.triangulation.reports import TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
@@ -23,7 +22,6 @@ from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 __all__ = [
     "CameraClocks",
     "Chunk",
-    "ClipDetections",
     "ClipModel",
     "Reconstruction",
     "Smoothing",
@@ -37,5 +35,5 @@ __all__ = [
     "shift_in_time",
     "smooth_joints",
     "triangulate_joints",
-    "unswap",
+    "undo_swaps",
 ]

@@ -13,17 +13,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import ClipArray, Flags, Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks
-from worldpose.triangulation.detections import CHUNK, ClipDetections, check_shapes
+from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, read_frames
 from worldpose.triangulation.left_right_swaps import undo_swaps
 from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
 from worldpose.triangulation.passes import (
     DetectorModel,
     Triangulation,
+    check_shapes,
     learn_detector,
     sample_frames,
     triangulate_joints,
@@ -37,6 +37,8 @@ from worldpose.triangulation.smoothing import (
     smooth_joints,
 )
 
+CHUNK: Final = 512
+"""Frames per chunk: some hundred megabytes with 25 people in 16 cameras."""
 MARGIN: Final = 2.0
 """Margin on either side for smoothing [s]: frames farther away move a joint by less than the step
 that ends the iteration, across gaps too."""
@@ -48,11 +50,13 @@ class ClipModel:
 
     Attributes:
         clocks: clock offsets of the cameras.
+        corrected: (cameras,) [frame], the offsets to correct; None = none, by the settings.
         detector: error model of detector and calibration.
         motion: motion prior of smoothing.
     """
 
     clocks: CameraClocks
+    corrected: Floats | None
     detector: DetectorModel
     motion: MotionModel
 
@@ -74,12 +78,12 @@ class Chunk:
 
 def learn_clip(
     cameras: Camera,
-    detections: ClipDetections,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
-) -> tuple[ClipModel, ClipDetections]:
-    """Return the clip's model, and its detections with clocks corrected if the settings say so.
+) -> ClipModel:
+    """Return the clip's model, learned from sample frames.
 
     Args:
         cameras: batch (cameras,).
@@ -89,30 +93,39 @@ def learn_clip(
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
     clocks = estimate_clocks(cameras, detections, fps, settings)
-    if settings.correct_clocks:
-        detections = replace(detections, late=clocks.late)
+    late = clocks.late if settings.correct_clocks else None
     joints = detections.confidence.shape[-1]
     chosen = sample_frames(detections.detection_index.shape, joints)
-    sample = detections.read_frames(chosen)
+    sample = read_frames(detections, chosen, late)
     detector = learn_detector(cameras, sample, settings, camera_covariance)
 
     def read_track(person: int, frames: slice) -> PersonTrack:
-        alone = detections.read(frames.start, frames.stop).select_person(person)
+        alone = read_frames(detections, frames, late).select_person(person)
         known = detector.select_person(person)
         raw = triangulate_joints(cameras, alone, settings, camera_covariance, known)
         unswapped = undo_swaps(alone, raw.exchanged)
         precision = raw.noise.precision(unswapped.confidence)
         return observe_person(unswapped, precision, raw.offsets, raw.joints, person=0)
 
-    intervals = choose_stretches(detections.have_views(settings.min_views), fps)
+    intervals = choose_stretches(_have_views(detections, settings.min_views), fps)
     tracks = (read_track(person, frames) for person, frames in intervals)
     motion = learn_motion(Rig.from_cameras(cameras), tracks, joints, fps, settings)
-    return ClipModel(clocks, detector, motion), detections
+    return ClipModel(clocks, late, detector, motion)
+
+
+def _have_views(detections: KeypointDetections[ClipArray], views: int) -> Flags:
+    """Return whether at least `views` cameras saw each person (frames, persons)."""
+    index = detections.detection_index
+    parts = [
+        (index[start : start + CHUNK] >= 0).sum(axis=1) >= views
+        for start in range(0, max(1, len(index)), CHUNK)
+    ]
+    return np.concatenate(parts)
 
 
 def reconstruct_chunks(
     cameras: Camera,
-    detections: ClipDetections,
+    detections: KeypointDetections[ClipArray],
     model: ClipModel,
     fps: float,
     settings: TriangulationSettings,
@@ -125,14 +138,14 @@ def reconstruct_chunks(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip, as `learn_clip` returned them.
-        model: of the clip.
+        detections: of the clip, as detected.
+        model: of the clip, from `learn_clip`.
         fps: frames per second [1/s].
         settings: of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
         length: frames per chunk; rounded up to the margin and whole tiles of the solver.
     """
-    frames, margin = detections.frames, round(MARGIN * fps)
+    frames, margin = detections.confidence.shape[0], round(MARGIN * fps)
     # Joints of a tile share their number of steps: equal tiles give bit-identical joints.
     length = LANES * -(-max(1, length, margin) // LANES)
     parts = [
@@ -141,7 +154,7 @@ def reconstruct_chunks(
     triangulated = (
         triangulate_joints(
             cameras,
-            detections.read(part.start, part.stop),
+            read_frames(detections, part, model.corrected),
             settings,
             camera_covariance,
             model.detector,
@@ -154,7 +167,7 @@ def reconstruct_chunks(
         first, last = max(0, part.start - margin), min(frames, part.stop + margin)
         smooth = smooth_joints(
             cameras,
-            detections.read(first, last),
+            read_frames(detections, slice(first, last), model.corrected),
             _add_margins(before, here, after, margin),
             fps,
             settings,
@@ -205,7 +218,7 @@ class Reconstruction:
 
 def reconstruct_joints(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     fps: float,
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: NDArray[np.float64] | None = None,
@@ -223,8 +236,9 @@ def reconstruct_joints(
         InputError: the shapes do not match.
     """
     check_shapes(cameras, detections, camera_covariance)
-    clip = ClipDetections(detections.keypoints, detections.confidence, detections.detection_index)
-    model, clip = learn_clip(cameras, clip, fps, settings, camera_covariance)
-    length = len(detections.keypoints)
-    (chunk,) = reconstruct_chunks(cameras, clip, model, fps, settings, camera_covariance, length)
+    model = learn_clip(cameras, detections, fps, settings, camera_covariance)
+    chunks = reconstruct_chunks(
+        cameras, detections, model, fps, settings, camera_covariance, len(detections.keypoints)
+    )
+    (chunk,) = chunks
     return Reconstruction(chunk.triangulation, chunk.smoothing, model.clocks)

@@ -1,4 +1,4 @@
-"""Clock offsets of the cameras, estimated from reprojection residuals of moving people.
+"""Clock offsets of the cameras: estimated from moving people, and corrected in their detections.
 
 Frame t of a camera with clock offset d shows the time t + d: its rays miss a person by the person's
 motion in d frames.
@@ -6,17 +6,17 @@ motion in d frames.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.arrays import ClipArray, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.geometry import Camera, projection
-from worldpose.triangulation.detections import ClipDetections, shift_in_time
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings
@@ -77,7 +77,7 @@ class CameraClocks:
 
 def estimate_clocks(
     cameras: Camera,
-    detections: ClipDetections,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TriangulationSettings,
 ) -> CameraClocks:
@@ -99,10 +99,7 @@ def estimate_clocks(
     parts = _choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
-        sums = [
-            _sum_equations(rig, detections.read(part.start, part.stop), late, fps, loose)
-            for part in parts
-        ]
+        sums = [_sum_equations(rig, detections[part], late, fps, loose) for part in parts]
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
         # A common offset moves people along their path and changes no residual.
@@ -171,7 +168,7 @@ def _common_score(sums: list[_Sums]) -> Floats:
 
 def _sum_equations(
     rig: Rig,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     late: Floats,
     fps: float,
     settings: TriangulationSettings,
@@ -237,3 +234,68 @@ def _project_with_jacobian(camera: Floats, points: Floats) -> tuple[Floats, Floa
     given = np.ascontiguousarray(points[None])
     projection.project_with_jacobians(camera[None], given, image, jacobian, status)
     return image[0], jacobian[0, ..., :3]
+
+
+def read_frames(
+    detections: KeypointDetections[ClipArray], frames: slice | Integers, late: Floats | None
+) -> KeypointDetections:
+    """Return the detections of some frames of a clip, on the common clock.
+
+    Args:
+        detections: of the clip, as detected.
+        frames: from a first frame to before a last one, or single frames.
+        late: (cameras,) [frame], clock offsets to correct; None = no correction.
+    """
+    offsets = np.zeros(1) if late is None else np.nan_to_num(late)
+    reach = math.ceil(float(np.abs(offsets).max(initial=0.0)))
+    if not reach:
+        return detections[frames]
+    if isinstance(frames, slice):
+        start = max(0, frames.start - reach)
+        shifted = shift_in_time(detections[start : frames.stop + reach], offsets)
+        return shifted[frames.start - start : frames.stop - start]
+    each = [read_frames(detections, slice(frame, frame + 1), late) for frame in frames.tolist()]
+    if not each:
+        return read_frames(detections, slice(0, 0), late)
+    return KeypointDetections.from_keypoints(
+        np.concatenate([one.keypoints for one in each]),
+        np.concatenate([one.confidence for one in each]),
+        np.concatenate([one.detection_index for one in each]),
+    )
+
+
+def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetections:
+    """Return the detections shifted to the common clock, one per person and camera.
+
+    Keypoints are interpolated linearly between two frames and are missing unless both have them.
+
+    Args:
+        detections: as detected.
+        late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
+
+    Returns:
+        Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index.
+    """
+    frames, _, persons = detections.detection_index.shape
+    at = np.maximum(detections.detection_index, 0).astype(np.int64)[..., None]
+    there = (detections.detection_index >= 0)[..., None]
+    pixels = np.take_along_axis(detections.keypoints, at[..., None], axis=2).astype(np.float64)
+    weights = np.take_along_axis(detections.confidence, at, axis=2).astype(np.float64)
+    weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
+    for camera in np.flatnonzero(np.nan_to_num(late)):
+        time = np.arange(frames) - late[camera]
+        before = np.floor(time).astype(np.int64)
+        share = time - before
+        # A whole number of frames needs one frame only.
+        after = np.where(share > 0.0, before + 1, before)
+        outside = (before < 0) | (after >= frames)
+        before, after = np.clip(before, 0, frames - 1), np.clip(after, 0, frames - 1)
+        for array, spread in ((pixels, 3), (weights, 2)):
+            part = share.reshape(-1, *(1,) * spread)
+            of = array[:, camera]
+            moved = (1.0 - part) * of[before] + part * of[after]
+            moved[outside] = np.nan
+            array[:, camera] = moved
+    seen = np.isfinite(weights).any(axis=-1)
+    index = np.where(seen, np.arange(persons), -1).astype(np.int16)
+    return KeypointDetections.from_keypoints(pixels, weights, index)

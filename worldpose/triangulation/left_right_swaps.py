@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.projection import project_point
@@ -62,39 +62,24 @@ def find_swaps(
     return exchanged
 
 
-def undo_swaps(detections: TrackedDetections, exchanged: Flags) -> TrackedDetections:
+def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDetections:
     """Return detections with left-right swaps undone.
 
     Args:
         detections: as detected; not changed.
         exchanged: (frames, cameras, persons, parts).
     """
-    return replace(
-        detections,
-        keypoints=unswap(detections.keypoints, detections.detection_index, exchanged),
-        confidence=unswap(detections.confidence, detections.detection_index, exchanged),
-    )
-
-
-def unswap(
-    seen: NDArray[np.floating], index: NDArray[np.integer], exchanged: Flags
-) -> NDArray[np.floating]:
-    """Return values of detected joints with left-right swaps undone.
-
-    Args:
-        seen: (frames, cameras, detections, 17, ...); not changed.
-        index: (frames, cameras, persons).
-        exchanged: (frames, cameras, persons, parts).
-    """
     if not exchanged.any():
-        return seen
-    right = seen.copy()
+        return detections
+    keypoints, confidence = detections.keypoints.copy(), detections.confidence.copy()
     for part in range(exchanged.shape[-1]):
         frame, camera, person = np.nonzero(exchanged[..., part])
-        place = tuple(each[:, None] for each in (frame, camera, index[frame, camera, person]))
+        detection = detections.detection_index[frame, camera, person]
+        place = tuple(each[:, None] for each in (frame, camera, detection))
         of_part = PAIRS[part == PART_OF]
-        right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    return right
+        for right, seen in ((keypoints, detections.keypoints), (confidence, detections.confidence)):
+            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
+    return replace(detections, keypoints=keypoints, confidence=confidence)
 
 
 @compile_kernel

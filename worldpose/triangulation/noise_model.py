@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
@@ -29,8 +29,8 @@ from worldpose.triangulation.batched_gauss_newton import (
     USED,
     weigh,
 )
-from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Observations, Rig, gather, linearize
+from worldpose.triangulation.solving import consensus
 
 BINS: Final = 8
 """Confidence classes with equally many observations."""
@@ -77,7 +77,7 @@ class NoiseModel:
 
 def learn_noise(
     rig: Rig,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     shift: Floats,
     noise: tuple[float, float],
     limit: float,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, fold_radius, projection
 from worldpose.geometry.distortion import distort
@@ -129,7 +129,7 @@ class PersonTrack:
 
 
 def observe_person(
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     precision: Floats,
     offsets: Floats,
     joints: Floats,

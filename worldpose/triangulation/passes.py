@@ -1,7 +1,7 @@
 """Triangulation of every joint of every person, in passes (T3, T4).
 
-Each pass solves all joints (`solving`, with the inliers of `consensus`) and learns from the
-residuals: noise, left-right swaps, calibration's share, offsets of people. The next pass uses it.
+Each pass solves all joints (`solving`) and learns from the residuals: noise, left-right swaps,
+calibration's share, offsets of people. The next pass uses it.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
+from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.triangulation.detections import check_shapes
 from worldpose.triangulation.left_right_swaps import find_swaps, undo_swaps
 from worldpose.triangulation.limb_lengths import limb_lengths, repair_limb_lengths
 from worldpose.triangulation.noise_model import BY_JOINT, NoiseModel, learn_common_bias, learn_noise
@@ -104,7 +104,7 @@ class Triangulation:
 
 def triangulate_joints(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: Floats | None = None,
     model: DetectorModel | None = None,
@@ -169,7 +169,7 @@ def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
 
 def learn_detector(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
 ) -> DetectorModel:
@@ -191,7 +191,7 @@ class _Passes:
 
 def _run_passes(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     settings: TriangulationSettings,
     camera_covariance: Floats | None,
     known: DetectorModel | None,
@@ -285,3 +285,48 @@ def _count_agreement(passes: _Passes, covariance: Floats, index: NDArray[np.inte
 def _by_camera(there: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the number of true entries of (frames, cameras, ...), by camera."""
     return np.array([np.count_nonzero(there[:, c]) for c in range(there.shape[1])], np.int64)
+
+
+def check_shapes(
+    cameras: Camera, detections: KeypointDetections, camera_covariance: Floats | None
+) -> None:
+    """Require arrays of matching shapes, and valid indices.
+
+    Raises:
+        InputError: they do not match.
+    """
+    keypoints, confidence = detections.keypoints, detections.confidence
+    detection_index = detections.detection_index
+    if (
+        confidence.ndim != 4
+        or keypoints.shape != (*confidence.shape, 2)
+        or detection_index.ndim != 3
+        or detection_index.shape[:2] != confidence.shape[:2]
+        or cameras.batch_shape != confidence.shape[1:2]
+    ):
+        raise InputError(
+            "triangulation",
+            expected="keypoints (frames, cameras, detections, joints, 2), confidence without the "
+            "last, detection_index (frames, cameras, persons), cameras (cameras,)",
+            found=f"{keypoints.shape}, {confidence.shape}, {detection_index.shape}, "
+            f"{cameras.batch_shape}",
+            todo="Give arrays of the same clip and cameras.",
+        )
+    if camera_covariance is not None and camera_covariance.shape != (*cameras.batch_shape, 12, 12):
+        raise InputError(
+            "triangulation: camera_covariance",
+            expected=f"shape {(*cameras.batch_shape, 12, 12)}",
+            found=f"{camera_covariance.shape}",
+            todo="Give the covariance of every camera's calibration, or none.",
+        )
+    detections = confidence.shape[2]
+    if (
+        detection_index.size
+        and not -1 <= detection_index.min() <= detection_index.max() < detections
+    ):
+        raise InputError(
+            "triangulation: detection_index",
+            expected=f"-1 or the place of one of {detections} detections",
+            found=f"{detection_index.min()} to {detection_index.max()}",
+            todo="Give the index that was made from these detections.",
+        )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
@@ -191,7 +191,7 @@ def estimate_offsets(
 
 
 def estimate_midhip_shift(
-    rig: Rig, detections: TrackedDetections, settings: TriangulationSettings
+    rig: Rig, detections: KeypointDetections, settings: TriangulationSettings
 ) -> Floats:
     """Return the mid-hip residual of each person in each image, and a zero.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
@@ -426,7 +426,7 @@ class Smoothing:
 
 def smooth_joints(
     cameras: Camera,
-    detections: TrackedDetections,
+    detections: KeypointDetections,
     raw: Triangulation,
     fps: float,
     settings: TriangulationSettings,

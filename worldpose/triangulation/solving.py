@@ -1,9 +1,12 @@
-"""Triangulation of every joint of a clip from its inlier observations."""
+"""Triangulation of every joint of a clip from its inlier observations, for 64 joints at a time.
+
+Tiles, states and their rows are those of `batched_gauss_newton`.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +14,168 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.compiled import compile_kernel
 from worldpose.triangulation.batched_gauss_newton import (
+    CHANGED,
+    INSIDE,
     LANES,
     MATRIX,
     POINT,
     PRECISION,
     ROWS,
+    SEEN,
+    SHARPNESS,
+    SQUARED,
     STATE,
+    STEP,
     USED,
+    WORST,
+    largest,
     measure,
+    select,
+    start,
+    step,
+    survey,
 )
-from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Observations, gather, linearize
 from worldpose.triangulation.settings import TriangulationSettings
+
+MAX_STEPS: Final = 8
+CONVERGED: Final = 1e-6
+"""Length of a step that ends the iteration [m]."""
+MAX_REVISIONS: Final = 5
+"""Updates of the inlier set; it settles after one or two."""
+SHRINK: Final = 0.1
+"""Factor on the scale of the loss from step to step [1]."""
+
+
+@compile_kernel
+def consensus(
+    tiles: Floats,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    state: Floats,
+) -> None:
+    """Write the least-squares points of the inlier views, NaN where there are none.
+
+    The first attempt uses all views. If they disagree, a Geman-McClure loss whose scale shrinks
+    from the largest error to `limit` finds a majority (graduated non-convexity, Blake and Zisserman
+    1987). Without a majority, the pair of views with the smallest error over all views decides. The
+    result is the plain least-squares point of the views within `limit`.
+
+    Args:
+        tiles: (cameras, ROWS x LANES); writes `USED`.
+        depths: (cameras, 4).
+        noise: [px], [m].
+        limit: largest squared error of an inlier [variances].
+        state: written: points, and the inverse matrices there.
+    """
+    for tile in tiles:
+        # Start with all available views.
+        tile[SQUARED : SQUARED + LANES] = 0.0
+    select(tiles, limit, state)
+    state[SHARPNESS : SHARPNESS + LANES] = 0.0
+    start(tiles, state)
+    step(tiles, depths, noise, state)
+    if _graduate(tiles, depths, noise, limit, state):
+        survey(tiles, limit, state)
+        for j in range(LANES):
+            if state[SHARPNESS + j] > 0.0:
+                inside = state[INSIDE + j]
+                # A majority of three or more agrees by chance too rarely to look further.
+                if inside < 3 or 2 * inside <= state[SEEN + j]:
+                    _take_best_pair(tiles, depths, noise, limit, j, state)
+        state[SHARPNESS : SHARPNESS + LANES] = 0.0
+    for _ in range(MAX_REVISIONS):
+        select(tiles, limit, state)
+        if not largest(state, CHANGED) > 0.0:
+            break
+        step(tiles, depths, noise, state)
+        step(tiles, depths, noise, state)
+    for _ in range(MAX_STEPS):
+        step(tiles, depths, noise, state)
+        if not largest(state, STEP) > CONVERGED**2:
+            break
+
+
+@compile_kernel
+def _graduate(
+    tiles: Floats, depths: Floats, noise: tuple[float, float], limit: float, state: Floats
+) -> bool:
+    """Move joints with disagreeing views to a majority's point; return whether there are any.
+
+    Their loss scale ends at `limit`; the loss scale of all other joints is infinite.
+    """
+    survey(tiles, limit, state)
+    most = 0.0
+    for j in range(LANES):
+        if state[INSIDE + j] < state[SEEN + j]:
+            worst = max(state[WORST + j], limit)
+            state[SHARPNESS + j] = 1.0 / worst
+            most = max(most, worst)
+    if most == 0.0:
+        return False
+    while True:
+        step(tiles, depths, noise, state)
+        if most <= limit:
+            break
+        most *= SHRINK
+        for j in range(LANES):
+            state[SHARPNESS + j] = min(1.0 / limit, state[SHARPNESS + j] / SHRINK)
+    # Errors refer to the state before a step: one more step updates them.
+    step(tiles, depths, noise, state)
+    return True
+
+
+@compile_kernel
+def _take_best_pair(
+    tiles: Floats,
+    depths: Floats,
+    noise: tuple[float, float],
+    limit: float,
+    lane: int,
+    state: Floats,
+) -> None:
+    """Set a lane to the two-view point with the smallest truncated error over all views."""
+    views = np.empty(len(tiles), np.int64)
+    count = 0
+    for camera in range(len(tiles)):
+        if tiles[camera, PRECISION + lane] > 0.0:
+            views[count] = camera
+            count += 1
+    pairs = np.empty((LANES, 2), np.int64)
+    trial, trial_depths = np.empty((count, ROWS * LANES)), np.empty((count, 4))
+    for k in range(count):
+        trial_depths[k] = depths[views[k]]
+        for row in range(ROWS):
+            trial[k, row * LANES : (row + 1) * LANES] = tiles[views[k], row * LANES + lane]
+    points = np.empty(STATE * LANES)
+    best, filled = math.inf, 0
+    for one in range(count):
+        for two in range(one + 1, count):
+            pairs[filled, 0], pairs[filled, 1] = one, two
+            filled += 1
+            if filled < LANES and (one, two) != (count - 2, count - 1):
+                continue
+            for k in range(count):
+                for j in range(LANES):
+                    among = j < filled and (pairs[j, 0] == k or pairs[j, 1] == k)
+                    trial[k, USED + j] = 1.0 if among else 0.0
+            points[SHARPNESS : SHARPNESS + LANES] = 0.0
+            start(trial, points)
+            at = points[POINT : POINT + 3 * LANES].copy()
+            step(trial, trial_depths, noise, points)
+            for j in range(filled):
+                cost = 0.0
+                for k in range(count):
+                    squared = trial[k, SQUARED + j]
+                    cost += squared if squared < limit else limit
+                if cost < best:
+                    best = cost
+                    for axis in range(3):
+                        state[POINT + axis * LANES + lane] = at[axis * LANES + j]
+                    for k in range(count):
+                        tiles[views[k], SQUARED + lane] = trial[k, SQUARED + j]
+            filled = 0
 
 
 class Solution(NamedTuple):

@@ -5,8 +5,7 @@ or a file.
 """
 
 from worldpose.video.folder import ImageFolder, index_video, open_video
-from worldpose.video.frame_index import FrameIndex, index_frames
-from worldpose.video.reading import VideoReader
+from worldpose.video.reading import FrameIndex, VideoReader, index_frames
 from worldpose.video.writing import write_video
 
 __all__ = [

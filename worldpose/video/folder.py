@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.errors import InputError
-from worldpose.video.frame_index import FrameIndex, index_frames
-from worldpose.video.reading import VideoReader
+from worldpose.video.reading import FrameIndex, VideoReader, index_frames
 
 HEADER_BYTES: Final = 1 << 20
 """First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""

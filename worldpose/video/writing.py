@@ -12,7 +12,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from worldpose.errors import InputError
-from worldpose.video.frame_index import FrameIndex, index_frames
+from worldpose.video.reading import FrameIndex, index_frames
 
 
 def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | None = None) -> int:

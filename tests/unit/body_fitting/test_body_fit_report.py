@@ -7,10 +7,10 @@ import pytest
 from test_monocular import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body_fitting import (
     BodyFittingSettings,
     ClipEvidence,
-    Pictures,
     fit_bodies,
     report_fit,
 )
@@ -28,7 +28,8 @@ def test_figures_of_every_person_are_those_of_his_joints():
     keypoints[20:, 0, 0, 5] = np.nan
     index = np.zeros((30, 1, 1), dtype=np.int64)
     index[25:] = -1
-    report = report_fit(fit, joints, 50.0, Pictures(camera, keypoints, index))
+    detections = KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index)
+    report = report_fit(fit, joints, 50.0, (camera, detections))
     assert report.bodies == 30 and report.filled == 2 and report.guided == 0
     # Pixels are 5 px off by design; 1 cm at 70 m and 4000 px of focal length is 0.6 px.
     assert report.reprojection_px[0] == pytest.approx(5.0, abs=1.0)

@@ -7,6 +7,7 @@ import pytest
 from test_monocular import broadcast, crowd
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body import BodyParameters
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.body_fitting.objective import Evidence
@@ -18,6 +19,10 @@ from worldpose.body_fitting.ray_constraints import (
 )
 
 CAMERA = broadcast(1)
+
+
+def tracked(keypoints, index):
+    return KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index)
 
 
 def scene(frames, hidden):
@@ -40,7 +45,7 @@ def scene(frames, hidden):
 
 def test_lines_pass_through_the_joints_they_see():
     exact, joints, _, keypoints, index = scene(30, slice(10, 20))
-    lines = find_ray_constraints(CAMERA, keypoints, index, joints)
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
     assert lines.seen[10:20].all() and not lines.seen[:10].any() and not lines.seen[20:].any()
     off = np.einsum("fpjab,fpjb->fpja", lines.across, lines.points - exact[:, None])
     # The joints of a person stand 0.8 rad / 70 from his middle at most, and the points 1 m too far
@@ -53,20 +58,19 @@ def test_lines_pass_through_the_joints_they_see():
 def test_joints_that_two_cameras_see_or_none_have_no_line():
     _, joints, _, keypoints, index = scene(12, slice(4, 8))
     keypoints[5, 0, 0, 3] = np.nan
-    lines = find_ray_constraints(CAMERA, keypoints, index, joints)
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
     assert np.isnan(lines.points[5, 0, 3]).all() and np.isfinite(lines.points[5, 0, 4]).all()
     two = type(CAMERA).stack([CAMERA[0], CAMERA[0]])
-    both = find_ray_constraints(
-        two, np.repeat(keypoints, 2, axis=1), np.repeat(index, 2, axis=1), joints
-    )
+    twice = tracked(np.repeat(keypoints, 2, axis=1), np.repeat(index, 2, axis=1))
+    both = find_ray_constraints(two, twice, joints)
     assert not both.seen.any()
-    unseen = find_ray_constraints(CAMERA, keypoints, np.full_like(index, -1), joints)
+    unseen = find_ray_constraints(CAMERA, tracked(keypoints, np.full_like(index, -1)), joints)
     assert not unseen.seen.any() and not unseen.across.any()
 
 
 def test_a_person_who_was_never_triangulated_has_no_line():
     _, joints, _, keypoints, index = scene(4, slice(0, 4))
-    assert not find_ray_constraints(CAMERA, keypoints, index, joints).seen.any()
+    assert not find_ray_constraints(CAMERA, tracked(keypoints, index), joints).seen.any()
 
 
 @pytest.mark.parametrize("length", [25, 75])
@@ -74,7 +78,7 @@ def test_stretches_of_one_view_are_filled_better_than_by_motion_alone(length):
     hidden = slice(20, 20 + length)
     exact, joints, covariance, keypoints, index = scene(40 + length, hidden)
     settings = BodyFittingSettings(max_filled_gap_s=2.0)
-    lines = find_ray_constraints(CAMERA, keypoints, index, joints)
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
     alone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     lined = fit_bodies(
         MODEL, ClipEvidence(joints, covariance, 50.0, ray_constraints=[lines]), settings
@@ -96,7 +100,7 @@ def test_stretches_of_one_view_are_filled_better_than_by_motion_alone(length):
 def test_who_is_seen_by_one_camera_stays_longer_than_the_longest_gap():
     _, joints, covariance, keypoints, index = scene(90, slice(15, 75))
     settings = BodyFittingSettings(max_filled_gap_s=0.5)
-    lines = find_ray_constraints(CAMERA, keypoints, index, joints)
+    lines = find_ray_constraints(CAMERA, tracked(keypoints, index), joints)
     gone = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), settings)
     stays = fit_bodies(
         MODEL, ClipEvidence(joints, covariance, 50.0, ray_constraints=[lines]), settings

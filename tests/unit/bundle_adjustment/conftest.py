@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment import Clicks, Clip, Problem
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.scene import look_at
@@ -97,7 +97,9 @@ def clip():
         keypoints = np.ascontiguousarray(keypoints.swapaxes(0, 1))
         index = np.broadcast_to(np.arange(persons), (frames, cameras, persons)).astype(np.int16)
         confidence = np.ones(keypoints.shape[:-1])
-        placed = triangulate_joints(base, TrackedDetections(keypoints, confidence, index), STATED)
+        frame = 100 + np.arange(frames)
+        seen = KeypointDetections.from_keypoints(keypoints, confidence, index, frame)
+        placed = triangulate_joints(base, seen, STATED)
         clicks = []
         for c in range(cameras):
             points = rng.uniform([-18.0, -18.0, 0.0], [18.0, 18.0, 0.3], (clicked, 3))
@@ -108,11 +110,8 @@ def clip():
             cameras=base,
             covariance=np.tile(np.diag(KNOWN**2), (cameras, 1, 1)),
             clicks=tuple(clicks),
-            frame=100 + np.arange(frames),
             fps=25.0,
-            keypoints=keypoints,
-            confidence=confidence,
-            detection_index=index.astype(np.int64),
+            detections=seen,
             joints=placed.joints,
             views=placed.views.astype(np.int64),
             triangulation=STATED,

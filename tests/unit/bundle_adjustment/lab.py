@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment import Clicks, Clip
 from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration import step_camera
@@ -147,16 +147,14 @@ def make_lab(
     index = np.broadcast_to(np.arange(persons), (frames, cameras, persons)).astype(np.int16)
     confidence = np.where(np.isfinite(keypoints[..., 0]), 0.8, np.nan)
     settings = TriangulationSettings()
-    placed = triangulate_joints(given, TrackedDetections(keypoints, confidence, index), settings)
+    seen = KeypointDetections.from_keypoints(keypoints, confidence, index, np.arange(frames))
+    placed = triangulate_joints(given, seen, settings)
     clip = Clip(
         cameras=given,
         covariance=np.zeros((cameras, 12, 12)),
         clicks=(Clicks.none(),) * cameras,
-        frame=np.arange(frames),
         fps=FPS,
-        keypoints=keypoints,
-        confidence=confidence,
-        detection_index=index.astype(np.int64),
+        detections=seen,
         joints=placed.joints,
         views=placed.views.astype(np.int64),
         triangulation=settings,
@@ -167,11 +165,7 @@ def make_lab(
 def triangulated(lab, cameras, covariance=None):
     """Joints of the laboratory's people with some cameras."""
     clip = lab.clip
-    index = clip.detection_index.astype(np.int16)
-    arrays = (clip.keypoints, clip.confidence, index)
-    return triangulate_joints(
-        cameras, TrackedDetections(*arrays), clip.triangulation, covariance
-    ).joints
+    return triangulate_joints(cameras, clip.detections, clip.triangulation, covariance).joints
 
 
 def joint_error(lab, joints, aligned=False):

@@ -23,8 +23,8 @@ SETTINGS = BundleAdjustmentSettings()
 
 
 def observations(made):
-    people = np.ones(made.detection_index.shape[2], dtype=bool)
-    return select_observations(made, np.arange(len(made.frame)), people, made.cameras, 3)
+    people = np.ones(made.detections.detection_index.shape[2], dtype=bool)
+    return select_observations(made, np.arange(len(made.detections.frame)), people, made.cameras, 3)
 
 
 def test_the_prior_is_the_inverse_of_what_calibration_knows(clip):
@@ -72,7 +72,8 @@ def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):
     for o in (0, 1, len(observed.image) - 1):
         frame, person, joint = observed.frame_of[o], observed.person_of[o], observed.joint_of[o]
         np.testing.assert_array_equal(
-            observed.image[o], made.keypoints[frame, observed.camera_of[o], person, joint]
+            observed.image[o],
+            made.detections.keypoints[frame, observed.camera_of[o], person, joint],
         )
         np.testing.assert_array_equal(
             observed.points[observed.point_of[o]], made.joints[frame, person, joint]

@@ -74,14 +74,14 @@ def found(made, cameras, limit=4.2, longest=10_000):
 def test_planted_keypoints_come_first(clip):
     made, true, _ = clip(cameras=8, frames=20, noise=0.9)
     rng = np.random.default_rng(8)
-    image = made.keypoints.copy()
+    image = made.detections.keypoints.copy()
     chosen = rng.permutation(20 * 8 * 6 * 17)[:300]
     rows = np.column_stack(np.unravel_index(chosen, (20, 8, 6, 17)))
     planted = {tuple(row) for row in rows.tolist()}
     for row in sorted(planted):
         angle, length = rng.uniform(0.0, 2.0 * np.pi), 0.9 * rng.uniform(4.0, 30.0)
         image[row] += length * np.array([np.cos(angle), np.sin(angle)])
-    listed = found(replace(made, keypoints=image), true)
+    listed = found(replace(made, detections=replace(made.detections, keypoints=image)), true)
     first = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     assert (np.diff(listed.surprise) <= 0).all()
     hits = planted & set(first[: len(planted)])
@@ -91,9 +91,9 @@ def test_planted_keypoints_come_first(clip):
 
 def test_a_person_taken_for_another_is_one_entry(clip):
     made, true, _ = clip(cameras=8, noise=0.9)
-    index = made.detection_index.copy()
+    index = made.detections.detection_index.copy()
     index[7, 3, [0, 1]] = [1, 0]
-    listed = found(replace(made, detection_index=index), true)
+    listed = found(replace(made, detections=replace(made.detections, detection_index=index)), true)
     entries = set(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     assert {(7, 3, 0, -1), (7, 3, 1, -1)} <= entries
     assert listed.surprise[0] > 10.0
@@ -102,13 +102,13 @@ def test_a_person_taken_for_another_is_one_entry(clip):
 def test_planted_exchanges_of_people_head_the_list_at_the_length_of_what_was_planted(clip):
     made, true, _ = clip(cameras=8, frames=20, noise=0.9)
     rng = np.random.default_rng(9)
-    index, planted = made.detection_index.copy(), set()
+    index, planted = made.detections.detection_index.copy(), set()
     for number in rng.permutation(20 * 8)[:24]:
         frame, camera = divmod(int(number), 8)
         pair = rng.permutation(6)[:2]
         index[frame, camera, pair] = index[frame, camera, pair[::-1]]
         planted |= {(frame, camera, int(person), -1) for person in pair}
-    listed = found(replace(made, detection_index=index), true)
+    listed = found(replace(made, detections=replace(made.detections, detection_index=index)), true)
     entries = list(zip(listed.frame, listed.camera, listed.person, listed.joint, strict=True))
     first = set(entries[: len(planted)])
     # At the planted length precision equals recall.
@@ -233,7 +233,7 @@ def test_a_click_on_a_point_that_the_camera_cannot_image_is_first_and_says_why(c
     # All the way to what is stored.
     settings = BundleAdjustmentSettings(evidence="markings", folds=2)
     adjusted = replace(adjust_cameras(clip_of, settings), cameras=true)
-    people = np.arange(made.detection_index.shape[2])
+    people = np.arange(made.detections.detection_index.shape[2])
     arrays, attributes = adjustment_arrays(adjusted, settings, people)
     checked = checked_arrays(BUNDLE_ADJUSTMENT, arrays, {})
     assert checked["click_wrong"][0]

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
 from worldpose.static_calibration import project_with_jacobian, step_camera
 from worldpose.triangulation import triangulate_joints
@@ -44,8 +43,7 @@ def test_players_tell_an_ambiguous_camera_about_the_half_without_markings(clip):
             root = np.linalg.cholesky(block / np.outer(scale, scale))
             step[c, free] = scale * (root @ rng.standard_normal(int(free.sum())))
         cameras = step_camera(true, step)
-        index = made.detection_index.astype(np.int16)
-        detections = TrackedDetections(made.keypoints, made.confidence, index)
+        detections = made.detections
         placed = triangulate_joints(cameras, detections, made.triangulation)
         ambiguous = replace(
             made,

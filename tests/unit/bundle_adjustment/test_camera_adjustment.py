@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import (
     BundleAdjustmentSettings,
     Clicks,
@@ -81,9 +80,11 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
 
 def test_people_taken_for_others_in_one_camera_spoil_little(clip):
     made, true, _ = clip(cameras=6)
-    keypoints = made.keypoints.copy()
+    keypoints = made.detections.keypoints.copy()
     keypoints[:, 5, :2] += np.random.default_rng(4).normal(0.0, 40.0, (24, 2, 1, 2))
-    adjusted = adjust_cameras(replace(made, keypoints=keypoints), QUICK)
+    adjusted = adjust_cameras(
+        replace(made, detections=replace(made.detections, keypoints=keypoints)), QUICK
+    )
     assert adjusted.accepted[:5].all()
     before, after = errors(made.cameras, true)[:5], errors(adjusted.cameras, true)[:5]
     # Without these people it is a factor of three.
@@ -97,8 +98,7 @@ def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
     given = replace(
         made, cameras=step_camera(true, step), covariance=np.zeros_like(made.covariance)
     )
-    index = made.detection_index.astype(np.int16)
-    detections = TrackedDetections(made.keypoints, made.confidence, index)
+    detections = made.detections
     placed = triangulate_joints(given.cameras, detections, made.triangulation)
     given = replace(given, joints=placed.joints)
     adjusted = adjust_cameras(given, QUICK)

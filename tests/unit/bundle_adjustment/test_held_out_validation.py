@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import TrackedDetections
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import compare_errors, held_out_errors
 from worldpose.static_calibration import step_camera
@@ -57,7 +56,7 @@ def test_nobody_gives_no_comparison(clip):
 @pytest.mark.parametrize(("scale", "loss"), [(3.0, 9.0 * np.log(5.0)), (1.5, 2.25 * np.log(17.0))])
 def test_what_a_far_keypoint_costs_grows_with_the_logarithm_of_its_square(clip, scale, loss):
     made, true, _ = clip(frames=2, persons=1, noise=0.0)
-    made.keypoints[1, 2, 0, 4] += [3.6, 4.8]
+    made.detections.keypoints[1, 2, 0, 4] += [3.6, 4.8]
     everybody = np.ones((2, 1), dtype=bool)
     held = held_out_errors(made, true, np.arange(2), everybody, robust_scale=scale)
     # 6 px at a noise of one: two and four scales, and the other four views are exact.
@@ -78,8 +77,7 @@ def errors(cameras, true):
 
 def placed_again(clip):
     """The clip with its people triangulated with the cameras that it has now."""
-    index = clip.detection_index.astype(np.int16)
-    detections = TrackedDetections(clip.keypoints, clip.confidence, index)
+    detections = clip.detections
     placed = triangulate_joints(clip.cameras, detections, clip.triangulation)
     return replace(clip, joints=placed.joints, views=placed.views.astype(np.int64))
 
@@ -115,9 +113,12 @@ def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(hones
 
 def test_a_camera_that_shows_other_people_has_no_say(honest):
     made, true, clean = honest
-    index = made.detection_index.copy()
+    index = made.detections.detection_index.copy()
     index[:, WRONG] = np.roll(index[:, WRONG], 1, axis=-1)
-    adjusted = adjust_cameras(placed_again(replace(made, detection_index=index)), QUICK)
+    adjusted = adjust_cameras(
+        placed_again(replace(made, detections=replace(made.detections, detection_index=index))),
+        QUICK,
+    )
     assert np.flatnonzero(~adjusted.accepted).tolist() == [WRONG]
     assert "shows other people" in adjusted.reasons[WRONG]
     np.testing.assert_array_equal(adjusted.cameras.numbers[WRONG], made.cameras.numbers[WRONG])

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from joint_regions import JOINT_GROUPS, region_counts
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
-from worldpose.evaluation.regions import JOINT_GROUPS, region_counts
 from worldpose.formats import JointTracks
 
 

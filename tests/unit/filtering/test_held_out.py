@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted_errors import plant
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.filtering import measure_held_out
 from worldpose.filtering.held_out import FARTHEST
 from worldpose.triangulation import TriangulationSettings
@@ -19,14 +19,16 @@ def scene():
 
 def measured(scene, index=None, used=None):
     suspects = scene.suspects
-    keypoints, confidence = (suspects.keypoints, suspects.confidence) if used is None else used
-    index = suspects.detection_index if index is None else index
-    detections = TrackedDetections(keypoints, confidence, index.astype(np.int16))
-    return measure_held_out(scene.cameras, detections, suspects.keypoints, SETTINGS)
+    keypoints, confidence = (
+        (suspects.detections.keypoints, suspects.detections.confidence) if used is None else used
+    )
+    index = suspects.detections.detection_index if index is None else index
+    detections = KeypointDetections.from_keypoints(keypoints, confidence, index.astype(np.int16))
+    return measure_held_out(scene.cameras, detections, suspects.detections.keypoints, SETTINGS)
 
 
 def test_people_who_are_not_followed_make_it_worse_though_nothing_contradicts_them(scene):
-    index = scene.suspects.detection_index.copy()
+    index = scene.suspects.detections.detection_index.copy()
     index[:, :, 0] = -1
     whole, fewer = measured(scene), measured(scene, index)
     assert fewer.keypoints == whole.keypoints
@@ -35,31 +37,31 @@ def test_people_who_are_not_followed_make_it_worse_though_nothing_contradicts_th
 
 def test_people_placed_from_planted_keypoints_are_foreseen_worse_than_without_them(scene):
     rng = np.random.default_rng(5)
-    wrong = rng.random(scene.suspects.confidence.shape) < 0.4
-    keypoints = scene.suspects.keypoints.copy()
+    wrong = rng.random(scene.suspects.detections.confidence.shape) < 0.4
+    keypoints = scene.suspects.detections.keypoints.copy()
     keypoints[wrong] += 25.0
-    spoilt = measured(scene, used=(keypoints, scene.suspects.confidence))
-    without = np.where(wrong, np.nan, scene.suspects.confidence)
-    kept = np.where(wrong[..., None], np.nan, scene.suspects.keypoints)
+    spoilt = measured(scene, used=(keypoints, scene.suspects.detections.confidence))
+    without = np.where(wrong, np.nan, scene.suspects.detections.confidence)
+    kept = np.where(wrong[..., None], np.nan, scene.suspects.detections.keypoints)
     assert measured(scene, used=(kept, without)).error < spoilt.error
 
 
 def test_what_nobody_foresees_counts_as_the_farthest(scene):
-    nobody = np.full_like(scene.suspects.detection_index, -1)
+    nobody = np.full_like(scene.suspects.detections.detection_index, -1)
     assert measured(scene, nobody).error == pytest.approx(FARTHEST)
 
 
 def test_without_keypoints_there_is_nothing_to_foresee(scene):
-    nothing = np.full_like(scene.suspects.keypoints, np.nan)
-    index = scene.suspects.detection_index.astype(np.int16)
-    used = TrackedDetections(nothing, nothing[..., 0], index)
+    nothing = np.full_like(scene.suspects.detections.keypoints, np.nan)
+    index = scene.suspects.detections.detection_index.astype(np.int16)
+    used = KeypointDetections.from_keypoints(nothing, nothing[..., 0], index)
     assert measure_held_out(scene.cameras, used, nothing, SETTINGS) is None
 
 
 def test_a_clip_without_anybody_is_as_badly_foreseen_as_can_be(scene):
-    assert measured(scene, scene.suspects.detection_index[:, :, :0]).error == pytest.approx(
-        FARTHEST
-    )
+    assert measured(
+        scene, scene.suspects.detections.detection_index[:, :, :0]
+    ).error == pytest.approx(FARTHEST)
 
 
 @pytest.mark.parametrize(("count", "least", "judges"), [(2, 2, False), (3, 2, True), (3, 3, False)])
@@ -67,12 +69,12 @@ def test_left_out_cameras_judge_only_where_enough_others_are_left(scene, count, 
     suspects, some = scene.suspects, slice(count)
     found = measure_held_out(
         scene.cameras[some],
-        TrackedDetections(
-            suspects.keypoints[:, some],
-            suspects.confidence[:, some],
-            suspects.detection_index[:, some].astype(np.int16),
+        KeypointDetections.from_keypoints(
+            suspects.detections.keypoints[:, some],
+            suspects.detections.confidence[:, some],
+            suspects.detections.detection_index[:, some].astype(np.int16),
         ),
-        suspects.keypoints[:, some],
+        suspects.detections.keypoints[:, some],
         TriangulationSettings(min_views=least),
     )
     assert (found is not None) == judges

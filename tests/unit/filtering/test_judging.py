@@ -16,15 +16,20 @@ def scene():
     return plant(31)
 
 
-def judged(scene, **changes):
-    suspects = replace(scene.suspects, **changes)
+def judged(scene, dropped=None, exchanged=None, **changes):
+    suspects = replace(
+        scene.suspects,
+        detections=replace(scene.suspects.detections, **changes),
+        dropped=scene.suspects.dropped if dropped is None else dropped,
+        exchanged=scene.suspects.exchanged if exchanged is None else exchanged,
+    )
     spread = learn_keypoint_spread(scene.views, suspects)
     return judge_detections(scene.views, suspects, spread, SETTINGS)
 
 
 def test_nine_of_ten_planted_keypoints_are_found_and_few_honest_ones_rejected(scene):
     found = judged(scene)
-    seen = np.isfinite(scene.suspects.confidence) & (scene.person >= 0)[..., None]
+    seen = np.isfinite(scene.suspects.detections.confidence) & (scene.person >= 0)[..., None]
     planted = scene.displaced & seen
     assert planted.sum() > 500
     assert found.rejected[planted].mean() >= 0.9
@@ -35,13 +40,13 @@ def test_everybody_fits_the_body_that_is_his(scene):
     found = judged(scene)
     known = found.fits >= 0
     assert (found.fits[known] == scene.person[known]).mean() > 0.99
-    mine = (scene.person >= 0) & (np.isfinite(scene.suspects.confidence).sum(-1) >= 10)
+    mine = (scene.person >= 0) & (np.isfinite(scene.suspects.detections.confidence).sum(-1) >= 10)
     assert (found.fits[mine] >= 0).mean() > 0.95
 
 
 def test_a_box_that_nobody_claims_is_given_to_the_body_that_it_fits(scene):
     frame, camera, person = 3, 1, 2
-    index = scene.suspects.detection_index.copy()
+    index = scene.suspects.detections.detection_index.copy()
     place = index[frame, camera, person]
     assert place >= 0
     index[frame, camera, person] = -1
@@ -51,7 +56,7 @@ def test_a_box_that_nobody_claims_is_given_to_the_body_that_it_fits(scene):
 
 
 def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
-    index = scene.suspects.detection_index.copy()
+    index = scene.suspects.detections.detection_index.copy()
     frame, camera = 5, 0
     first, second = np.flatnonzero(index[frame, camera] >= 0)[:2]
     places = index[frame, camera, [first, second]]
@@ -63,24 +68,27 @@ def test_two_boxes_under_each_other_s_names_fit_the_other_and_are_kept(scene):
 
 
 def test_a_box_that_fits_nobody_is_dropped_whole(scene):
-    keypoints = scene.suspects.keypoints.copy()
+    keypoints = scene.suspects.detections.keypoints.copy()
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.detection_index[frame, camera, person]
+    place = scene.suspects.detections.detection_index[frame, camera, person]
     keypoints[frame, camera, place, :, 0] += 400.0
     found = judged(scene, keypoints=keypoints)
     assert found.dropped[frame, camera, place]
-    there = np.isfinite(scene.suspects.confidence[frame, camera, place])
+    there = np.isfinite(scene.suspects.detections.confidence[frame, camera, place])
     np.testing.assert_array_equal(found.rejected[frame, camera, place], there)
     assert found.fits[frame, camera, place] == -1
 
 
 def test_a_dropped_box_that_nobody_claims_any_more_stays_dropped_until_it_fits(scene):
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.detection_index[frame, camera, person]
+    place = scene.suspects.detections.detection_index[frame, camera, person]
     before = np.zeros_like(scene.suspects.dropped)
     before[frame, camera, place] = True
     assert not judged(scene, dropped=before).dropped[frame, camera, place]
-    keypoints, index = scene.suspects.keypoints.copy(), scene.suspects.detection_index.copy()
+    keypoints, index = (
+        scene.suspects.detections.keypoints.copy(),
+        scene.suspects.detections.detection_index.copy(),
+    )
     keypoints[frame, camera, place, :, 0] += 400.0
     index[frame, camera, person] = -1
     unclaimed = {"keypoints": keypoints, "detection_index": index}
@@ -90,8 +98,8 @@ def test_a_dropped_box_that_nobody_claims_any_more_stays_dropped_until_it_fits(s
 
 def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
     frame, camera, person = 4, 2, 1
-    place = scene.suspects.detection_index[frame, camera, person]
-    keypoints = scene.suspects.keypoints.copy()
+    place = scene.suspects.detections.detection_index[frame, camera, person]
+    keypoints = scene.suspects.detections.keypoints.copy()
     own = keypoints[frame, camera, place]
     keypoints[frame, camera, place] = 2.0 * np.nanmean(own, axis=0) - own
     found = judged(scene, keypoints=keypoints)
@@ -101,10 +109,13 @@ def test_a_body_upside_down_has_the_distance_but_not_the_similarity(scene):
 
 def test_sides_that_were_put_right_are_no_contradiction(scene):
     frame, camera, person = 6, 3, 0
-    place = scene.suspects.detection_index[frame, camera, person]
+    place = scene.suspects.detections.detection_index[frame, camera, person]
     honest = judged(scene).mahalanobis_distance[frame, camera, place]
     left_right = [0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15]
-    keypoints, confidence = scene.suspects.keypoints.copy(), scene.suspects.confidence.copy()
+    keypoints, confidence = (
+        scene.suspects.detections.keypoints.copy(),
+        scene.suspects.detections.confidence.copy(),
+    )
     for array in (keypoints, confidence):
         array[frame, camera, place] = array[frame, camera, place][left_right]
     exchanged = scene.suspects.exchanged.copy()
@@ -131,8 +142,8 @@ def test_a_person_without_a_body_is_not_judged(scene):
 
 
 def test_nothing_to_judge_is_no_error(scene):
-    index = np.full_like(scene.suspects.detection_index, -1)
-    keypoints = np.full_like(scene.suspects.keypoints, np.nan)
+    index = np.full_like(scene.suspects.detections.detection_index, -1)
+    keypoints = np.full_like(scene.suspects.detections.keypoints, np.nan)
     found = judged(scene, detection_index=index, keypoints=keypoints)
     assert not found.rejected.any()
     assert (found.fits == -1).all()
@@ -142,7 +153,7 @@ def test_without_anybody_boxes_are_nobody_s_and_none_is_rejected(scene):
     suspects = scene.suspects
     nobody = replace(
         suspects,
-        detection_index=suspects.detection_index[:, :, :0],
+        detections=suspects.detections.assign_people(suspects.detections.detection_index[:, :, :0]),
         offsets=suspects.offsets[:, :, :0],
         exchanged=suspects.exchanged[:, :, :0],
     )

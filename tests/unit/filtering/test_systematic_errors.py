@@ -130,12 +130,13 @@ def with_a_late_camera(scene, frames, held):
     """
     motion = watch_motion(scene.cameras, scene.joints, np.gradient(scene.joints, axis=0))
     late = np.array([0.0, frames, 0.0, 0.0, 0.0, 0.0])
-    at = np.nonzero(scene.suspects.detection_index >= 0)
-    keypoints = scene.suspects.keypoints.copy()
+    at = np.nonzero(scene.suspects.detections.detection_index >= 0)
+    keypoints = scene.suspects.detections.keypoints.copy()
     shift = late[:, None, None, None] * motion.image_motion
-    keypoints[(*at[:2], scene.suspects.detection_index[at])] += shift[at]
+    keypoints[(*at[:2], scene.suspects.detections.detection_index[at])] += shift[at]
     offsets = held * np.nan_to_num(shift.mean(axis=-2))
-    suspects = replace(scene.suspects, keypoints=keypoints, offsets=offsets)
+    detections = replace(scene.suspects.detections, keypoints=keypoints)
+    suspects = replace(scene.suspects, detections=detections, offsets=offsets)
     return SystematicErrors(ViewBias.none(), late), motion, suspects
 
 
@@ -149,17 +150,17 @@ def test_a_late_clock_is_learned_beside_sides_and_its_shift_brings_keypoints_bac
     np.testing.assert_allclose(systematic.late - systematic.late.mean(), late, atol=0.07)
     right = suspects.subtract(systematic.shift(motion, scene.views))
     exact = replace(systematic, late=np.zeros(6)).shift(motion, scene.views)
-    on_time = scene.suspects.subtract(exact).keypoints
-    at = np.nonzero(scene.suspects.detection_index >= 0)
-    place = (*at[:2], scene.suspects.detection_index[at])
+    on_time = scene.suspects.subtract(exact).detections.keypoints
+    at = np.nonzero(scene.suspects.detections.detection_index >= 0)
+    place = (*at[:2], scene.suspects.detections.detection_index[at])
     here = at[1] == 1
     honest = ~scene.displaced[place][here]
 
     def beside(found):
         return np.linalg.norm((found - on_time)[place][here][honest], axis=-1)
 
-    assert np.nanmean(beside(right.keypoints)) < 0.4 * np.nanmean(
-        beside(suspects.subtract(exact).keypoints)
+    assert np.nanmean(beside(right.detections.keypoints)) < 0.4 * np.nanmean(
+        beside(suspects.subtract(exact).detections.keypoints)
     )
 
 
@@ -193,16 +194,16 @@ def test_no_more_is_of_clocks_in_offsets_than_cameras_are_late(scene, held, shar
 
 def test_shifts_go_with_the_joint_that_a_keypoint_is(scene):
     suspects = scene.suspects
-    frame, camera, person = np.argwhere(suspects.detection_index >= 0)[0]
+    frame, camera, person = np.argwhere(suspects.detections.detection_index >= 0)[0]
     exchanged = suspects.exchanged.copy()
     exchanged[frame, camera, person, 2] = True  # the legs
     suspects = replace(suspects, exchanged=exchanged)
-    shift = np.full((*suspects.detection_index.shape, 17, 2), np.nan)
+    shift = np.full((*suspects.detections.detection_index.shape, 17, 2), np.nan)
     shift[frame, camera, person] = np.arange(34.0).reshape(17, 2)
     found = suspects.assign_to_detections(shift)
-    own = found[frame, camera, suspects.detection_index[frame, camera, person]]
+    own = found[frame, camera, suspects.detections.detection_index[frame, camera, person]]
     left, right = COCO17.index("left_hip"), COCO17.index("right_hip")
     np.testing.assert_array_equal(own[left], [2.0 * right, 2.0 * right + 1.0])
     assert np.count_nonzero(found.any(axis=(-1, -2))) == 1
-    kept = suspects.subtract(shift).keypoints
-    np.testing.assert_allclose(kept, suspects.keypoints - found)
+    kept = suspects.subtract(shift).detections.keypoints
+    np.testing.assert_allclose(kept, suspects.detections.keypoints - found)

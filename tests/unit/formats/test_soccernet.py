@@ -1,4 +1,5 @@
-from worldpose.formats.soccernet import SOCCERNET_MARKINGS, soccernet_markings
+from soccernet import SOCCERNET_MARKINGS, soccernet_markings
+
 from worldpose.pitch import PitchTemplate
 
 

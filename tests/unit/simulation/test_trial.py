@@ -3,7 +3,7 @@ from statistics import mean
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -21,7 +21,9 @@ def reconstructed(scene, cameras, fps):
     tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
     index = tracks.detection_index
     plain = TriangulationSettings(learn_noise=False, offsets="none")
-    joints = triangulate_joints(cameras, TrackedDetections(keypoints, confidence, index), plain)
+    joints = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), plain
+    )
     prediction = JointTracks(scene.truth.frames, np.asarray(tracks.person), joints.joints)
     scores, _ = evaluate_joints(prediction, scene.truth, fps=fps)
     return scores

@@ -10,8 +10,12 @@ import pytest
 from store_samples import sample_recipe
 
 from worldpose.errors import StoreError
-from worldpose.store import code_version, explain_difference, libraries, recipe_key
+from worldpose.store import code_version, libraries, recipe_differences, recipe_key
 from worldpose.store.recipes import _read_module, _source_cache
+
+
+def describe(old, new):
+    return [str(each) for each in recipe_differences(old, new)]
 
 
 def test_key_is_the_first_half_of_the_sha256_of_the_recipe() -> None:
@@ -24,7 +28,7 @@ def test_key_is_the_first_half_of_the_sha256_of_the_recipe() -> None:
 
 
 def test_equal_recipes_have_no_difference() -> None:
-    assert explain_difference(sample_recipe(), sample_recipe()) == []
+    assert describe(sample_recipe(), sample_recipe()) == []
 
 
 @pytest.mark.parametrize(
@@ -49,20 +53,20 @@ def test_equal_recipes_have_no_difference() -> None:
 )
 def test_every_change_has_its_own_line_and_its_own_key(change: dict[str, Any], line: str) -> None:
     changed = sample_recipe(**change)
-    assert explain_difference(sample_recipe(), changed) == [line]
+    assert describe(sample_recipe(), changed) == [line]
     assert recipe_key(changed) != recipe_key(sample_recipe())
 
 
 def test_digests_that_begin_alike_are_still_a_difference() -> None:
     one = sample_recipe(sources={"pitch": "a" * 64})
     other = sample_recipe(sources={"pitch": "a" * 63 + "b"})
-    assert len(explain_difference(one, other)) == 1
+    assert len(describe(one, other)) == 1
 
 
 def test_a_difference_inside_a_list_is_named_by_its_place() -> None:
     old = sample_recipe().model_copy(update={"sources": {"camera": {"focal_px": [1000.0, 1001.0]}}})
     new = sample_recipe().model_copy(update={"sources": {"camera": {"focal_px": [1000.0, 1002.0]}}})
-    assert explain_difference(old, new) == ["source camera.focal_px[1]: 1001.0 -> 1002.0"]
+    assert describe(old, new) == ["source camera.focal_px[1]: 1001.0 -> 1002.0"]
 
 
 TREE = {

@@ -5,7 +5,7 @@ import pytest
 
 from data_contracts.tracking import Join
 from worldpose.tracking import TrackingSettings, describe_doubts, track_people
-from worldpose.tracking.doubts import Takeover
+from worldpose.tracking.joins import Takeover
 
 FRAMES = np.arange(300, 400)
 FPS = 50.0

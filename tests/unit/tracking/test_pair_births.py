@@ -5,9 +5,14 @@ import pytest
 
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
-from worldpose.tracking.camera_statistics import CameraGates, CameraVisibility, find_covered_bodies
 from worldpose.tracking.frame_tracker import FrameTracker
-from worldpose.tracking.pair_births import group_pairs, judge_pairs
+from worldpose.tracking.pair_births import (
+    CameraGates,
+    CameraVisibility,
+    find_covered_bodies,
+    group_pairs,
+    judge_pairs,
+)
 
 SETTINGS = TrackingSettings()
 FPS = 25.0

@@ -4,8 +4,8 @@ import pytest
 
 from worldpose.triangulation import batched_gauss_newton
 from worldpose.triangulation.batched_gauss_newton import LANES, ROWS, STATE
-from worldpose.triangulation.consensus import consensus
 from worldpose.triangulation.observations import Observations, Rig, gather, linearize
+from worldpose.triangulation.solving import consensus
 
 POINT = np.array([0.7, -1.1, 1.3])
 NOISE = (2.0, 0.0)

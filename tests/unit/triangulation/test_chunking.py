@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation import (
-    ClipDetections,
     TriangulationSettings,
     learn_clip,
     reconstruct_chunks,
@@ -27,9 +26,9 @@ class Watched:
         self.values, self.shape, self.most = values, values.shape, 0
 
     def __getitem__(self, frames):
-        first, last, _ = frames.indices(len(self.values))
-        self.most = max(self.most, last - first)
-        return self.values[frames]
+        read = self.values[frames]
+        self.most = max(self.most, len(read))
+        return read
 
 
 @pytest.fixture
@@ -46,8 +45,9 @@ def clip(ring):
 
 def test_parts_give_what_the_whole_clip_gives(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, SETTINGS)
-    model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, SETTINGS)
+    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    seen = KeypointDetections.from_keypoints(*arrays)
+    model = learn_clip(camera, seen, FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     assert [(part.frames.start, part.frames.stop) for part in parts] == [
         (0, 128),
@@ -71,8 +71,9 @@ def test_parts_give_what_the_whole_clip_gives(clip):
 
 def test_reports_of_parts_add_up_to_the_clip_s(clip):
     camera, arrays = clip
-    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, SETTINGS)
-    model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, SETTINGS)
+    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    seen = KeypointDetections.from_keypoints(*arrays)
+    model = learn_clip(camera, seen, FPS, SETTINGS)
     parts = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=128))
     agreement = reduce(add, [part.triangulation.agreement for part in parts])
     assert agreement.report(whole.triangulation.noise.factor) == whole.triangulation.report
@@ -85,10 +86,12 @@ def test_reports_of_parts_add_up_to_the_clip_s(clip):
 
 def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
     camera, arrays = clip
-    watched = [Watched(values) for values in arrays]
+    plain = KeypointDetections.from_keypoints(*arrays)
+    watched = [Watched(values) for values in plain.arrays().values()]
+    seen = KeypointDetections(*watched, detection_index=plain.detection_index)
     settings = SETTINGS.model_copy(update={"correct_clocks": True})
-    model, seen = learn_clip(camera, ClipDetections(*watched), FPS, settings)
-    assert max(values.most for values in watched[:2]) <= MARGIN * FPS + 2
+    model = learn_clip(camera, seen, FPS, settings)
+    assert max(values.most for values in watched) <= MARGIN * FPS + 2
     for _ in reconstruct_chunks(camera, seen, model, FPS, settings, length=64):
         pass
     # 128 frames are the least that hold a margin of 100 in whole tiles of 64.
@@ -98,8 +101,9 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
 def test_parts_with_corrected_clocks_are_those_of_the_whole_clip(clip):
     camera, arrays = clip
     settings = SETTINGS.model_copy(update={"correct_clocks": True, "max_clock_error_frames": 10.0})
-    whole = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, settings)
-    model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, settings)
+    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, settings)
+    seen = KeypointDetections.from_keypoints(*arrays)
+    model = learn_clip(camera, seen, FPS, settings)
     assert model.clocks.determined.all()
     parts = list(reconstruct_chunks(camera, seen, model, FPS, settings, length=128))
     joined = np.concatenate([part.triangulation.joints for part in parts])
@@ -112,7 +116,8 @@ def test_clip_without_frames_or_people_has_one_empty_part(ring):
     for frames, persons in ((0, 2), (5, 0)):
         keypoints, confidence, index = detections(camera, runner(5), 1.0)
         arrays = keypoints[:frames], confidence[:frames], index[:frames, :, :persons]
-        model, seen = learn_clip(camera, ClipDetections(*arrays), FPS, SETTINGS)
+        seen = KeypointDetections.from_keypoints(*arrays)
+        model = learn_clip(camera, seen, FPS, SETTINGS)
         (part,) = reconstruct_chunks(camera, seen, model, FPS, SETTINGS)
         assert part.smoothing.joints.shape == (frames, persons, 17, 3)
 

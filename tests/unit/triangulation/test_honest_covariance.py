@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.static_calibration.parameters import step_camera
 from worldpose.triangulation import (
-    ClipDetections,
     TriangulationSettings,
     estimate_clocks,
     triangulate_joints,
@@ -62,16 +61,18 @@ def coverage(seeds):
         cameras, (keypoints, confidence, index), truth = simulated(seed)
         rng = np.random.default_rng(seed)
         arrays = keypoints, confidence, index
-        exact = triangulate_joints(cameras, TrackedDetections(*arrays), settings)
+        exact = triangulate_joints(cameras, KeypointDetections.from_keypoints(*arrays), settings)
         squared["exact"].append(squared_deviations(exact, truth))
         count = len(cameras.focal)
         steps = CALIBRATION * rng.normal(size=(count, 12))
         given = Camera.stack([step_camera(cameras[c], steps[c]) for c in range(count)])
         covariance = np.broadcast_to(np.diag(CALIBRATION**2), (count, 12, 12)).copy()
-        calibrated = triangulate_joints(given, TrackedDetections(*arrays), settings, covariance)
+        calibrated = triangulate_joints(
+            given, KeypointDetections.from_keypoints(*arrays), settings, covariance
+        )
         squared["calibrated"].append(squared_deviations(calibrated, truth))
         few = keypoints, confidence, two_views_each(index, rng)
-        two = triangulate_joints(cameras, TrackedDetections(*few), settings)
+        two = triangulate_joints(cameras, KeypointDetections.from_keypoints(*few), settings)
         squared["two views"].append(squared_deviations(two, truth))
     joined = {case: np.concatenate(values) for case, values in squared.items()}
     return {case: ((values < INSIDE).mean(), len(values)) for case, values in joined.items()}
@@ -104,7 +105,9 @@ def test_95_percent_of_clocks_lie_within_two_standard_errors(name):
     for seed in range(20, 30):
         scene = simulate_scene(scenario, seed)
         cameras, arrays, _ = arrays_of(scene, scenario.crowd.people)
-        found = estimate_clocks(cameras, ClipDetections(*arrays), scenario.fps, settings)
+        found = estimate_clocks(
+            cameras, KeypointDetections.from_keypoints(*arrays), scenario.fps, settings
+        )
         true = np.array(list(scene.clocks.values()))[found.determined]
         error = found.late[found.determined] - true + true.mean()
         deviations.append(error / found.standard_error[found.determined])

@@ -3,14 +3,14 @@ import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.geometry import Camera, Rigid
 from worldpose.triangulation import (
     TriangulationSettings,
     reconstruct_joints,
     triangulate_joints,
-    unswap,
+    undo_swaps,
 )
 from worldpose.triangulation.left_right_swaps import find_swaps
 from worldpose.triangulation.observations import Observations, Rig
@@ -42,7 +42,9 @@ def test_parts_have_every_joint_with_a_side_once():
 
 def test_exchanged_sides_are_found_named_and_put_right(clip):
     camera, (keypoints, confidence, index) = clip
-    expected = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    expected = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     assert not expected.exchanged.any()
     wrong, truth = keypoints.copy(), np.zeros_like(expected.exchanged)
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
@@ -50,7 +52,9 @@ def test_exchanged_sides_are_found_named_and_put_right(clip):
     legs = [joint for joint, name in enumerate(COCO17) if name[-4:] in ("_hip", "knee", "nkle")]
     wrong[5:9, 3, 1] = exchanged(keypoints[5:9, 3, 1], legs)
     truth[5:9, 3, 1, LEGS] = True
-    found = triangulate_joints(camera, TrackedDetections(wrong, confidence, index), SETTINGS)
+    found = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(wrong, confidence, index), SETTINGS
+    )
     np.testing.assert_array_equal(found.exchanged, truth)
     # The same observations: the same joints to the last step of the iteration.
     np.testing.assert_allclose(found.joints, expected.joints, atol=1e-6)
@@ -62,7 +66,9 @@ def test_exchanges_that_are_not_to_be_undone_are_rejected_views(clip):
     camera, (keypoints, confidence, index) = clip
     keypoints[:, 1] = exchanged(keypoints[:, 1])
     left = SETTINGS.model_copy(update={"undo_swaps": False})
-    found = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), left)
+    found = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), left
+    )
     assert not found.exchanged.any()
     assert found.report.rejected_share[1] > 0.5
 
@@ -70,18 +76,20 @@ def test_exchanges_that_are_not_to_be_undone_are_rejected_views(clip):
 def test_noise_is_not_taken_for_an_exchange(ring):
     # 6 px are twice the stated noise here; odds of fifty to one leave a few in a thousand.
     arrays = detections(ring(5), runner(40), 6.0)
-    found = triangulate_joints(ring(5), TrackedDetections(*arrays), SETTINGS)
+    found = triangulate_joints(ring(5), KeypointDetections.from_keypoints(*arrays), SETTINGS)
     assert found.exchanged.any(axis=-1).mean() < 0.01
 
 
 def test_smoothing_sees_the_sides_put_right(clip):
     camera, (keypoints, confidence, index) = clip
     expected = reconstruct_joints(
-        camera, TrackedDetections(keypoints, confidence, index), FPS, SETTINGS
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), FPS, SETTINGS
     )
     wrong = keypoints.copy()
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
-    found = reconstruct_joints(camera, TrackedDetections(wrong, confidence, index), FPS, SETTINGS)
+    found = reconstruct_joints(
+        camera, KeypointDetections.from_keypoints(wrong, confidence, index), FPS, SETTINGS
+    )
     # The iteration ends at steps of 0.1 mm.
     np.testing.assert_allclose(found.smoothing.joints, expected.smoothing.joints, atol=2e-4)
 
@@ -90,10 +98,12 @@ def test_what_was_seen_is_put_right_as_triangulation_did(clip):
     camera, (keypoints, confidence, index) = clip
     wrong = keypoints.copy()
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
-    found = triangulate_joints(camera, TrackedDetections(wrong, confidence, index), SETTINGS)
-    np.testing.assert_array_equal(unswap(wrong, index, found.exchanged), keypoints)
+    detections = KeypointDetections.from_keypoints(wrong, confidence, index)
+    found = triangulate_joints(camera, detections, SETTINGS)
+    right = undo_swaps(detections, found.exchanged)
+    np.testing.assert_array_equal(right.keypoints, keypoints)
     nothing = np.zeros_like(found.exchanged)
-    np.testing.assert_array_equal(unswap(wrong, index, nothing), wrong)
+    np.testing.assert_array_equal(undo_swaps(detections, nothing).keypoints, wrong)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from running_samples import FPS, detections, runner
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints
 
 GONE = 2
@@ -36,10 +36,14 @@ def test_a_missing_camera_sees_nothing_and_takes_nothing_away(ring, field, known
     covariance = np.tile(1e-8 * np.eye(12), (5, 1, 1)) if known else None
     given = (keypoints, confidence)
     expected = reconstruct_joints(
-        camera, TrackedDetections(*given, unseen), FPS, settings, covariance
+        camera, KeypointDetections.from_keypoints(*given, unseen), FPS, settings, covariance
     )
     found = reconstruct_joints(
-        without(camera, field), TrackedDetections(*given, index), FPS, settings, covariance
+        without(camera, field),
+        KeypointDetections.from_keypoints(*given, index),
+        FPS,
+        settings,
+        covariance,
     )
     joints = found.triangulation.joints
     assert np.isfinite(joints).all()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from running_samples import detections, runner
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
@@ -17,7 +17,9 @@ def test_noise_is_learned_by_joint(ring):
     keypoints, confidence, index = detections(camera, joints, 1.0)
     more = np.random.default_rng(2).normal(size=keypoints[..., 3, :].shape)
     keypoints[..., 3, :] += np.sqrt(8.0) * more
-    result = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), PLAIN)
+    result = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), PLAIN
+    )
     factor = result.noise.joint
     # 1 px and 3 px; 1900 residuals a joint: 2 % each. Doubtful views of the worse are cut at 3.5
     # deviations.
@@ -31,13 +33,15 @@ def test_noise_is_learned_by_confidence(ring):
     doubtful = rng.random(confidence.shape) < 0.3
     confidence[doubtful] = 0.5
     keypoints += np.where(doubtful, 3.0, 0.0)[..., None] * rng.normal(size=keypoints.shape)
-    result = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), PLAIN)
+    result = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), PLAIN
+    )
     sure, doubt = result.noise.precision(np.ones(17)), result.noise.precision(np.full(17, 0.5))
     # sqrt(10) times the noise; knots average over classes of confidence.
     assert np.sqrt(np.median(sure / doubt)) == pytest.approx(np.sqrt(10), rel=0.15)
     worse = triangulate_joints(
         camera,
-        TrackedDetections(keypoints, confidence, index),
+        KeypointDetections.from_keypoints(keypoints, confidence, index),
         PLAIN.model_copy(update={"learn_noise": False}),
     )
     error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (result, worse)]
@@ -47,7 +51,9 @@ def test_noise_is_learned_by_confidence(ring):
 def test_few_observations_change_the_stated_noise_little(ring):
     camera = ring(4)
     keypoints, confidence, index = detections(camera, runner(1, 1)[:, :, :2], 1.0)
-    result = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), PLAIN)
+    result = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), PLAIN
+    )
     assert (np.abs(np.log(result.noise.joint)) < 1.0).all()
 
 
@@ -99,10 +105,13 @@ def test_offsets_keep_calibration_errors_from_the_pose(ring, known):
     for offsets in ("none", "midhip", "body"):
         # 2 mrad are 6 cm at 30 m.
         settings = SETTINGS.model_copy(update={"offsets": offsets})
-        result = triangulate_joints(given, TrackedDetections(*arrays), settings, covariance)
+        result = triangulate_joints(
+            given, KeypointDetections.from_keypoints(*arrays), settings, covariance
+        )
         errors[offsets] = shape_error(result.joints, joints)
     exact = shape_error(
-        triangulate_joints(truth, TrackedDetections(*arrays), SETTINGS).joints, joints
+        triangulate_joints(truth, KeypointDetections.from_keypoints(*arrays), SETTINGS).joints,
+        joints,
     )
     assert errors["body"] < 1.15 * exact
     assert errors["body"] < errors["midhip"]
@@ -112,8 +121,8 @@ def test_offsets_keep_calibration_errors_from_the_pose(ring, known):
 def test_offsets_do_nothing_to_exact_cameras(ring):
     truth, joints = ring(6), runner(40)
     arrays = detections(truth, joints, 1.0)
-    with_offsets = triangulate_joints(truth, TrackedDetections(*arrays), SETTINGS)
-    without = triangulate_joints(truth, TrackedDetections(*arrays), PLAIN)
+    with_offsets = triangulate_joints(truth, KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    without = triangulate_joints(truth, KeypointDetections.from_keypoints(*arrays), PLAIN)
     errors = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (with_offsets, without)]
     assert errors[0] < 1.02 * errors[1]
     # Where the detector errs by 2 cm, nothing says that cameras misplace people by a centimetre.
@@ -124,7 +133,9 @@ def test_given_camera_covariance_widens_that_of_the_joints(ring):
     truth, joints = ring(6), runner(10)
     arrays = detections(truth, joints, 1.0)
     given, covariance = misjudged(truth, 6, 2e-3)
-    result = triangulate_joints(given, TrackedDetections(*arrays), SETTINGS, covariance)
+    result = triangulate_joints(
+        given, KeypointDetections.from_keypoints(*arrays), SETTINGS, covariance
+    )
     error = result.joints - joints
     inverse = np.linalg.inv(result.covariance)
     squared = np.einsum("...i,...ij,...j->...", error, inverse, error)
@@ -135,6 +146,8 @@ def test_given_camera_covariance_widens_that_of_the_joints(ring):
 def test_nobody_seen_gives_empty_results(ring):
     keypoints, confidence, index = detections(ring(4), runner(5), 0.0)
     index[:] = -1
-    result = triangulate_joints(ring(4), TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     assert np.isnan(result.joints).all()
     assert result.report.misplacement_m == (None,) * 4

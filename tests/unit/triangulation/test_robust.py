@@ -3,7 +3,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
@@ -22,7 +22,7 @@ def some_joints(persons=2, count=17, frames=1):
 
 def test_no_frames_gives_empty_arrays(ring, seen):
     none = [array[:0] for array in seen(ring(3), some_joints())]
-    result = triangulate_joints(ring(3), TrackedDetections(*none), SETTINGS)
+    result = triangulate_joints(ring(3), KeypointDetections.from_keypoints(*none), SETTINGS)
     assert result.joints.shape == (0, 2, 17, 3)
     assert result.report.joints == 0
     assert result.report.reprojection_error_px is None
@@ -32,7 +32,7 @@ def test_no_detection_and_no_person_give_empty_arrays(ring):
     index = np.empty((2, 3, 0), np.int16)
     keypoints = np.empty((2, 3, 0, 17, 2))
     result = triangulate_joints(
-        ring(3), TrackedDetections(keypoints, keypoints[..., 0], index), SETTINGS
+        ring(3), KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index), SETTINGS
     )
     assert result.inliers.shape == (2, 3, 0, 17)
 
@@ -40,7 +40,9 @@ def test_no_detection_and_no_person_give_empty_arrays(ring):
 def test_one_view_determines_nothing(ring, seen):
     keypoints, confidence, index = seen(ring(3), some_joints())
     index[:, 1:] = -1
-    result = triangulate_joints(ring(3), TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     assert np.isnan(result.joints).all()
     assert np.isnan(result.covariance).all()
     assert np.isnan(result.reprojection_error).all()
@@ -52,18 +54,24 @@ def test_one_view_determines_nothing(ring, seen):
 def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
     # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
     narrow = ring(2, arc=0.12)
-    result = triangulate_joints(narrow, TrackedDetections(*seen(narrow, some_joints())), SETTINGS)
+    result = triangulate_joints(
+        narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), SETTINGS
+    )
     assert np.isnan(result.joints).all()
     wide = SETTINGS.model_copy(update={"min_angle_rad": 0.03})
     assert np.isfinite(
-        triangulate_joints(narrow, TrackedDetections(*seen(narrow, some_joints())), wide).joints
+        triangulate_joints(
+            narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), wide
+        ).joints
     ).all()
 
 
 def test_two_cameras_that_face_each_other_determine_nothing_between_them(ring, seen):
     opposite = ring(2)
     middle = np.linspace(opposite.center[0], opposite.center[1], 7)[1:-1].reshape(1, 1, 5, 3)
-    result = triangulate_joints(opposite, TrackedDetections(*seen(opposite, middle)), SETTINGS)
+    result = triangulate_joints(
+        opposite, KeypointDetections.from_keypoints(*seen(opposite, middle)), SETTINGS
+    )
     assert np.isnan(result.joints).all()
 
 
@@ -71,7 +79,9 @@ def test_point_between_two_views_that_disagree_is_missing(ring, seen):
     cameras = ring(4)[np.array([0, 1])]
     keypoints, confidence, index = seen(cameras, some_joints(1, 1))
     keypoints[0, 1, 0, 0, 1] += 100.0
-    result = triangulate_joints(cameras, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     assert np.isnan(result.joints).all()
     assert result.views.item() == 0
 
@@ -83,7 +93,9 @@ def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, se
     confidence[:, 1] = 0.0
     confidence[:, 2] = np.nan
     confidence[:, 2, 0] = -0.5
-    result = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     np.testing.assert_array_equal(result.views, 2)
     np.testing.assert_array_equal(result.inliers.any(axis=(0, 2, 3)), [0, 0, 0, 1, 1])
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
@@ -94,7 +106,9 @@ def test_noise_free_views_give_the_joint(ring, seen, count):
     # Two cameras of four, so that they do not face each other.
     cameras = ring(4)[np.array([0, 1])] if count == 2 else ring(count)
     joints = some_joints(frames=3)
-    result = triangulate_joints(cameras, TrackedDetections(*seen(cameras, joints)), SETTINGS)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(*seen(cameras, joints)), SETTINGS
+    )
     # Undistortion is exact to 1e-13 of the focal length; seen 2e-13 m.
     np.testing.assert_allclose(result.joints, joints, atol=1e-10)
     np.testing.assert_array_equal(result.views, count)
@@ -112,7 +126,7 @@ def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
     keypoints, confidence, index = seen(ring(count), some_joints())
     keypoints[:, 1] += offset / np.sqrt(2)
     result = triangulate_joints(
-        ring(count), TrackedDetections(keypoints, confidence, index), SETTINGS
+        ring(count), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
     )
     expected = np.arange(count) != 1
     np.testing.assert_array_equal(
@@ -129,7 +143,9 @@ def test_three_outliers_of_eight_are_rejected(ring, seen):
     keypoints[:, :3] += rng.choice([-1, 1], (1, 3, 2, 17, 2)) * rng.uniform(
         30, 200, (1, 3, 2, 17, 2)
     )
-    result = triangulate_joints(ring(8), TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        ring(8), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
     np.testing.assert_array_equal(result.views, 5)
 
@@ -141,7 +157,9 @@ def test_two_agreeing_views_of_four_win_over_two_that_do_not(ring, seen):
     keypoints[:, 2:] += (
         rng.uniform(80, 200, (1, 2, 2, 17, 2)) * np.array([1, -1])[:, None, None, None]
     )
-    result = triangulate_joints(cameras, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     good = np.linalg.norm(result.joints - some_joints(), axis=-1) < 1e-6
     # An outlier may meet another ray by chance: within the gate of 7 px on a line of some
     # 1000 px, a few of 34 joints; seen 0.
@@ -151,7 +169,9 @@ def test_two_agreeing_views_of_four_win_over_two_that_do_not(ring, seen):
 def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen):
     keypoints, confidence, index = seen(ring(6), some_joints(1, 17))
     keypoints += np.random.default_rng(3).normal(0, 1.0, keypoints.shape)
-    result = triangulate_joints(ring(6), TrackedDetections(keypoints, confidence, index), STATED)
+    result = triangulate_joints(
+        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
+    )
     image = ring(6).project(result.joints[0, 0])
     lengths = np.linalg.norm(image - keypoints[0, :, 0], axis=-1)
     inliers = result.inliers[0, :, 0]
@@ -165,7 +185,9 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
     rng = np.random.default_rng(4)
     keypoints += rng.normal(0, 1.0, keypoints.shape)
     confidence[...] = rng.uniform(0.3, 1.0, confidence.shape)
-    result = triangulate_joints(ring(4), TrackedDetections(keypoints, confidence, index), WHITE)
+    result = triangulate_joints(
+        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), WHITE
+    )
     assert result.inliers.all()
 
     def cost(points):
@@ -191,7 +213,9 @@ def monte_carlo(cameras: Camera, seen, scale):
         keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
     )
     loose = WHITE.model_copy(update={"pixel_noise_px": scale, "max_deviation": 6.0})
-    result = triangulate_joints(cameras, TrackedDetections(keypoints, confidence, index), loose)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), loose
+    )
     return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
 
 
@@ -210,9 +234,11 @@ def test_covariance_is_the_spread_of_a_monte_carlo(ring, seen):
 def test_twice_the_pixel_noise_is_four_times_the_covariance(ring, seen):
     joints = some_joints()
     views = seen(ring(5), joints)
-    once = triangulate_joints(ring(5), TrackedDetections(*views), WHITE)
+    once = triangulate_joints(ring(5), KeypointDetections.from_keypoints(*views), WHITE)
     twice = triangulate_joints(
-        ring(5), TrackedDetections(*views), WHITE.model_copy(update={"pixel_noise_px": 2.0})
+        ring(5),
+        KeypointDetections.from_keypoints(*views),
+        WHITE.model_copy(update={"pixel_noise_px": 2.0}),
     )
     np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-9)
 
@@ -223,7 +249,9 @@ def test_joint_noise_is_in_metres(ring, seen):
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
     metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
-    result = triangulate_joints(cameras, TrackedDetections(*seen(cameras, joint)), metric)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), metric
+    )
     # x and y by one ray each, z by both. The point is 13 degrees off axis, where the image is
     # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
     np.testing.assert_allclose(
@@ -233,9 +261,11 @@ def test_joint_noise_is_in_metres(ring, seen):
 
 def test_confidence_weighs_like_variance(ring, seen):
     keypoints, confidence, index = seen(ring(5), some_joints())
-    full = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), WHITE)
+    full = triangulate_joints(
+        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), WHITE
+    )
     quarter = triangulate_joints(
-        ring(5), TrackedDetections(keypoints, confidence / 4, index), WHITE
+        ring(5), KeypointDetections.from_keypoints(keypoints, confidence / 4, index), WHITE
     )
     np.testing.assert_allclose(quarter.covariance, 4 * full.covariance, rtol=1e-9)
 
@@ -249,11 +279,13 @@ def test_camera_order_does_not_matter(ring, seen, seed):
     keypoints[:, 0] += rng.uniform(-200, 200, 2)
     order = rng.permutation(6)
     straight = triangulate_joints(
-        ring(6), TrackedDetections(keypoints, confidence, index), SETTINGS
+        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
     )
     shuffled = triangulate_joints(
         ring(6)[order],
-        TrackedDetections(keypoints[:, order], confidence[:, order], index[:, order]),
+        KeypointDetections.from_keypoints(
+            keypoints[:, order], confidence[:, order], index[:, order]
+        ),
         SETTINGS,
     )
     np.testing.assert_array_equal(straight.inliers[:, order], shuffled.inliers)
@@ -265,7 +297,9 @@ def test_same_input_gives_the_same_bytes(ring, seen):
     keypoints, confidence, index = seen(ring(6), some_joints(frames=3))
     keypoints += np.random.default_rng(6).normal(0, 3.0, keypoints.shape)
     runs = [
-        triangulate_joints(ring(6), TrackedDetections(keypoints, confidence, index), SETTINGS)
+        triangulate_joints(
+            ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+        )
         for _ in range(2)
     ]
     for name in ("joints", "covariance", "views", "reprojection_error", "inliers"):
@@ -275,9 +309,13 @@ def test_same_input_gives_the_same_bytes(ring, seen):
 def test_frames_do_not_depend_on_each_other(ring, seen):
     joints = some_joints(1, 2, frames=300)
     keypoints, confidence, index = seen(ring(4), joints)
-    whole = triangulate_joints(ring(4), TrackedDetections(keypoints, confidence, index), STATED)
+    whole = triangulate_joints(
+        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
+    )
     tail = triangulate_joints(
-        ring(4), TrackedDetections(keypoints[250:], confidence[250:], index[250:]), STATED
+        ring(4),
+        KeypointDetections.from_keypoints(keypoints[250:], confidence[250:], index[250:]),
+        STATED,
     )
     # Joints that share a tile share its number of steps; a step more changes under 1e-9 m.
     np.testing.assert_allclose(whole.joints[250:], tail.joints, atol=1e-9)
@@ -286,31 +324,43 @@ def test_frames_do_not_depend_on_each_other(ring, seen):
 def test_arrays_of_different_clips_are_refused(ring, seen):
     keypoints, confidence, index = seen(ring(4), some_joints())
     with pytest.raises(InputError, match="expected keypoints"):
-        triangulate_joints(ring(3), TrackedDetections(keypoints, confidence, index), SETTINGS)
+        triangulate_joints(
+            ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+        )
     with pytest.raises(InputError, match="same clip"):
-        triangulate_joints(ring(4), TrackedDetections(keypoints, confidence, index[:0]), SETTINGS)
+        triangulate_joints(
+            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index[:0]), SETTINGS
+        )
 
 
 def test_index_of_a_detection_that_does_not_exist_is_refused(ring, seen):
     keypoints, confidence, index = seen(ring(4), some_joints())
     index[0, 2, 1] = 2
     with pytest.raises(InputError, match="one of 2 detections"):
-        triangulate_joints(ring(4), TrackedDetections(keypoints, confidence, index), SETTINGS)
+        triangulate_joints(
+            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+        )
 
 
 def test_spread_is_the_widest_angle_between_rays(ring, seen):
     # Two cameras a quarter turn apart and 8 m up: rays to a point 8 m up cross at a right angle.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    result = triangulate_joints(cameras, TrackedDetections(*seen(cameras, joint)), STATED)
+    result = triangulate_joints(
+        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), STATED
+    )
     np.testing.assert_allclose(result.spread, np.pi / 2, rtol=1e-6)
 
 
 def test_shared_bias_is_in_the_covariance(ring, seen):
     keypoints, confidence, index = seen(ring(5), some_joints())
-    without = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), STATED)
+    without = triangulate_joints(
+        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
+    )
     biased = STATED.model_copy(update={"common_bias_m": 0.03})
-    result = triangulate_joints(ring(5), TrackedDetections(keypoints, confidence, index), biased)
+    result = triangulate_joints(
+        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), biased
+    )
     added = result.covariance - without.covariance
     np.testing.assert_allclose(added, np.broadcast_to(9e-4 * np.eye(3), added.shape), atol=1e-15)
 
@@ -319,7 +369,7 @@ def test_camera_covariance_of_another_rig_is_refused(ring, seen):
     with pytest.raises(InputError, match="camera_covariance"):
         triangulate_joints(
             ring(4),
-            TrackedDetections(*seen(ring(4), some_joints())),
+            KeypointDetections.from_keypoints(*seen(ring(4), some_joints())),
             SETTINGS,
             np.zeros((3, 12, 12)),
         )

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from running_samples import FPS, detections, runner
 
-from data_contracts.keypoints import TrackedDetections
+from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation import (
-    ClipDetections,
     TriangulationSettings,
     estimate_clocks,
     reconstruct_joints,
@@ -45,8 +44,8 @@ def test_segments_break_at_long_gaps_only():
 def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
     camera, joints = ring(4), runner(100)
     arrays = detections(camera, joints, 2.0)
-    raw = triangulate_joints(camera, TrackedDetections(*arrays), SETTINGS)
-    smooth = smooth_joints(camera, TrackedDetections(*arrays), raw, FPS, SETTINGS)
+    raw = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    smooth = smooth_joints(camera, KeypointDetections.from_keypoints(*arrays), raw, FPS, SETTINGS)
     error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (raw, smooth)]
     jerk = [np.abs(np.diff(r.joints - joints, 2, axis=0)).mean() for r in (raw, smooth)]
     # White noise at 50 frames/s and swings of 2 Hz: several frames count as one.
@@ -69,9 +68,11 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
     keypoints, confidence, index = detections(camera, joints, 1.0)
     index[20:30, 1:] = -1  # one view
     index[50:90] = -1  # 0.8 s without any
-    raw = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    raw = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     smooth = smooth_joints(
-        camera, TrackedDetections(keypoints, confidence, index), raw, FPS, SETTINGS
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
     )
     assert np.isnan(raw.joints[20:30]).all()
     assert smooth.filled[20:30].all()
@@ -87,15 +88,19 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
 def test_single_frame_and_no_joint_are_passed_through(ring):
     camera = ring(4)
     keypoints, confidence, index = detections(camera, runner(1, 1), 1.0)
-    raw = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    raw = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     smooth = smooth_joints(
-        camera, TrackedDetections(keypoints, confidence, index), raw, FPS, SETTINGS
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
     )
     np.testing.assert_allclose(smooth.joints, raw.joints, atol=1e-2)
     index[:] = -1
-    raw = triangulate_joints(camera, TrackedDetections(keypoints, confidence, index), SETTINGS)
+    raw = triangulate_joints(
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
+    )
     smooth = smooth_joints(
-        camera, TrackedDetections(keypoints, confidence, index), raw, FPS, SETTINGS
+        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
     )
     assert np.isnan(smooth.joints).all()
     assert smooth.report.filled_share is None
@@ -122,12 +127,12 @@ def test_late_clocks_are_found(ring):
     late = np.array([0.0, 3.0, -3.0, 0.5, -0.5, 1.0])
     camera = ring(6)
     arrays = late_detections(camera, 100, late)
-    clocks = estimate_clocks(camera, ClipDetections(*arrays), FPS, SETTINGS)
+    clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
     assert clocks.determined.all()
     np.testing.assert_allclose(clocks.late, late - late.mean(), atol=0.1)
     corrected = SETTINGS.model_copy(update={"correct_clocks": True})
-    result = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, corrected)
-    plain = reconstruct_joints(camera, TrackedDetections(*arrays), FPS, SETTINGS)
+    result = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, corrected)
+    plain = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
     assert (
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
@@ -141,7 +146,7 @@ def test_stated_errors_of_clocks_are_those_that_are_made(ring):
     errors, stated = [], []
     for seed in range(8):
         arrays = late_detections(camera, 50, late, noise=4.0, seed=10 * seed)
-        clocks = estimate_clocks(camera, ClipDetections(*arrays), FPS, anyhow)
+        clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, anyhow)
         assert clocks.determined.all()
         errors.append(clocks.late - late + late.mean())
         stated.append(clocks.standard_error)
@@ -155,7 +160,9 @@ def test_camera_that_sees_nobody_hides_no_other_clock(ring):
     late = np.array([0.0, 2.0, -1.0, 0.5, 0.0, 0.0])
     keypoints, confidence, index = late_detections(ring(6), 100, late)
     index[:, 4:] = -1
-    clocks = estimate_clocks(ring(6), ClipDetections(keypoints, confidence, index), FPS, SETTINGS)
+    clocks = estimate_clocks(
+        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), FPS, SETTINGS
+    )
     assert clocks.determined.tolist() == [True] * 4 + [False] * 2
     np.testing.assert_allclose(clocks.late[:4], late[:4] - late[:4].mean(), atol=0.1)
     assert clocks.report.clock_late_frames[4:] == (None, None)
@@ -164,7 +171,9 @@ def test_camera_that_sees_nobody_hides_no_other_clock(ring):
 def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
     camera = ring(4)
     still = np.broadcast_to(runner(1), (60, 2, 17, 3))
-    clocks = estimate_clocks(camera, ClipDetections(*detections(camera, still, 1.0)), FPS, SETTINGS)
+    clocks = estimate_clocks(
+        camera, KeypointDetections.from_keypoints(*detections(camera, still, 1.0)), FPS, SETTINGS
+    )
     assert not clocks.determined.any()
     assert np.isnan(clocks.late).all()
     assert clocks.report.clock_late_frames == (None,) * 4
@@ -174,7 +183,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
     index[4, 1, 0] = -1
     late = np.array([0.0, 2.0, -0.5])
-    shifted = shift_in_time(TrackedDetections(keypoints, confidence, index), late)
+    shifted = shift_in_time(KeypointDetections.from_keypoints(keypoints, confidence, index), late)
     pixels, moved = shifted.keypoints, shifted.detection_index
     np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
     np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])
@@ -206,6 +215,6 @@ def test_a_clock_errs_by_what_each_person_misses_the_others_by(
     sums = _Sums(information, score, np.zeros(2), np.zeros(2), np.zeros(2))
     monkeypatch.setattr("worldpose.triangulation.clocks._sum_equations", lambda *_: sums)
     nothing = detections(ring(2), runner(5), 1.0)
-    found = estimate_clocks(ring(2), ClipDetections(*nothing), FPS, SETTINGS)
+    found = estimate_clocks(ring(2), KeypointDetections.from_keypoints(*nothing), FPS, SETTINGS)
     # Over the sum of weights, and half of it from the mean of two clocks. 0.01 is known before.
     np.testing.assert_allclose(found.standard_error, 0.5 * error / 300.0, rtol=1e-3)

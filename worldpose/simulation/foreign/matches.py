@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -454,7 +454,7 @@ def simulate_foreign_match(
 
 def _number_frames(observations: KeypointDetections, offset: int) -> KeypointDetections:
     """Return the observations with the camera's own frame numbers."""
-    return KeypointDetections(frame=observations.frame + offset, **observations.arrays())
+    return replace(observations, frame=observations.frame + offset)
 
 
 def _write_reference(folder: Path, scene: ForeignScene) -> None:

@@ -1,11 +1,9 @@
-"""Every value says where it comes from."""
+"""The result of every unit says where it comes from."""
 
 from datetime import UTC, datetime
 
-import numpy as np
-
 from data_contracts.review import Correction, DeletedDetection, MovedPoint
-from worldpose.review import ORIGINS, joint_origins, unit_origins
+from flows.review.verdicts import unit_origins
 
 MADE_FROM = {
     "static_calibration/a": (),
@@ -54,25 +52,3 @@ def test_a_refusal_reaches_all_that_is_made_from_it():
     assert refused == {"tracking/one", "body_fitting/one"}
     everything = unit_origins(MADE_FROM, [moved("a")], ["static_calibration/a"])
     assert {u for u, o in everything.items() if o == "automatic"} == {"static_calibration/b"}
-
-
-def test_joints_are_automatic_filled_or_missing():
-    joints = np.zeros((2, 1, 3, 3))
-    joints[0, 0, 2, 1] = np.nan
-    filled = np.array([[[False, True, False]], [[False, False, True]]])
-    codes = joint_origins(joints, filled, "automatic")
-    automatic, fill = ORIGINS.index("automatic"), ORIGINS.index("filled")
-    assert codes[:, 0].tolist() == [[automatic, fill, -1], [automatic, automatic, fill]]
-    assert codes.dtype == np.int8
-
-
-def test_bodies_are_filled_as_a_whole():
-    codes = joint_origins(np.zeros((2, 1, 3, 3)), np.array([[True], [False]]), "corrected")
-    assert codes[:, 0].tolist() == [[2, 2, 2], [1, 1, 1]]
-
-
-def test_a_refused_result_has_refused_joints_only():
-    joints = np.full((1, 1, 2, 3), np.nan)
-    joints[0, 0, 0] = 1.0
-    codes = joint_origins(joints, np.ones((1, 1, 2), dtype=bool), "rejected")
-    assert codes[0, 0].tolist() == [ORIGINS.index("rejected"), -1]
