@@ -39,6 +39,9 @@ def serve(
     check: Annotated[
         bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
     ] = False,
+    test_alerts: Annotated[
+        bool, typer.Option("--test-alerts", help="Send a test alert to every channel, and exit.")
+    ] = False,
     max_concurrent: Annotated[
         int, typer.Option(min=1, help="Matches that run at the same time.")
     ] = 1,
@@ -82,7 +85,8 @@ def serve(
 ) -> None:
     """Serve a project until interrupted: dashboard, inbox, runs, pages, metrics, alerts.
 
-    Alerts go to the webhook in WORLDPOSE_ALERT_URL and by mail as WORLDPOSE_ALERT_MAIL says.
+    Alerts go to the webhook and the mail addresses in PROJECT/operations/secrets/alerts.toml, or as
+    WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL say.
     PREFECT_API_URL names a Prefect server that runs already.
 
     Example: worldpose serve --inbox /data/arriving
@@ -97,13 +101,16 @@ def serve(
     if check:
         _check(folder, as_json=as_json)
         return
+    if test_alerts:
+        _test_alerts(folder, as_json=as_json)
+        return
     from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.senders import senders_of
     from flows.service.service_secrets import METRICS_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
-    senders_of(os.environ)  # refuse wrong addresses at once, not in an unread log
+    senders_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
     tls = certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
@@ -160,6 +167,26 @@ def serve(
         line("Ctrl-C ends it; the next start resumes")
 
     serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
+
+
+def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
+    from flows.service.senders import send_test, senders_of
+
+    senders = senders_of(os.environ, folder.alert_settings)
+    if not senders:
+        raise UsageError(
+            "worldpose serve --test-alerts",
+            expected=f"a webhook or mail in {folder.alert_settings}",
+            found="none",
+            todo="Write the file as docs/how-to/operations.md says.",
+        )
+    problems = send_test(senders)
+    if as_json:
+        print_json({"channels": problems})
+    for name, problem in {} if as_json else problems.items():
+        line(f"{name}: {f'failed: {problem}' if problem else 'accepted a test alert'}")
+    if any(problems.values()):
+        raise typer.Exit(1)
 
 
 def _check(folder: StateFolder, *, as_json: bool) -> None:

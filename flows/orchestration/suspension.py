@@ -17,7 +17,6 @@ from prefect.client.schemas.filters import (
     FlowRunFilterStateType,
 )
 from prefect.client.schemas.objects import StateType
-from prefect.context import FlowRunContext
 from prefect.flow_runs import resume_flow_run, suspend_flow_run
 from prefect.input import RunInput
 from pydantic import Field
@@ -43,13 +42,6 @@ class Verdict(RunInput):
     """Name of the reviewer."""
     why: str = ""
     """The reviewer's comment."""
-
-
-def is_deployed() -> bool:
-    """Return whether this flow run belongs to a deployment: only such a run can be suspended."""
-    context = FlowRunContext.get()
-    run = None if context is None else context.flow_run
-    return run is not None and run.deployment_id is not None
 
 
 def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) -> None:

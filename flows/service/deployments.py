@@ -91,15 +91,8 @@ DEPLOYED: Final = (
     ),
     Deployed(
         "reprocess",
-        "Recompute the results of every match that an edit made stale.",
-        "background",
-        lambda plan: {
-            "project": plan.project,
-            "dask": plan.dask,
-            "workers": plan.workers,
-            "time_limits": plan.time_limits,
-        },
-        fixed=("project", "dask"),
+        "Start a run of every match with results that an edit made stale.",
+        None,
     ),
     Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),

@@ -64,7 +64,9 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    teller = AlertDispatcher(plan.state_folder, senders_of(os.environ))
+    teller = AlertDispatcher(
+        plan.state_folder, senders_of(os.environ, plan.state_folder.alert_settings)
+    )
     await asyncio.gather(  # each at its own interval: none blocks another
         _watch_bucket(plan),
         _watch_inbox(plan),
