@@ -6,6 +6,7 @@ with its key as version. Specification: https://openlineage.io/spec/2-0-2/OpenLi
 
 from __future__ import annotations
 
+import functools
 import http.client
 import json
 import logging
@@ -109,6 +110,7 @@ def _facet(name: str) -> dict[str, str]:
     return {"_producer": _producer(), "_schemaURL": f"{FACETS}/{at}/{kind}.json#/$defs/{kind}"}
 
 
+@functools.cache
 def _producer() -> str:
     return f"https://pypi.org/project/worldpose/{version('worldpose')}"
 

@@ -110,7 +110,8 @@ class Served:
         return fetch(f"http://127.0.0.1:{self.ports['metrics']}/metrics", headers=headers)
 
     def runs(self, name):
-        return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [name]}}})
+        """Prefect's runs of a match, or of what else their names begin with."""
+        return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"like_": f"{name}, "}}})
 
     def check(self):
         return worldpose("serve", "--check", "--project", self.project, "--json")

@@ -18,6 +18,7 @@ from flows.cli.page_server import (
     NamesOption,
     PortOption,
     TokenOption,
+    UsersOption,
     certificate_and_key,
 )
 from flows.orchestration.time_limits import parse_time_limits
@@ -80,6 +81,7 @@ def serve(
         typer.Option(help="Folder of logs and Prefect's database; PROJECT/operations by default."),
     ] = None,
     token: TokenOption = None,
+    users: UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -142,8 +144,9 @@ def serve(
         poll_minutes=poll_interval,
         gate_hours=gate_hours,
         disk_gb=disk_gb,
+        users=None if users is None else users.resolve(),
     )
-    access = access_for(host, token=token, names=names or (), secure=tls is not None)
+    access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     secrets = secrets_of(plan, access.token)
     variable = CLIENT_LOGIN if given else SERVER_LOGIN
     is_kept = not given and variable not in os.environ
@@ -160,7 +163,7 @@ def serve(
         else:
             line(f"dashboard      {plan.dashboard}  log in with: {login_at}")
         # A token chosen by the operator is not printed: the output can go to a log.
-        login = "/login" if token else f"/login#token={access.token}"
+        login = "/login" if token or users else f"/login#token={access.token}"
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")
         line(f"metrics        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")

@@ -109,7 +109,8 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
         runs = [
             run
             for run in client.read_flow_runs(flow_run_filter=paused)
-            if run.parameters.get("match_id") == match_id
+            if run.deployment_id is not None  # else no worker would take it up
+            and run.parameters.get("match_id") == match_id
             and open_blobs(str(run.parameters.get("project"))).url == project
         ]
     for run in runs:

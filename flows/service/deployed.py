@@ -12,6 +12,7 @@ from typing import Any, Final, cast
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact, create_table_artifact
 from prefect.context import FlowRunContext
+from prefect.runtime import flow_run
 from prefect.task_runners import TaskRunner
 from prefect_dask import DaskTaskRunner
 from pydantic import JsonValue, TypeAdapter, ValidationError
@@ -33,8 +34,8 @@ from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest
 from flows.service.artifacts import shown_at_prefect
 from flows.service.inbox import take_in
-from flows.service.match_runs import MatchRuns, alone_with, match_runs_of
-from flows.service.plan import ServePlan
+from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name
+from flows.service.plan import TITLES, ServePlan
 from flows.settings import selected_stages
 from flows.stage import Match
 from tasks.tracing import start_tracing
@@ -48,7 +49,14 @@ start_tracing()  # before the flow of this process starts, so that its span is e
 RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
 
 
-@flow(name="match", flow_run_name="{match_id}", task_runner=RUNNER, validate_parameters=False)
+def _name_run() -> str:
+    """Return the name that the run was created with, or one of the same form."""
+    what = str(flow_run.parameters.get("match_id") or TITLES[str(flow_run.flow_name)])
+    name = str(flow_run.name or "")
+    return name if name.startswith(f"{what}, ") else run_name(what)
+
+
+@flow(name="match", flow_run_name=_name_run, task_runner=RUNNER, validate_parameters=False)
 def match(
     project: str,
     match_id: str,
@@ -131,7 +139,7 @@ def _on_own_workers(request: RunRequest) -> RunRequest:
     return replace(request, dask=client.scheduler.address, security=client.security)
 
 
-@flow(name="ingest", flow_run_name="inbox", validate_parameters=False)
+@flow(name="ingest", flow_run_name=_name_run, validate_parameters=False)
 def ingest(plan: dict[str, Any]) -> list[str]:
     """Register every complete arrival, and start a run for each; return their ids.
 
@@ -181,7 +189,7 @@ class UnprocessedError(WorldposeError):
     """Some matches could not be checked; the others are current, or their runs are started."""
 
 
-@flow(name="reprocess", flow_run_name="stale matches", validate_parameters=False)
+@flow(name="reprocess", flow_run_name=_name_run, validate_parameters=False)
 def reprocess(
     project: str,
     matches: tuple[str, ...] | list[str] = (),
@@ -308,7 +316,7 @@ def release_folder(store: Store, match_id: str, name: str, out: str | None) -> P
     return Path(store.url) / "releases" / match_id / name
 
 
-@flow(name="finetune", validate_parameters=False)
+@flow(name="finetune", flow_run_name=_name_run, validate_parameters=False)
 def finetune(
     project: str,
     annotations: str,

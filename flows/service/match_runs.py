@@ -28,6 +28,7 @@ from data_contracts.operations import Priority, Serving
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, CLOUD_LOGIN, authorization
 from flows.run_record import runs_at_work
 from flows.service.layout import StateFolder, is_alive, served_state
+from flows.service.plan import deployment_name, deployment_names
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
@@ -114,12 +115,12 @@ class MatchRuns:
         Raises:
             UnreachablePrefectError: no run was created.
         """
-        deployment = self._ask(f"/deployments/name/match/{quote(self.name, safe='')}")
+        deployment = self._ask(f"/deployments/name/{quote(deployment_name(self.name, 'match'))}")
         given = {name: value for name, value in parameters.items() if value is not None}
         created = self._ask(
             f"/deployments/{deployment['id']}/create_flow_run",
             {
-                "name": match_id,
+                "name": run_name(match_id),
                 "parameters": {"match_id": match_id, **given},
                 "tags": [priority],
                 "work_queue_name": priority,
@@ -181,7 +182,7 @@ class MatchRuns:
         runs = self._ask(
             "/flow_runs/filter",
             {
-                "deployments": {"name": {"any_": [self.name]}},
+                "deployments": {"name": {"any_": deployment_names(self.name)}},
                 "flows": {"name": {"any_": ["match"]}},
                 "sort": sort,
                 "limit": PAGE,
@@ -231,6 +232,11 @@ class MatchRuns:
             f"Prefect at {self.api} {problem}, and nothing was started. `worldpose serve --check` "
             "says what is wrong; try again."
         )
+
+
+def run_name(what: str) -> str:
+    """Return the name of a run that is created now: what it processes, and the time."""
+    return f"{what}, {datetime.now().astimezone():%d %b %H:%M:%S}"
 
 
 def artifact_key(match_id: str) -> str:

@@ -46,7 +46,7 @@ body > header {
 nav, .right { display: flex; align-items: center; gap: .6rem; min-width: 0; }
 nav a { text-decoration: none; color: inherit; font-weight: 650; }
 nav a:hover { text-decoration: underline; }
-main { width: min(78rem, 100%); margin: 0 auto; padding: 1.2rem 1.2rem 3rem; }
+main { padding: 1.2rem 1.2rem 3rem; }
 h1 { font-size: 1.25rem; margin: 0 0 .8rem; font-weight: 650; }
 h2 { font-size: 1rem; margin: 1.6rem 0 .5rem; font-weight: 650; }
 a { color: var(--accent); }
@@ -58,11 +58,12 @@ th, td {
   vertical-align: top; overflow-wrap: anywhere;
 }
 th { color: var(--soft); font-weight: 600; font-size: .86rem; vertical-align: bottom; }
-th.stage { writing-mode: vertical-rl; transform: rotate(180deg); padding: .3rem 0 0; }
-th.stage { white-space: nowrap; overflow-wrap: normal; }
+th.stage { writing-mode: vertical-rl; transform: rotate(180deg); padding: .3rem 0 .2rem; }
+th.stage { white-space: nowrap; overflow-wrap: normal; border: 0; font-size: .8rem; }
+th.stage { line-height: 3.2rem; }
 td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-td.cell { width: 2.9rem; padding: .3rem .15rem; font-size: .8rem; line-height: 1.25; }
-td.match { min-width: 12rem; }
+td.cell { width: 3.2rem; padding: .3rem .1rem; font-size: .78rem; line-height: 1.25; }
+td.match, td.run { min-width: 13rem; line-height: 1.3; }
 small, .soft { color: var(--soft); font-size: .82rem; }
 .cell > span, .unit { display: block; padding-left: .3rem; border-left: 4px solid var(--line); }
 .cell > span { overflow-wrap: normal; }
@@ -180,7 +181,7 @@ def _row(row: StatusRow, stages: Sequence[str]) -> str:
         cells = f'<td class="failed" colspan="{max(1, len(stages))}">{escape(match.problem)}</td>'
     else:
         cells = "".join(_cell(match.stages.get(stage, ())) for stage in stages)
-    return f'<tr><td class="match">{title}</td><td>{state}</td>{cells}</tr>'
+    return f'<tr><td class="match">{title}</td><td class="run">{state}</td>{cells}</tr>'
 
 
 def _at_work(run: Mapping[str, Any]) -> str:

@@ -25,7 +25,7 @@ def store(tiny_run):
 
 @pytest.fixture
 def record(store):
-    failed = UnitFailure(unit="refitting/clip", error="ValueError", message="no body", key="a" * 64)
+    failed = UnitFailure(unit="refitting/clip", error="ValueError", message="no body", key="a" * 32)
     return store.run(TINY).model_copy(update={"failed": (failed,)})
 
 

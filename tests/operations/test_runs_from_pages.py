@@ -1,14 +1,19 @@
 """Runs that pages start go through the deployment: one after another, linked, none twice."""
 
+import random
+import shutil
+import signal
+import time
 from datetime import datetime
 from itertools import pairwise
 
 import pytest
+from faults.checker import doubled
 from service import Browser, wait_until
 
 from flows.registering import register
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.store import Store
+from worldpose.store import Store, verify
 
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
 LINKED_SECONDS = 1.0
@@ -19,10 +24,10 @@ LINKED_SECONDS = 1.0
 def matches(served, tmp_path):
     """A function that registers so many small matches in the project before it is served."""
 
-    def make(count):
+    def make(count, first=0):
         store = Store.create(str(served.project))
         names = []
-        for seed in range(count):
+        for seed in range(first, first + count):
             folder = tmp_path / "matches" / str(seed)
             simulate_match(SCENARIOS["tiny"], seed, folder, MatchOptions(**SMALL))
             match, _ = register(store, folder)
@@ -58,7 +63,7 @@ def require_one_after_another(served, store, names, runs):
     assert sorted(run["parameters"]["match_id"] for run in runs) == sorted(names)
     assert {run["state_name"] for run in runs} == {"Completed"}, served.explain()
     assert {run["work_pool_name"] for run in runs} == {"worldpose"}
-    deployment = served.ask("/deployments/name/match/worldpose")["id"]
+    deployment = served.ask("/deployments/name/match/worldpose-match")["id"]
     assert {run["deployment_id"] for run in runs} == {deployment}
     times = sorted((moment(run["start_time"]), moment(run["end_time"])) for run in runs)
     assert all(end <= start for (_, end), (start, _) in pairwise(times))
@@ -90,4 +95,46 @@ def test_matches_started_on_pages_run_one_after_another(count, served, matches):
         served.explain,
     )
     assert store.runs(names[0]) == ("0001",)
+    assert served.end() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(
+    seed, served, matches, small_match
+):
+    """Its runs began on pages and in the inbox; it is killed three times while they are at work."""
+    rng = random.Random(seed)
+    store, names = matches(2, first=100)
+    served.options = {"--max-concurrent": 2, "--workers": 1, "--poll-interval": 5}
+    served.begin()
+    arriving = served.project / "inbox" / ".arriving"
+    shutil.copytree(small_match, arriving)
+    arriving.rename(arriving.with_name("arrived"))
+    browser = Browser(served)
+    for name in names:
+        browser.ask(f"/api/matches/{name}/runs", {"gates": "never"})
+    for _ in range(3):
+        time.sleep(rng.uniform(1.0, 60.0))
+        assert served.end(signal.SIGKILL) == 0
+        served.begin()
+
+    def has_ended():
+        browser = Browser(served)
+        for name in store.matches():
+            browser.approve_all(name)  # the match in the inbox may have questions
+        runs = at_prefect(served)
+        states = {run["state_name"] for run in runs}
+        assert not states & {"Failed", "Cancelled"}, served.explain()
+        return len(runs) >= 3 and states == {"Completed"}
+
+    wait_until(has_ended, served.explain)
+    everything = store.matches()
+    assert len(everything) == 3 and set(names) < set(everything)
+    runs = at_prefect(served)
+    assert sorted(run["parameters"]["match_id"] for run in runs) == sorted(everything)
+    assert [store.run(name).state for name in everything] == ["complete"] * 3
+    assert list(doubled(store)) == []
+    assert list(verify(store)) == []
     assert served.end() == 0
