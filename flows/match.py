@@ -22,14 +22,12 @@ from pydantic import JsonValue
 
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Work
-from flows.gates import Gatekeeper, waiting_for_verdicts
 from flows.orchestration.cluster_errors import require_workers
-from flows.orchestration.suspension import is_deployed, take_verdict
 from flows.orchestration.time_limits import TimeLimits, seconds_of
 from flows.progress import reporter
 from flows.registering import open_match
-from flows.run_plan import PlannedUnit, plan_ahead
-from flows.run_record import RunLog, latest_run
+from flows.run_plan import PlannedUnit
+from flows.run_record import RunLog
 from flows.settings import selected_stages
 from flows.stage import Stage
 from worldpose.errors import WorldposeError
@@ -65,16 +63,13 @@ def process_match(
 ) -> str:
     """Run the method on one match, record the run and return its number.
 
-    A deployment's run that needs review is suspended until people have decided, and then resumes;
-    any other run ends, and the next one continues.
-
     Args:
         project: folder or URL of the store.
         match_id: a registered match.
         settings: stage to its settings that differ from their defaults.
         from_stage: first stage to run; the latest run supplies earlier results.
         until_stage: last stage to run.
-        gates: when results need review; None is `auto` for a deployment, else `never`.
+        gates: when results need review; None is `never`.
         iteration: iteration number; the previous iterations have their results.
         time_limits: stage to the time limit of a unit [min], if not the default.
 
@@ -85,35 +80,24 @@ def process_match(
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
     stages = selected_stages(from_stage, until_stage)
-    policy: GatePolicy = gates or ("auto" if is_deployed() else "never")
-    while True:
-        match = open_match(store, match_id)
-        if is_deployed():
-            latest = latest_run(store, match_id)
-            gatekeeper = Gatekeeper(store, match, policy)
-            plan = plan_ahead(gatekeeper, stages, settings, latest, iteration)
-            open_questions = waiting_for_verdicts(plan.waiting)
-            if open_questions and plan.is_recorded_by(latest):
-                take_verdict(store, match_id, open_questions)
-                continue
-        with _status_at_prefect(store, match_id) if is_deployed() else nullcontext():
-            log = RunLog.begin(store, match, stages, settings, policy, iteration)
-            record = _run_stages(log, time_limits or {})
-        if record.failed or not (is_deployed() and waiting_for_verdicts(record.waiting)):
-            break
+    match = open_match(store, match_id)
+    log = RunLog.begin(store, match, stages, settings, gates or "never", iteration)
+    return require_complete(run_stages(log, time_limits or {}))
+
+
+def require_complete(record: RunRecord) -> str:
+    """Return the number of a complete run.
+
+    Raises:
+        IncompleteRunError: it is not complete.
+    """
     if record.state != "complete":
         raise IncompleteRunError(record)
     return record.run_id
 
 
-def _status_at_prefect(store: Store, match_id: str) -> AbstractContextManager[None]:
-    from flows.service.artifacts import shown_at_prefect  # only deployments use it
-
-    return shown_at_prefect(store, match_id)
-
-
-def _run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
-    """Compute the missing units of a run on Dask workers, and return its record."""
+def run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
+    """Compute the missing units of a run on the Dask workers of this flow; return its record."""
 
     def compute_missing(
         stage: Stage, units: list[PlannedUnit]

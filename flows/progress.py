@@ -4,15 +4,55 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Final
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Self
 
 logger = logging.getLogger("worldpose.run")
 
 MOST_TOLD: Final = 200
 """Units of a stage that are reported one by one; of more, only every n-th."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far something is.
+
+    Attributes:
+        share: done, from 0 to 1.
+        seconds_left: expected time to its end [s]; None before anything is done.
+    """
+
+    share: float
+    seconds_left: float | None
+
+    @classmethod
+    def after(cls, share: float, began: float) -> Self:
+        """Return the progress of what began at a time of the monotonic clock [s]."""
+        elapsed = time.monotonic() - began
+        return cls(share, elapsed * (1.0 - share) / share if share > 0.0 else None)
+
+    def __str__(self) -> str:
+        """Return percent and time left, at most 13 characters."""
+        percent = f"{100.0 * self.share:.0f} %"
+        if self.seconds_left is None or self.share >= 1.0:
+            return percent
+        return f"{percent} {in_time(self.seconds_left)}"
+
+
+def in_time(seconds: float) -> str:
+    """Format a duration in at most 7 characters."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    if seconds < 99.5 * 60.0:
+        return f"{seconds / 60.0:.0f} min"
+    if seconds < 99.5 * 3600.0:
+        return f"{seconds / 3600.0:.1f} h"
+    return f"{seconds / 86400.0:.0f} d"
 
 
 class Reporter:
@@ -27,6 +67,35 @@ class Reporter:
 
     left: int = 0
     every: int = 1
+    _work: Mapping[str, float] = MappingProxyType({})
+    _reached: tuple[str, ...] = ()
+    _missing: int = 0
+    _began: float | None = None
+    _stage_began: float = 0.0
+
+    def run_planned(self, work: Mapping[str, float]) -> None:
+        """Begin to measure a run.
+
+        Args:
+            work: stage to the expected computation time of its missing units, all workers [s].
+        """
+        self._work, self._reached, self._missing, self._began = dict(work), (), 0, None
+
+    @property
+    def stage_progress(self) -> Progress:
+        """How far the current stage is."""
+        share = 1.0 - self.left / self._missing if self._missing else 1.0
+        return Progress.after(min(max(share, 0.0), 1.0), self._stage_began)
+
+    @property
+    def run_progress(self) -> Progress:
+        """How far the run is, by the expected work; as the stage without a plan."""
+        total = sum(self._work.values())
+        if not total or self._began is None:
+            return self.stage_progress
+        done = sum(self._work.get(stage, 0.0) for stage in self._reached[:-1])
+        done += self._work.get(self._reached[-1], 0.0) * self.stage_progress.share
+        return Progress.after(min(done / total, 1.0), self._began)
 
     def say(self, text: str) -> None:
         """Report any other slow operation."""
@@ -35,6 +104,10 @@ class Reporter:
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
         """Report that a stage starts, with the numbers of its units and of those to compute."""
         self.left, self.every = missing, max(1, math.ceil(missing / MOST_TOLD))
+        self._missing, self._stage_began = missing, time.monotonic()
+        self._reached = (*self._reached, stage)
+        if missing and self._began is None:
+            self._began = self._stage_began
         logger.info("%s: %s (%d units, %d to compute)", stage, about, units, missing)
 
     def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
@@ -55,6 +128,10 @@ class Reporter:
         """Report that a unit has no result."""
         self.left -= 1
         logger.error("%s: failed: %s", unit, message)
+
+    def report_interruption(self) -> None:
+        """Report that the user ended the run; its process ends next."""
+        logger.warning("interrupted")
 
 
 def in_short(figures: Mapping[str, float]) -> str:

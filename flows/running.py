@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from multiprocessing.resource_tracker import ensure_running
 from types import FrameType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -21,9 +22,10 @@ from flows.orchestration.prefect_environment import START_SECONDS, has_server, p
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
-from flows.run_record import RunLog, latest_run
+from flows.run_record import RunLog, expected_work, latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
+from tasks.tracing import flush_spans, start_tracing
 from worldpose.errors import InputError, WorldposeError
 from worldpose.store import Store
 
@@ -84,6 +86,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
         policy = latest.gates
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
+    reporter().run_planned(expected_work(store, plan.missing, latest))
     if plan.missing:
         return _with_prefect(store, match, replace(request, gates=policy), plan.missing)
     if latest is not None and plan.is_recorded_by(latest):
@@ -110,6 +113,7 @@ def _with_prefect(
 
         from flows.match import IncompleteRunError, process_match
 
+        start_tracing()
         client = {} if request.security is None else {"security": request.security}
         runner = cast("TaskRunner[Any]", DaskTaskRunner(address=request.dask, client_kwargs=client))
         try:
@@ -130,6 +134,7 @@ def _with_prefect(
             require_workers(failure)
             raise
         finally:
+            flush_spans()
             APILogHandler().flush()  # while the server can still accept the last lines
     return store.run(match.match_id, run_id)
 
@@ -212,16 +217,31 @@ def _ending_at_once() -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        sys.stderr.write("\ninterrupted: run again to resume from the finished results\n")
+        signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C does not tear the last line
+        reporter().report_interruption()
         sys.stderr.flush()
         os._exit(128 + number)
 
+    _start_quiet_tracker()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _start_quiet_tracker() -> None:
+    """Start Python's resource tracker, which warns of what an ended run leaves and it removes."""
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
+    try:
+        ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _without_heartbeats() -> AbstractContextManager[Any]:

@@ -12,6 +12,8 @@ import os
 import dask
 from distributed import Scheduler, Worker
 
+from tasks.tracing import flush_spans, start_tracing
+
 gc.disable()
 # Before Prefect is imported with the first task: it would send telemetry.
 os.environ.setdefault("DO_NOT_TRACK", "1")
@@ -26,10 +28,12 @@ def dask_setup(node: Worker | Scheduler) -> None:
     The HTTP server is closed: it would show the computation to every user of the machine.
     """
     node.http_server.stop()
+    start_tracing()
     gc.freeze()
     gc.enable()
 
 
 def dask_teardown(node: Worker | Scheduler) -> None:
-    """Leave all memory to the end of the process: freeing it piece by piece takes a second."""
+    """Send the last spans; leave all memory to the end of the process, which saves a second."""
+    flush_spans()
     gc.freeze()

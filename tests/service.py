@@ -38,6 +38,7 @@ class Served:
     def __init__(self, folder, webhook):
         self.environment = {}
         self.launcher = []  # what begins the command: setpriv, nice
+        self.options = {}
         self.project = folder / "project"
         self.webhook = webhook
         self.ports = dict(zip(("prefect", "pages", "metrics"), free_ports(3), strict=True))
@@ -53,6 +54,7 @@ class Served:
             "--settle-time": 3,
             "--poll-interval": 1,
             "--disk-gb": 1e9,  # more than there is: an alert that is sure to come
+            **self.options,
         }
         environment = {
             **{name: value for name, value in os.environ.items() if name != "PREFECT_API_URL"},
@@ -108,7 +110,8 @@ class Served:
         return fetch(f"http://127.0.0.1:{self.ports['metrics']}/metrics", headers=headers)
 
     def runs(self, name):
-        return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"any_": [name]}}})
+        """Prefect's runs of a match, or of what else their names begin with."""
+        return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"like_": f"{name}, "}}})
 
     def check(self):
         return worldpose("serve", "--check", "--project", self.project, "--json")

@@ -20,35 +20,49 @@ if TYPE_CHECKING:
     from typer._click.formatting import HelpFormatter
     from typer._click.shell_completion import CompletionItem
 
-COMMANDS: Final = {
-    "init": "project:init",
-    "status": "project:status",
-    "verify": "project:verify",
-    "gc": "project:gc",
-    "simulate": "matches:simulate",
-    "import": "matches:import_command",
-    "ingest": "matches:ingest",
-    "clips": "programme:clips",
-    "run": "run:run",
-    "reprocess": "reprocess:reprocess",
-    "serve": "serve:serve",
-    "diff": "lineage:diff",
-    "why": "lineage:why",
-    "timings": "timings:timings",
-    "pin": "pins:pin",
-    "unpin": "pins:unpin",
-    "export": "results:export",
-    "report": "results:report",
-    "evaluate": "evaluate:evaluate",
-    "check": "data_set:check",
-    "statistics": "data_set:statistics",
-    "label": "finetune:label",
-    "finetune": "finetune:finetune",
-    "review": "review",
-    "models": "models",
-    "body": "body",
+GROUPS: Final = {
+    "Bring a match in": {
+        "init": "project:init",
+        "simulate": "matches:simulate",
+        "import": "matches:import_command",
+        "clips": "programme:clips",
+        "ingest": "matches:ingest",
+    },
+    "Process matches": {
+        "run": "run:run",
+        "reprocess": "reprocess:reprocess",
+        "serve": "serve:serve",
+        "review": "review",
+    },
+    "Look at results, and hand them on": {
+        "status": "project:status",
+        "report": "results:report",
+        "export": "results:export",
+        "evaluate": "evaluate:evaluate",
+        "check": "data_set:check",
+        "statistics": "data_set:statistics",
+    },
+    "Find out why": {
+        "why": "lineage:why",
+        "diff": "lineage:diff",
+        "timings": "timings:timings",
+    },
+    "Keep the project in order": {
+        "pin": "pins:pin",
+        "unpin": "pins:unpin",
+        "verify": "project:verify",
+        "gc": "project:gc",
+    },
+    "Models": {
+        "models": "models",
+        "body": "body",
+        "label": "finetune:label",
+        "finetune": "finetune:finetune",
+    },
 }
-"""Command to `module:function` in flows.cli; a module alone is a group with `commands`."""
+"""Heading in the help to commands, each as `module:function` in flows.cli; a module alone is a
+group with `commands`."""
+COMMANDS: Final = {name: place for group in GROUPS.values() for name, place in group.items()}
 
 
 class RenamingCommand(TyperCommand):
@@ -101,9 +115,11 @@ class Commands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Context, formatter: HelpFormatter) -> None:
-        """Write every command with the first sentence of its help."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, summary(name)) for name in COMMANDS])
+        """Write every command with the first sentence of its help, by groups."""
+        widest = max(map(len, COMMANDS))
+        for heading, commands in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(f"{name:<{widest}}", summary(name)) for name in commands])
 
     def shell_complete(self, ctx: Context, incomplete: str) -> list[CompletionItem]:
         """Return the commands and options that begin with the typed text."""

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -28,6 +29,9 @@ ProjectOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Print the metrics of each result too.")
+]
 MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
@@ -67,17 +71,36 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
     to.print(table, soft_wrap=False)
 
 
-class ConsoleReporter(Reporter):
-    """Progress as lines on standard error, with a spinner on a terminal."""
+UNIT_WIDTH = 25
+"""Of a unit's name in the progress [characters]: with it a line has at most 80."""
 
-    def __init__(self) -> None:
+
+class ConsoleReporter(Reporter):
+    """Progress as lines on standard error, one per unit, with a spinner on a terminal.
+
+    Attributes:
+        verbose: whether to print metrics too.
+        computed: number of results that are kept whatever happens.
+    """
+
+    def __init__(self, *, verbose: bool = False) -> None:
+        self.verbose, self.computed = verbose, 0
+        self.spinner: Status | None = None
         self._started = time.monotonic()
         self._tenths = 0
+        self._has_heading = False
 
     def say(self, text: str) -> None:
         """Print one line, with the seconds since the start."""
         seconds = time.monotonic() - self._started
-        errors.print(f"[dim]{seconds:7.1f} s[/]  {text}", highlight=False)
+        width = errors.width if errors.is_terminal else NO_WIDTH
+        errors.print(
+            Text.from_markup(f"[dim]{seconds:7.1f} s[/]  {text}"),
+            width=width,
+            overflow="ellipsis",
+            no_wrap=True,
+            soft_wrap=False,
+        )
 
     def bytes_read(self, done: int, total: int) -> None:
         """Report every tenth of a long read."""
@@ -90,33 +113,61 @@ class ConsoleReporter(Reporter):
         """Print the stage and how many of its units are already published."""
         super().stage_started(stage, about, units=units, missing=missing)
         reused = f", {units - missing} already there" if missing < units else ""
-        self.say(f"[bold]{stage}[/]: {about} ({missing} of {units} to compute{reused})")
+        self.say(f"[bold]{stage}[/]: {missing} of {units} to compute{reused}: {escape(about)}")
+        if missing and not self._has_heading:
+            self._has_heading = True
+            self.say(f"[dim]  {'unit':<{UNIT_WIDTH}} {'time':>8}   {'stage':>13}   {'run':>13}[/]")
+
+    def unit_done(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
+        """Count the kept result, and report it."""
+        self.computed += 1
+        super().unit_done(unit, seconds, figures)
 
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
-        """Print the unit, its time and its metrics."""
+        """Print the unit and its time, and how far its stage and the run are."""
         super().tell_of(unit, seconds, figures)
-        self.say(
-            f"  {escape(unit)}  {seconds:.2f} s  [dim]{in_short(figures)}[/]  ({self.left} left)"
-        )
+        name = escape(f"{shorten_name(unit, UNIT_WIDTH):<{UNIT_WIDTH}}")
+        at = f"{self.stage_progress!s:>13}   {self.run_progress!s:>13}"
+        self.say(f"  {name} {seconds:6.1f} s   {at}")
+        if self.verbose and figures:
+            line(f"{'':13}{in_short(figures)}", to=errors)
 
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
         """Print the unit and why it needs review."""
         super().unit_waits(unit, reasons)
-        self.say(f"  [bold]{escape(unit)} waits for review[/]: {escape('; '.join(reasons))}")
+        line(f"{'':13}{unit} waits for review: {'; '.join(reasons)}", to=errors)
 
     def unit_failed(self, unit: str, message: str) -> None:
         """Print the unit and why it failed."""
         super().unit_failed(unit, message)
-        self.say(f"  [bold red]{escape(unit)} failed[/]: {escape(message)}  ({self.left} left)")
+        line(f"{'':13}{unit} failed: {message}", to=errors)
+
+    def report_interruption(self) -> None:
+        """Print what is kept, and how to continue, as the last line of the process."""
+        if self.spinner is not None:
+            self.spinner.stop()
+        results = "result is" if self.computed == 1 else "results are"
+        line(
+            f"interrupted: {self.computed} new {results} kept; the same command continues",
+            to=errors,
+        )
+
+
+def shorten_name(name: str, width: int) -> str:
+    """Return a name without its middle if it is longer than `width` characters."""
+    if len(name) <= width:
+        return name
+    end = (width - 1) // 2
+    return f"{name[: width - 1 - end]}…{name[-end:]}"
 
 
 @contextmanager
-def progress() -> Iterator[ConsoleReporter]:
-    """Report progress of all runs inside the context as lines on standard error."""
-    reporter = ConsoleReporter()
+def progress(*, verbose: bool = False) -> Iterator[ConsoleReporter]:
+    """Report progress of all runs inside the context on standard error; verbose: with metrics."""
+    reporter = ConsoleReporter(verbose=verbose)
     with reporting_to(reporter):
         if errors.is_terminal:
-            with errors.status("working"):
+            with errors.status("working") as reporter.spinner:
                 yield reporter
         else:
             yield reporter

@@ -29,6 +29,10 @@ TokenOption = Annotated[
         help="Token with which people log in; a new one by default.",
     ),
 ]
+UsersOption = Annotated[
+    Path | None,
+    typer.Option("--users", help="TOML file of the people who may log in, with their roles."),
+]
 
 
 def certificate_and_key(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:

@@ -13,6 +13,7 @@ from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    VerboseOption,
     errors,
     line,
     print_json,
@@ -55,6 +56,7 @@ def reprocess(
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
+    verbose: VerboseOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -71,7 +73,7 @@ def reprocess(
     wanted = [find_registration(store, name).spec.match_id for name in matches or ()]
     limits = parse_time_limits(time_limits or ())
     request = RunRequest(overrides, dask=dask, workers=workers, time_limits=limits)
-    with progress():
+    with progress(verbose=verbose):
         found = reprocess_matches(store, wanted, request, retry=retry, is_rehearsal=dry_run)
     if as_json:
         print_json({"matches": [_as_json(each) for each in found]})

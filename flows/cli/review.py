@@ -28,6 +28,7 @@ from flows.cli.page_server import (
     NamesOption,
     PortOption,
     TokenOption,
+    UsersOption,
     certificate_and_key,
 )
 from flows.orchestration.prefect_environment import has_server
@@ -254,6 +255,7 @@ def serve(
     certificate: CertificateOption = None,
     key: KeyOption = None,
     token: TokenOption = None,
+    users: UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
 ) -> None:
     """Serve the review pages to browsers until interrupted.
@@ -266,12 +268,14 @@ def serve(
     from flows.web.serving import serve as serve_pages
 
     tls = certificate_and_key(certificate, key)
-    access = access_for(host, token=token, names=names or (), secure=tls is not None)
+    access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     logging.getLogger("worldpose.pages").setLevel(logging.INFO)
-    # A token chosen by the operator is not printed: the output can go to a log.
+    # A token chosen by the operator is not printed (the output can go to a log), nor one that
+    # lets nobody in.
     where = address(access, host, port)
-    shown = where if token is None else where.partition("#")[0]
+    is_shown = token is None and users is None
+    shown = where if is_shown else where.partition("#")[0]
     told = f"review pages of {Store.open(project).url}: {shown}"
     serve_pages(project, access, host=host, port=port, tls=tls, announce=lambda: line(told))
 

@@ -19,6 +19,7 @@ from flows.cli.console import (
     JsonOption,
     MatchArgument,
     ProjectOption,
+    VerboseOption,
     errors,
     line,
     print_json,
@@ -32,6 +33,7 @@ from flows.registering import find_match
 from flows.results.comparison import KINDS, Mark, compare_runs, count_marks
 from flows.review.advice import click_advice, clock_advice
 from flows.review.verdicts import warnings_of
+from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
 from worldpose.errors import UsageError
@@ -77,6 +79,7 @@ def run(
             "decreasing.",
         ),
     ] = "1",
+    verbose: VerboseOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -101,8 +104,9 @@ def run(
         policy,
         time_limits=parse_time_limits(time_limits or ()),
     )
-    with progress():
+    with progress(verbose=verbose):
         opened = find_match(store, match)
+        require_no_other_run(store, opened.match_id)
         for text in warnings_of(opened):
             line(f"warning: {text}", to=errors)
         passes = None if most == 1 else iterate_match(store, opened, request, most)
@@ -190,10 +194,22 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
     if not (record.executed or record.failed or record.waiting):
         line("Nothing to do: every result is current.")
     line(f"results: {project}/results/{record.match_id}")
+    line(f"next: {_next_command(record)}")
+
+
+def _next_command(record: RunRecord) -> str:
+    """Return the most useful command after a run."""
+    if record.failed:
+        return f"worldpose why {record.match_id}, which says what failed and why"
+    if record.waiting:
+        return f"worldpose review serve, to decide; then worldpose run {record.match_id} again"
+    if "body_fitting" in {name.partition("/")[0] for name in record.results}:
+        return f"worldpose report {record.match_id}"
+    return f"worldpose run {record.match_id}, for the stages after these"
 
 
 def _print_waiting(record: RunRecord) -> None:
-    """Print the units that need review, and how to review them."""
+    """Print the units that need review."""
     if not record.waiting:
         return
     undecided = sum(not unit.rejected for unit in record.waiting)
@@ -204,10 +220,6 @@ def _print_waiting(record: RunRecord) -> None:
         line(f"  {unit.request}: {'; '.join(unit.reasons)}")
     if len(record.waiting) > SHOWN:
         line(f"  and {len(record.waiting) - SHOWN} more")
-    line(
-        f"next: worldpose review list {record.match_id}, then approve or reject what it lists, "
-        "and give this command again"
-    )
 
 
 UNTIL_BEST = "auto"

@@ -18,6 +18,7 @@ from flows.cli.page_server import (
     NamesOption,
     PortOption,
     TokenOption,
+    UsersOption,
     certificate_and_key,
 )
 from flows.orchestration.time_limits import parse_time_limits
@@ -38,6 +39,9 @@ def serve(
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
+    ] = False,
+    test_alerts: Annotated[
+        bool, typer.Option("--test-alerts", help="Send a test alert to every channel, and exit.")
     ] = False,
     max_concurrent: Annotated[
         int, typer.Option(min=1, help="Matches that run at the same time.")
@@ -77,12 +81,14 @@ def serve(
         typer.Option(help="Folder of logs and Prefect's database; PROJECT/operations by default."),
     ] = None,
     token: TokenOption = None,
+    users: UsersOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Serve a project until interrupted: dashboard, inbox, runs, pages, metrics, alerts.
 
-    Alerts go to the webhook in WORLDPOSE_ALERT_URL and by mail as WORLDPOSE_ALERT_MAIL says.
+    Alerts go to the webhook and the mail addresses in PROJECT/operations/secrets/alerts.toml, or as
+    WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL say.
     PREFECT_API_URL names a Prefect server that runs already.
 
     Example: worldpose serve --inbox /data/arriving
@@ -97,13 +103,16 @@ def serve(
     if check:
         _check(folder, as_json=as_json)
         return
+    if test_alerts:
+        _test_alerts(folder, as_json=as_json)
+        return
     from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.senders import senders_of
     from flows.service.service_secrets import METRICS_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
-    senders_of(os.environ)  # refuse wrong addresses at once, not in an unread log
+    senders_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
     tls = certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
@@ -135,8 +144,9 @@ def serve(
         poll_minutes=poll_interval,
         gate_hours=gate_hours,
         disk_gb=disk_gb,
+        users=None if users is None else users.resolve(),
     )
-    access = access_for(host, token=token, names=names or (), secure=tls is not None)
+    access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     secrets = secrets_of(plan, access.token)
     variable = CLIENT_LOGIN if given else SERVER_LOGIN
     is_kept = not given and variable not in os.environ
@@ -153,13 +163,33 @@ def serve(
         else:
             line(f"dashboard      {plan.dashboard}  log in with: {login_at}")
         # A token chosen by the operator is not printed: the output can go to a log.
-        login = "/login" if token else f"/login#token={access.token}"
+        login = "/login" if token or users else f"/login#token={access.token}"
         line(f"review pages   {plan.pages}{login}")
         line(f"status page    {plan.pages}/status")
         line(f"metrics        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
         line("Ctrl-C ends it; the next start resumes")
 
     serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
+
+
+def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
+    from flows.service.senders import send_test, senders_of
+
+    senders = senders_of(os.environ, folder.alert_settings)
+    if not senders:
+        raise UsageError(
+            "worldpose serve --test-alerts",
+            expected=f"a webhook or mail in {folder.alert_settings}",
+            found="none",
+            todo="Write the file as docs/how-to/operations.md says.",
+        )
+    problems = send_test(senders)
+    if as_json:
+        print_json({"channels": problems})
+    for name, problem in {} if as_json else problems.items():
+        line(f"{name}: {f'failed: {problem}' if problem else 'accepted a test alert'}")
+    if any(problems.values()):
+        raise typer.Exit(1)
 
 
 def _check(folder: StateFolder, *, as_json: bool) -> None:

@@ -25,7 +25,7 @@ def timings(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the time of each stage of a run, and the idle time.
+    """Print the time of each stage of a run, the idle time, core hours and bytes.
 
     Example: worldpose timings matches/tiny
     """
@@ -50,5 +50,6 @@ def timings(
     for name, seconds in (("start", found.start), ("between units", found.between)):
         rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
     print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
+    line(f"all its results, also those of earlier runs: {found.cost}")
     if not found.stages:
         line("nothing was computed by this run; --run names another")

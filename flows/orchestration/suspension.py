@@ -17,7 +17,6 @@ from prefect.client.schemas.filters import (
     FlowRunFilterStateType,
 )
 from prefect.client.schemas.objects import StateType
-from prefect.context import FlowRunContext
 from prefect.flow_runs import resume_flow_run, suspend_flow_run
 from prefect.input import RunInput
 from pydantic import Field
@@ -43,13 +42,6 @@ class Verdict(RunInput):
     """Name of the reviewer."""
     why: str = ""
     """The reviewer's comment."""
-
-
-def is_deployed() -> bool:
-    """Return whether this flow run belongs to a deployment: only such a run can be suspended."""
-    context = FlowRunContext.get()
-    run = None if context is None else context.flow_run
-    return run is not None and run.deployment_id is not None
 
 
 def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) -> None:
@@ -117,7 +109,8 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
         runs = [
             run
             for run in client.read_flow_runs(flow_run_filter=paused)
-            if run.parameters.get("match_id") == match_id
+            if run.deployment_id is not None  # else no worker would take it up
+            and run.parameters.get("match_id") == match_id
             and open_blobs(str(run.parameters.get("project"))).url == project
         ]
     for run in runs:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
+from data_contracts.run import ResultManifest
 from flows.method import METHOD
 from worldpose.store import Store
 
@@ -29,6 +31,41 @@ class StageTime:
 
 
 @dataclass(frozen=True)
+class Cost:
+    """What the results of a run cost.
+
+    Attributes:
+        core_hours: sum of the computing times of all units, each on one core [h].
+        bytes: size of their files [byte].
+    """
+
+    core_hours: float
+    bytes: int
+
+    @classmethod
+    def of(cls, manifests: Iterable[ResultManifest]) -> Self:
+        """Return the sum over results."""
+        seconds, size = 0.0, 0
+        for manifest in manifests:
+            seconds += manifest.seconds
+            size += sum(file.size for file in manifest.files)
+        return cls(seconds / 3600.0, size)
+
+    def __str__(self) -> str:
+        """Return both for people."""
+        return f"{self.core_hours:.3g} core hours, {in_bytes(self.bytes)}"
+
+
+def in_bytes(size: float) -> str:
+    """Format a size [byte] in at most 7 characters."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 999.5:
+            return f"{size:.3g} {unit}"
+        size /= 1000.0
+    return f"{size:.3g} TB"
+
+
+@dataclass(frozen=True)
 class RunTime:
     """Timing of a run.
 
@@ -38,6 +75,7 @@ class RunTime:
         stages: stages with computed units, in the method's order.
         start: until its first unit ran: planning, and the start of workers [s].
         between: after that, time without a running unit: planning, submitting, recording [s].
+        cost: of all results of the run, also of those that earlier runs computed.
     """
 
     run_id: str
@@ -45,6 +83,7 @@ class RunTime:
     stages: tuple[StageTime, ...]
     start: float
     between: float
+    cost: Cost
 
 
 def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
@@ -59,10 +98,14 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
         run_id: a number or name, or `latest`.
     """
     record = store.run(match_id, run_id)
+    manifests = {}
+    for name, key in record.results.items():
+        stage, _, unit = name.partition("/")
+        manifests[name] = store.manifest(match_id, stage, unit, key)
     spans: dict[str, list[tuple[float, float]]] = {}
     for name in record.executed:
-        stage, _, unit = name.partition("/")
-        manifest = store.manifest(match_id, stage, unit, record.results[name])
+        stage, _, _ = name.partition("/")
+        manifest = manifests[name]
         end = manifest.created_at.timestamp()
         spans.setdefault(stage, []).append((end - manifest.seconds, end))
     stages = tuple(
@@ -80,7 +123,8 @@ def run_time(store: Store, match_id: str, run_id: str) -> RunTime:
     begun = record.started_at.timestamp()
     start = max(0.0, min((begin for begin, _ in all_spans), default=begun) - begun)
     between = max(0.0, record.seconds - start - _covered_length(all_spans))
-    return RunTime(record.run_id, record.seconds, stages, start, between)
+    cost = Cost.of(manifests.values())
+    return RunTime(record.run_id, record.seconds, stages, start, between, cost)
 
 
 def _covered_length(spans: Iterable[tuple[float, float]]) -> float:

@@ -49,12 +49,13 @@ class Alert:
 
 @dataclass(frozen=True)
 class FailedRun:
-    """A failed run at the Prefect server: its id, name, state and message."""
+    """A failed run at the Prefect server: its id, name, state, message, and match if it has one."""
 
     id: str
     name: str
     state: str
     message: str
+    match_id: str = ""
 
 
 def alerts_now(
@@ -70,7 +71,7 @@ def alerts_now(
             "run_failed",
             f"run {run.name} is {run.state}: {run.message}",
             f"{plan.dashboard}/runs/flow-run/{run.id}",
-            run.name,
+            run.match_id,
         )
         for run in failed
     ]

@@ -1,25 +1,21 @@
-"""Artifacts of a deployment's run in Prefect's dashboard: progress, unit table, links."""
+"""Artifacts of a deployment's run in Prefect's dashboard: progress and table of units."""
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
-from urllib.parse import quote
 from uuid import UUID
 
 from prefect.artifacts import (
-    create_link_artifact,
     create_progress_artifact,
     create_table_artifact,
     update_progress_artifact,
 )
 
-from flows.method import METHOD
-from flows.progress import Reporter, in_short, reporting_to
-from flows.service.layout import served_state
+from flows.progress import Reporter, in_short, in_time, reporting_to
+from flows.service.match_runs import artifact_key
 from flows.service.overview import Overview
 from worldpose.store import Store
 
@@ -35,14 +31,10 @@ class ArtifactReporter(Reporter):
 
     def __init__(self, artifact: UUID | None) -> None:
         self.artifact = artifact
-        self._at = 0
-        self._missing = 0
 
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
         """Report that all stages before are done."""
         super().stage_started(stage, about, units=units, missing=missing)
-        self._at = [each.name for each in METHOD].index(stage)
-        self._missing = missing
         self._tell(f"{stage}: {about}")
 
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
@@ -56,11 +48,14 @@ class ArtifactReporter(Reporter):
         self._tell(f"{unit} failed")
 
     def _tell(self, text: str) -> None:
-        artifact = self.artifact
+        artifact, at = self.artifact, self.run_progress
         if artifact is not None:
-            within = 1.0 - self.left / self._missing if self._missing else 0.0
-            percent = 100.0 * (self._at + min(within, 1.0)) / len(METHOD)
-            _show_artifact(lambda: update_progress_artifact(artifact, percent, description=text))
+            left = "" if at.seconds_left is None else f", about {in_time(at.seconds_left)} left"
+            _show_artifact(
+                lambda: update_progress_artifact(
+                    artifact, 100.0 * at.share, description=f"{text}{left}"
+                )
+            )
 
 
 @contextmanager
@@ -73,7 +68,7 @@ def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
         store: the project.
         match_id: the match.
     """
-    key = re.sub(r"[^a-z0-9]+", "-", match_id.lower()).strip("-")
+    key = artifact_key(match_id)
     artifact = _show_artifact(lambda: create_progress_artifact(0.0, key=f"progress-{key}"))
     reporter = ArtifactReporter(artifact)
     with reporting_to(reporter):
@@ -81,15 +76,6 @@ def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
     if artifact is not None:
         _show_artifact(lambda: update_progress_artifact(artifact, 100.0, description="recorded"))
     _show_artifact(lambda: create_table_artifact(table_of(store, match_id), key=f"units-{key}"))
-    serving = served_state(store.url).read_serving()
-    pages = None if serving is None else serving.services.get("pages")
-    if pages is not None and pages.address is not None:
-        review = f"{pages.address}/#/match/{quote(match_id, safe='')}"
-        _show_artifact(
-            lambda: create_link_artifact(review, f"Review {match_id}", key=f"review-{key}")
-        )
-        status = f"{pages.address}/status"
-        _show_artifact(lambda: create_link_artifact(status, "Status of all matches", key="status"))
 
 
 def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:

@@ -72,6 +72,7 @@ def pages(plan: ServePlan) -> None:
         token=os.environ.pop("WORLDPOSE_REVIEW_TOKEN"),  # hide it from runs that pages start
         names=plan.names,
         secure=plan.certificate is not None,
+        users=plan.users,
     )
     tls = None
     if plan.certificate is not None and plan.key is not None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, cast
 
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact, create_table_artifact
-from prefect.client.schemas.objects import FlowRun
-from prefect.deployments import run_deployment
+from prefect.context import FlowRunContext
+from prefect.runtime import flow_run
 from prefect.task_runners import TaskRunner
 from prefect_dask import DaskTaskRunner
 from pydantic import JsonValue, TypeAdapter, ValidationError
@@ -18,27 +20,126 @@ from pydantic import JsonValue, TypeAdapter, ValidationError
 from data_contracts.finetune import NetKind
 from data_contracts.operations import Arrival
 from data_contracts.records import Name
-from flows.match import process_match
-from flows.orchestration.prefect_environment import served_cluster
+from data_contracts.run import GatePolicy, RunRecord
+from flows.gates import Gatekeeper, waiting_for_verdicts
+from flows.iterate import iterate_match
+from flows.match import require_complete, run_stages
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, served_cluster
+from flows.orchestration.suspension import take_verdict
+from flows.progress import reporter
 from flows.registering import open_match
 from flows.reprocess import reprocess_matches
+from flows.run_plan import plan_ahead
+from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest
+from flows.service.artifacts import shown_at_prefect
 from flows.service.inbox import take_in
-from flows.service.plan import ServePlan
+from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name
+from flows.service.plan import TITLES, ServePlan
+from flows.settings import selected_stages
 from flows.stage import Match
+from tasks.tracing import start_tracing
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store import Store, open_run
 
 NAME: Final = TypeAdapter(Name)
 LOG = logging.getLogger("worldpose.operations")
 
+start_tracing()  # before the flow of this process starts, so that its span is exported
 RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
 
-match = process_match.with_options(task_runner=RUNNER)
-"""Flow that processes one match; suspended while its results need review."""
+
+def _name_run() -> str:
+    """Return the name that the run was created with, or one of the same form."""
+    what = str(flow_run.parameters.get("match_id") or TITLES[str(flow_run.flow_name)])
+    name = str(flow_run.name or "")
+    return name if name.startswith(f"{what}, ") else run_name(what)
 
 
-@flow(name="ingest", flow_run_name="inbox", validate_parameters=False)
+@flow(name="match", flow_run_name=_name_run, task_runner=RUNNER, validate_parameters=False)
+def match(
+    project: str,
+    match_id: str,
+    settings: dict[str, dict[str, JsonValue]] | None = None,
+    from_stage: str | None = None,
+    until_stage: str | None = None,
+    gates: GatePolicy = "auto",
+    iterations: int = 1,
+    time_limits: dict[str, float] | None = None,
+) -> str:
+    """Process a match and return the number of its run; suspended while results need review.
+
+    A run waits for another one of the same match, and computes nothing if all results are current.
+
+    Args:
+        project: folder or URL of the store.
+        match_id: a registered match.
+        settings: stage to its settings that differ from their defaults.
+        from_stage: first stage to run; the latest run supplies earlier results.
+        until_stage: last stage to run.
+        gates: when results need review.
+        iterations: number of iterations, the best of which is kept.
+        time_limits: stage to the time limit of a unit [min], if not the default.
+
+    Raises:
+        IncompleteRunError: some units failed or were rejected; the others have their results.
+        LostWorkersError: the Prefect server or Dask scheduler is gone; the run restarts.
+    """
+    logging.getLogger("worldpose").setLevel(logging.INFO)
+    store = Store.open(project)
+    request = RunRequest(
+        settings or {},
+        from_stage,
+        until_stage,
+        gates=gates,
+        iteration=1,
+        time_limits=time_limits or {},
+    )
+    context, runs = FlowRunContext.get(), match_runs_of(store.url)
+    if runs is not None and context is not None and context.flow_run is not None:
+        runs.link_pages(str(context.flow_run.id), match_id)  # a run of Prefect's form has none
+    with alone_with(store, match_id):
+        if iterations == 1:
+            return require_complete(_run_until_decided(store, match_id, request))
+        with shown_at_prefect(store, match_id):
+            given = open_match(store, match_id)
+            request = _on_own_workers(request)
+            return require_complete(iterate_match(store, given, request, iterations).record)
+
+
+def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:
+    """Run a match, again after each verdict; only plan it if the latest run has all results."""
+    stages = selected_stages(request.from_stage, request.until_stage)
+    policy: GatePolicy = request.gates or "auto"
+    while True:
+        opened, latest = open_match(store, match_id), latest_run(store, match_id)
+        gatekeeper = Gatekeeper(store, opened, policy)
+        plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
+        if latest is not None and plan.is_recorded_by(latest):
+            open_questions = waiting_for_verdicts(plan.waiting)
+            if open_questions:
+                take_verdict(store, match_id, open_questions)
+                continue
+            if latest.state == "complete":
+                return latest
+        with shown_at_prefect(store, match_id):
+            reporter().run_planned(expected_work(store, plan.missing, latest))
+            log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
+            record = run_stages(log, request.time_limits)
+        if record.failed or not waiting_for_verdicts(record.waiting):
+            return record
+
+
+def _on_own_workers(request: RunRequest) -> RunRequest:
+    """Return the request with the scheduler of this flow, which the flows inside it share."""
+    context = FlowRunContext.get()
+    client = getattr(context and context.task_runner, "client", None)
+    if client is None:
+        return request
+    return replace(request, dask=client.scheduler.address, security=client.security)
+
+
+@flow(name="ingest", flow_run_name=_name_run, validate_parameters=False)
 def ingest(plan: dict[str, Any]) -> list[str]:
     """Register every complete arrival, and start a run for each; return their ids.
 
@@ -78,61 +179,67 @@ def ingest(plan: dict[str, Any]) -> list[str]:
 
 
 def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
-    begun = run_deployment(
-        plan.match_deployment,
-        parameters={"match_id": opened.match_id},
-        flow_run_name=opened.match_id,
-        timeout=0,
-        as_subflow=False,
-        tags=[arrival.priority],
-        # After a kill, or for a moved folder, a second call returns the existing run.
-        idempotency_key=f"arrival-{opened.registration.identity}",
-        work_queue_name=arrival.priority,
-    )
-    return str(cast("FlowRun", begun).id)  # already awaited, outside an event loop
+    runs = MatchRuns(plan.prefect, plan.name, os.environ.get(CLIENT_LOGIN), plan.pages)
+    # After a kill, or for a moved folder, a second call returns the existing run.
+    key = f"arrival-{opened.registration.identity}"
+    return runs.start(opened.match_id, priority=arrival.priority, key=key).id
 
 
 class UnprocessedError(WorldposeError):
-    """Some matches could not be recomputed; the others are current."""
+    """Some matches could not be checked; the others are current, or their runs are started."""
 
 
-@flow(name="reprocess", validate_parameters=False)
+@flow(name="reprocess", flow_run_name=_name_run, validate_parameters=False)
 def reprocess(
     project: str,
     matches: tuple[str, ...] | list[str] = (),
     settings: dict[str, dict[str, JsonValue]] | None = None,
     retry: bool = False,
-    dask: str | None = None,
-    workers: int | None = None,
     time_limits: dict[str, float] | None = None,
 ) -> dict[str, str]:
-    """Recompute the stale results of every match of a project; return each match's state.
+    """Start a run of every match with stale results, in the background; return each one's state.
 
-    Nothing is started if nothing is stale. A match that waits for review is no failure; its run
-    continues when this flow is called again after the verdict.
+    Nothing is started for a match without stale results, or whose run has not ended.
 
     Args:
         project: folder or URL of the store.
         matches: ids of registered matches; none = all.
         settings: stage to settings that override those of each match's latest run.
         retry: retry failed units, even without an edit.
-        dask: address of a running Dask scheduler; None starts workers on this machine.
-        workers: number of worker processes on this machine; None = one per core.
-        time_limits: stage to the time limit of a unit [min], if not the default.
+        time_limits: stage to the time limit of a unit [min], if not those of the service.
 
     Raises:
-        UnprocessedError: some matches failed or are partial; the others are done.
+        UnprocessedError: some matches could not be checked; the others are started.
     """
-    request = RunRequest(settings or {}, dask=dask, workers=workers, time_limits=time_limits or {})
-    found = reprocess_matches(Store.open(project), tuple(matches), request, retry=retry)
-    unprocessed = [
-        f"{each.match_id} is {each.state}" + (f": {each.problem}" if each.problem else "")
-        for each in found
-        if each.state in ("failed", "partial")
-    ]
-    if unprocessed:
-        raise UnprocessedError("; ".join(unprocessed))
-    return {each.match_id: each.state for each in found}
+    store = Store.open(project)
+    runs = match_runs_of(store.url)
+    if runs is None:
+        raise WorldposeError(f"{project} is not served on this machine")
+    request = RunRequest(settings or {})
+    found = reprocess_matches(store, tuple(matches), request, retry=retry, is_rehearsal=True)
+    active = {run.match_id for run in runs.active()}
+    states: dict[str, str] = {each.match_id: each.state for each in found}
+    for each in found:
+        if each.status is None or each.state != "stale":
+            continue
+        if each.match_id in active:
+            states[each.match_id] = "has a run"
+            continue
+        latest = each.status.latest
+        runs.start(
+            each.match_id,
+            priority="background",
+            settings={stage: dict(values) for stage, values in each.status.settings.items()},
+            until_stage=each.status.until_stage,
+            gates=latest.gates,
+            iterations=None if latest.iteration == 1 else latest.iteration,
+            time_limits=None if time_limits is None else dict(time_limits),
+        )
+        states[each.match_id] = "started"
+    unchecked = [f"{each.match_id}: {each.problem}" for each in found if each.problem]
+    if unchecked:
+        raise UnprocessedError("; ".join(unchecked))
+    return states
 
 
 @flow(name="release", flow_run_name="release {name} of {match_id}", validate_parameters=False)
@@ -209,7 +316,7 @@ def release_folder(store: Store, match_id: str, name: str, out: str | None) -> P
     return Path(store.url) / "releases" / match_id / name
 
 
-@flow(name="finetune", validate_parameters=False)
+@flow(name="finetune", flow_run_name=_name_run, validate_parameters=False)
 def finetune(
     project: str,
     annotations: str,

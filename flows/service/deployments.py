@@ -24,14 +24,16 @@ from prefect.runner._process_manager import ProcessHandle
 from prefect.runner._starter_engine import EngineCommandStarter
 from prefect.schedules import Interval, Schedule
 from prefect.states import Failed
+from prefect.utilities.callables import parameter_schema
 from prefect.workers.process import (
     ProcessJobConfiguration,
     ProcessWorker,
     ProcessWorkerResult,
 )
 
+from flows.service.forms import form_schema
 from flows.service.layout import PRIORITIES
-from flows.service.plan import ServePlan
+from flows.service.plan import ServePlan, deployment_name
 from worldpose.errors import InputError
 
 LOG: Final = logging.getLogger("worldpose.operations")
@@ -91,15 +93,8 @@ DEPLOYED: Final = (
     ),
     Deployed(
         "reprocess",
-        "Recompute the results of every match that an edit made stale.",
-        "background",
-        lambda plan: {
-            "project": plan.project,
-            "dask": plan.dask,
-            "workers": plan.workers,
-            "time_limits": plan.time_limits,
-        },
-        fixed=("project", "dask"),
+        "Start a run of every match with results that an edit made stale.",
+        None,
     ),
     Deployed("release", "Freeze a match's complete run under a name, with a report.", None),
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
@@ -123,6 +118,7 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
     """
     async with get_client() as client:
         await _refuse_other_project(client, plan)
+        await _remove_former(client, plan)
         matches, arrivals = pools(plan)
         await _pool(client, matches, plan.max_concurrent, "Matches, urgent ones first")
         await _pool(client, arrivals, 1, "What arrives, while matches run")
@@ -152,7 +148,7 @@ async def _deploy(plan: ServePlan, deployed: Deployed) -> tuple[UUID, Installed]
     matches, arrivals = pools(plan)
     parameters = deployed.parameters(plan)
     deployment = await flow.ato_deployment(
-        name=plan.name,
+        name=deployment_name(plan.name, deployed.flow).partition("/")[2],
         description=deployed.about,
         parameters=parameters,
         schedule=None if deployed.schedule is None else deployed.schedule(plan),
@@ -163,8 +159,13 @@ async def _deploy(plan: ServePlan, deployed: Deployed) -> tuple[UUID, Installed]
     deployment.entrypoint = deployed.entrypoint
     number = await deployment.aapply()
     async with get_client() as client:  # applying the deployment again would not update these
+        form = form_schema(parameter_schema(flow).model_dump(), deployed.fixed)
         again = DeploymentUpdate(
-            entrypoint=deployed.entrypoint, pull_steps=[], job_variables={}, path=None
+            entrypoint=deployed.entrypoint,
+            pull_steps=[],
+            job_variables={},
+            path=None,
+            parameter_openapi_schema=form,
         )
         await client.update_deployment(number, again)
     fixed = json.loads(json.dumps({name: parameters[name] for name in deployed.fixed}))
@@ -189,6 +190,18 @@ async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
                 else "Give this project's deployments another name with --name."
             ),
         )
+
+
+async def _remove_former(client: PrefectClient, plan: ServePlan) -> None:
+    """Remove this project's deployments of earlier versions, which all had the service's name."""
+    for deployed in DEPLOYED:
+        try:
+            there = await client.read_deployment_by_name(f"{deployed.flow}/{plan.name}")
+        except ObjectNotFound:
+            continue
+        given = there.parameters
+        if plan.project in (given.get("project"), (given.get("plan") or {}).get("project")):
+            await client.delete_deployment(there.id)
 
 
 async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> None:

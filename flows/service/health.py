@@ -17,7 +17,7 @@ from typing import Any, Final
 from data_contracts.operations import Serving
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, authorization
 from flows.service.layout import StateFolder, is_alive
-from flows.service.plan import FLOWS
+from flows.service.plan import FLOWS, deployment_names
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
@@ -107,7 +107,7 @@ def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
     ask = _ask if login is None else partial(_ask, login=login)
     deployments, problem = ask(
         f"{serving.prefect}/deployments/filter",
-        {"deployments": {"name": {"any_": [serving.name]}}},
+        {"deployments": {"name": {"any_": deployment_names(serving.name)}}},
     )
     if problem:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
@@ -130,7 +130,7 @@ def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
     late, problem = ask(
         f"{serving.prefect}/flow_runs/count",
         {
-            "deployments": {"name": {"any_": [serving.name]}},
+            "deployments": {"name": {"any_": deployment_names(serving.name)}},
             "flow_runs": {
                 "state": {"name": {"any_": ["Running"]}},
                 "expected_start_time": {

@@ -95,6 +95,11 @@ class StateFolder:
         return self.folder / "secrets" / "prefect"
 
     @property
+    def alert_settings(self) -> Path:
+        """The operator's file with the channels of alerts; readable by this user only."""
+        return self.folder / "secrets" / "alerts.toml"
+
+    @property
     def metrics_token(self) -> Path:
         """Token for Prometheus; readable by this user only."""
         return self.folder / "secrets" / "metrics"

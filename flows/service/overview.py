@@ -11,6 +11,7 @@ from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import ResultManifest, RunRecord
 from flows.gates import GATES
 from flows.method import METHOD
+from flows.results.timings import Cost
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.review import last_decision, read_journal, requests_by_id
@@ -34,6 +35,7 @@ class UnitSummary:
         objections: metrics beyond the gate's limits without an approval.
         waiting_since: time of the review request; None if there is none.
         why: reason for the failure or the review.
+        bytes: size of the files of its result [byte].
     """
 
     unit: str
@@ -43,6 +45,7 @@ class UnitSummary:
     objections: tuple[str, ...] = ()
     waiting_since: datetime | None = None
     why: str = ""
+    bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,13 @@ class MatchStatus:
         if self.at_work_since is not None:
             return "at work"
         return "not run" if self.latest is None else self.latest.state
+
+    @property
+    def cost(self) -> Cost:
+        """Core hours and bytes of all results of the latest run."""
+        units = [unit for _, unit in self.units]
+        seconds = sum(unit.seconds or 0.0 for unit in units)
+        return Cost(seconds / 3600.0, sum(unit.bytes for unit in units))
 
     @property
     def units(self) -> Iterable[tuple[str, UnitSummary]]:
@@ -147,7 +157,12 @@ class Overview:
         objections = () if gate is None or is_approved else gate.objections(manifest.figures)
         waits = next((each for each in run.waiting if each.unit == name), None)
         done = UnitSummary(
-            _unit(name), "done", manifest.seconds, manifest.figures, objections=objections
+            _unit(name),
+            "done",
+            manifest.seconds,
+            manifest.figures,
+            objections,
+            bytes=sum(file.size for file in manifest.files),
         )
         if waits is None or is_approved:
             return done

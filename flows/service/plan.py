@@ -12,6 +12,18 @@ from flows.service.layout import StateFolder
 METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """Flows that the Prefect server offers, known without importing Prefect."""
+TITLES = {"ingest": "inbox", "reprocess": "stale matches", "finetune": "fine-tuning"}
+"""Flow to what its runs are named by, if not a match."""
+
+
+def deployment_name(name: str, flow: str) -> str:
+    """Return Prefect's full name of a deployment, from the `--name` of the service and the flow."""
+    return f"{flow}/{name}-{flow}"
+
+
+def deployment_names(name: str) -> list[str]:
+    """Return the names of all deployments of a service, without those of their flows."""
+    return [deployment_name(name, flow).partition("/")[2] for flow in FLOWS]
 
 
 class ServePlan(Record):
@@ -60,6 +72,8 @@ class ServePlan(Record):
     """A result that waits longer for review raises an alert [h]."""
     disk_gb: float = Field(default=10.0, ge=0)
     """Less free space than this raises an alert [GB]."""
+    users: Path | None = None
+    """TOML file of the people who may log in to the pages; None: everybody with the token."""
 
     @property
     def state_folder(self) -> StateFolder:
@@ -82,9 +96,9 @@ class ServePlan(Record):
     @property
     def match_deployment(self) -> str:
         """Name of the Prefect deployment that processes matches."""
-        return f"match/{self.name}"
+        return deployment_name(self.name, "match")
 
     @property
     def ingest_deployment(self) -> str:
         """Prefect's name of the deployment that registers arrivals."""
-        return f"ingest/{self.name}"
+        return deployment_name(self.name, "ingest")

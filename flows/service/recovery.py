@@ -27,10 +27,11 @@ from prefect.events.filters import (
     EventResourceFilter,
 )
 from prefect.states import Cancelled, Crashed, Scheduled
+from prefect.types import KeyValueLabels
 
 from flows.orchestration.cluster_errors import LostWorkersError
 from flows.service.layout import is_alive
-from flows.service.plan import ServePlan
+from flows.service.plan import TITLES, ServePlan, deployment_name, deployment_names
 
 SILENT: Final = timedelta(seconds=90)
 """Without a heartbeat for so long, a run is checked; heartbeats come every 30 s."""
@@ -39,6 +40,10 @@ STARTING: Final = timedelta(minutes=5)
 machine."""
 MOST_BEGINNINGS: Final = 3
 """After so many starts, a killed run stays crashed and needs an operator."""
+MOST_SERVICE_DEATHS: Final = 10
+"""Starts that do not count, because the whole service was killed; a run may be to blame for it."""
+DEATHS: Final = "worldpose.service_deaths"
+"""Label of a run: how often the service was killed while the run was active."""
 AT_WORK: Final = (StateType.RUNNING, StateType.PENDING, StateType.CANCELLING)
 KILLED: Final = "its process was killed"
 
@@ -59,6 +64,9 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
             for run in await _runs(client, plan, AT_WORK):
                 was_cancelled = run.state_type == StateType.CANCELLING
                 state: State[Any] = Cancelled() if was_cancelled else Crashed(message=KILLED)
+                if run.state_type == StateType.RUNNING:
+                    deaths: KeyValueLabels = {DEATHS: _service_deaths(run) + 1}
+                    await client.update_flow_run_labels(run.id, deaths)
                 await client.set_flow_run_state(run.id, state, force=True)
         else:
             for run in await _runs(client, plan, (StateType.RUNNING, StateType.PENDING)):
@@ -74,12 +82,30 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
     return again
 
 
+async def name_scheduled_runs(plan: ServePlan) -> None:
+    """Name the runs that Prefect has created for a schedule, which get random words from it."""
+    async with get_client() as client:
+        for flow in ("match", *TITLES):
+            for run in await _runs(client, plan, (StateType.SCHEDULED,), flow):
+                due = run.next_scheduled_start_time
+                if run.auto_scheduled and due is not None:
+                    title = run.parameters.get("match_id") or TITLES.get(flow, flow)
+                    name = f"{title}, {due.astimezone():%d %b %H:%M:%S}"
+                    if run.name != name:
+                        await client.update_flow_run(run.id, name=name)
+
+
 def may_begin_again(run: FlowRun) -> bool:
     """Return whether a run may restart: its process was killed, or its machines were lost."""
-    if run.state is None or run.run_count >= MOST_BEGINNINGS:
+    own_starts = run.run_count - min(_service_deaths(run), MOST_SERVICE_DEATHS)
+    if run.state is None or own_starts >= MOST_BEGINNINGS:
         return False
     was_lost = LostWorkersError.__name__ in (run.state.message or "")
     return run.state_type == StateType.CRASHED or (run.state_type == StateType.FAILED and was_lost)
+
+
+def _service_deaths(run: FlowRun) -> int:
+    return int(run.labels.get(DEATHS) or 0)
 
 
 async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool:
@@ -107,12 +133,15 @@ async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool
 
 
 async def _runs(
-    client: PrefectClient, plan: ServePlan, states: Sequence[StateType]
+    client: PrefectClient, plan: ServePlan, states: Sequence[StateType], flow: str | None = None
 ) -> list[FlowRun]:
-    """Return the runs of the project's deployments that are in one of these states."""
+    """Return the runs of the project's deployments, or that of a flow, that are in these states."""
+    names = deployment_names(plan.name)
+    if flow is not None:
+        names = [deployment_name(plan.name, flow).partition("/")[2]]
     return await client.read_flow_runs(
         flow_run_filter=FlowRunFilter(
             state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states)))
         ),
-        deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[plan.name])),
+        deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=names)),
     )

@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 import smtplib
 import ssl
+import stat
+import tomllib
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from email.message import EmailMessage
+from pathlib import Path
 from typing import Final, Protocol
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import parse_qs, quote, unquote, urlencode, urlsplit
 
+from pydantic import Field, ValidationError
+
+from data_contracts.records import Record
 from worldpose.errors import UsageError
 
 ANSWER_SECONDS: Final = 10.0
@@ -62,10 +68,10 @@ class Webhook:
             is_web, port = False, None
         if not is_web or port == 0:
             raise UsageError(
-                "WORLDPOSE_ALERT_URL",
+                "the webhook of alerts (WORLDPOSE_ALERT_URL, alerts.toml)",
                 expected="https://HOST/PATH (or http:)",
                 found="something else, which may hold a secret",
-                todo="Correct the variable, or unset it to post nothing.",
+                todo="Correct it, or remove it to post nothing.",
             )
         return cls(address)
 
@@ -121,10 +127,10 @@ class Mail:
                 raise ValueError
         except (KeyError, ValueError):
             raise UsageError(
-                "WORLDPOSE_ALERT_MAIL",
+                "the mail of alerts (WORLDPOSE_ALERT_MAIL, alerts.toml)",
                 expected="smtps://USER:PASSWORD@HOST/?to=SOMEBODY@EXAMPLE.ORG",
                 found="something else, which may hold a secret",
-                todo="Correct the variable, or unset it to send no mail.",
+                todo="Correct it, or remove it to send no mail.",
             ) from None
         user, password = unquote(parts.username or ""), unquote(parts.password or "")
         return cls(host, port, is_secure, user, password, sender, receivers)
@@ -156,12 +162,102 @@ class Mail:
             server.send_message(message)
 
 
-def senders_of(environment: Mapping[str, str]) -> tuple[Sender, ...]:
-    """Return the channels in WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL.
+class MailSettings(Record):
+    """Table `mail` of alerts.toml."""
+
+    server: str
+    """`smtps://HOST[:PORT]`, or `smtp://` for STARTTLS."""
+    user: str = ""
+    """Login name; empty = no login."""
+    password: str = ""
+    """Its password."""
+    sender: str | None = None
+    """Address of the sender; None = the first receiver."""
+    receivers: tuple[str, ...] = Field(min_length=1)
+    """Addresses."""
+
+    @property
+    def address(self) -> str:
+        """The address of `WORLDPOSE_ALERT_MAIL` that says the same."""
+        scheme, _, host = self.server.partition("://")
+        login = f"{quote(self.user, safe='')}:{quote(self.password, safe='')}@" if self.user else ""
+        asked = [("to", each) for each in self.receivers]
+        asked += [] if self.sender is None else [("from", self.sender)]
+        return f"{scheme}://{login}{host.rstrip('/')}/?{urlencode(asked)}"
+
+
+class AlertSettings(Record):
+    """alerts.toml: the channels of a project's alerts."""
+
+    webhook: str | None = None
+    """Address that gets each alert as JSON."""
+    mail: MailSettings | None = None
+    """Mail server and receivers."""
+
+
+def read_alert_settings(file: Path) -> AlertSettings:
+    """Return the channels that a file names; none if there is no file.
+
+    Raises:
+        UsageError: it is malformed, or other users can read it.
+    """
+    try:
+        content = file.read_bytes()
+        mode = stat.S_IMODE(file.stat().st_mode)
+    except FileNotFoundError:
+        return AlertSettings()
+    if mode & 0o077:
+        raise UsageError(
+            str(file),
+            expected="a file that only its owner can read: it can hold a password",
+            found=f"mode {mode:o}",
+            todo=f"Change it: chmod 600 {file}.",
+        )
+    try:
+        return AlertSettings.model_validate(tomllib.loads(content.decode()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    except ValueError:  # neither TOML nor UTF-8; its message can quote a secret
+        problem = "something else, which may hold a secret"
+    raise UsageError(
+        str(file),
+        expected="`webhook`, and a table `mail` with server, receivers, user, password, sender",
+        found=problem,
+        todo="Correct the file; docs/how-to/operations.md has an example.",
+    )
+
+
+def senders_of(environment: Mapping[str, str], file: Path | None = None) -> tuple[Sender, ...]:
+    """Return the channels of WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL, else of alerts.toml.
 
     Raises:
         UsageError: one of them is malformed.
     """
-    webhook, mail = environment.get("WORLDPOSE_ALERT_URL"), environment.get("WORLDPOSE_ALERT_MAIL")
+    kept = AlertSettings() if file is None else read_alert_settings(file)
+    webhook = environment.get("WORLDPOSE_ALERT_URL") or kept.webhook
+    mail = environment.get("WORLDPOSE_ALERT_MAIL") or (kept.mail and kept.mail.address)
     found: list[Sender] = [Webhook.at(webhook)] if webhook else []
     return (*found, Mail.at(mail)) if mail else tuple(found)
+
+
+TEST_ALERT: Final = {
+    "alert": "test",
+    "match": "",
+    "text": "This is a test: alerts of worldpose arrive here.",
+    "link": "",
+}
+
+
+def send_test(senders: Iterable[Sender]) -> dict[str, str]:
+    """Send a test alert to each channel; return channel to problem, empty if it was accepted."""
+    found = {}
+    for sender in senders:
+        try:
+            sender.send(TEST_ALERT)
+        except Exception as error:  # its message can contain the address, and that a secret
+            code = getattr(error, "code", None) or getattr(error, "smtp_code", None)
+            found[sender.name] = type(error).__name__ + (f" {code}" if code else "")
+        else:
+            found[sender.name] = ""
+    return found

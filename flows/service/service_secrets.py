@@ -23,6 +23,8 @@ from worldpose.errors import UsageError
 from worldpose.formats import whole_file
 
 ALERTS: Final = ("WORLDPOSE_ALERT_URL", "WORLDPOSE_ALERT_MAIL")
+LINEAGE: Final = "OPENLINEAGE_API_KEY"
+"""Key of the receiver of lineage, which the runs of the worker need."""
 PAGES_TOKEN: Final = "WORLDPOSE_REVIEW_TOKEN"
 METRICS_TOKEN: Final = "WORLDPOSE_METRICS_TOKEN"
 
@@ -56,6 +58,8 @@ class Secrets:
             urls = [plan.project, *([plan.bucket or ""] if part == "watch" else [])]
             if any("://" in url for url in urls):
                 names += [name for name in environ if name.startswith("AWS_")]
+        if part == "worker":
+            names.append(LINEAGE)
         if part == "watch":
             names += ALERTS
             found[METRICS_TOKEN] = self.metrics

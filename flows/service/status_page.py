@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from html import escape
 from typing import Any, Final
@@ -22,33 +23,60 @@ from flows.web.app_context import PageContext
 WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
 REFRESH_SECONDS: Final = 15
 STYLE: Final = """
-:root { color-scheme: light dark; --line: #d7ded8; --dim: #56625a; --paper: #fff; }
-body { margin: 0; font: 15px/1.45 system-ui, sans-serif; background: #f4f6f4; color: #1d2420; }
-main { padding: 0 1.2rem 3rem; }
-header { display: flex; gap: 1.2rem; align-items: baseline; padding: .8rem 1.2rem; }
-h1 { font-size: 1.2rem; margin: 0; }
-h2 { font-size: 1rem; margin: 1.6rem 0 .5rem; }
-a { color: #0b5c8f; }
+:root {
+  color-scheme: light dark;
+  --ground: #f4f6f5; --panel: #ffffff; --ink: #1d2423; --soft: #5a6764; --line: #d6ddda;
+  --accent: #0b5c8f; --done: #0072b2; --waiting: #e69f00; --failed: #d55e00; --blocked: #8a9692;
+  --focus: #e69f00;
+  font: 15px/1.45 system-ui, "Segoe UI", "DejaVu Sans", sans-serif;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --ground: #14191a; --panel: #1d2425; --ink: #e6ebe9; --soft: #a2aeab; --line: #37413f;
+    --accent: #56b4e9; --done: #56b4e9; --failed: #ffa04d;
+  }
+}
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--ground); color: var(--ink); }
+body > header {
+  display: flex; justify-content: space-between; align-items: center; gap: 1rem;
+  padding: .5rem 1rem; background: var(--panel); border-bottom: 1px solid var(--line);
+  min-height: 2.9rem;
+}
+nav, .right { display: flex; align-items: center; gap: .6rem; min-width: 0; }
+nav a { text-decoration: none; color: inherit; font-weight: 650; }
+nav a:hover { text-decoration: underline; }
+main { padding: 1.2rem 1.2rem 3rem; }
+h1 { font-size: 1.25rem; margin: 0 0 .8rem; font-weight: 650; }
+h2 { font-size: 1rem; margin: 1.6rem 0 .5rem; font-weight: 650; }
+a { color: var(--accent); }
+:focus-visible { outline: 3px solid var(--focus); outline-offset: 1px; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; background: var(--paper); }
-th, td { border: 1px solid var(--line); padding: .3rem .55rem; text-align: left; }
-th { font-weight: 600; font-size: .85rem; white-space: nowrap; }
+table { border-collapse: collapse; width: 100%; }
+th, td {
+  text-align: left; padding: .3rem .45rem .3rem 0; border-bottom: 1px solid var(--line);
+  vertical-align: top; overflow-wrap: anywhere;
+}
+th { color: var(--soft); font-weight: 600; font-size: .86rem; vertical-align: bottom; }
+th.stage { writing-mode: vertical-rl; transform: rotate(180deg); padding: .3rem 0 .2rem; }
+th.stage { white-space: nowrap; overflow-wrap: normal; border: 0; font-size: .8rem; }
+th.stage { line-height: 3.2rem; }
 td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-small, .dim { color: var(--dim); font-size: .82rem; }
-.done { border-left: 4px solid #009e73; }
-.waiting { border-left: 4px solid #e69f00; }
-.failed { border-left: 4px solid #d55e00; }
-.blocked { border-left: 4px solid #999; }
+td.cell { width: 3.2rem; padding: .3rem .1rem; font-size: .78rem; line-height: 1.25; }
+td.match, td.run { min-width: 13rem; line-height: 1.3; }
+small, .soft { color: var(--soft); font-size: .82rem; }
+.cell > span, .unit { display: block; padding-left: .3rem; border-left: 4px solid var(--line); }
+.cell > span { overflow-wrap: normal; }
+.done { border-color: var(--done) !important; }
+.waiting { border-color: var(--waiting) !important; }
+.failed { border-color: var(--failed) !important; }
+.blocked { border-color: var(--blocked) !important; }
 .state { font-weight: 600; }
+progress { width: 100%; accent-color: var(--accent); }
 details { margin: .4rem 0; }
 summary { cursor: pointer; }
-@media (prefers-color-scheme: dark) {
-  :root { --line: #37413f; --dim: #a2aea7; --paper: #1d2425; }
-  body { background: #14191a; color: #e6ebe8; }
-  a { color: #7cc4f5; }
-}
 """
-"""Colours that are distinct for colour-blind readers; each state is also given as text."""
+"""Colours and sizes of the other pages; each state is also given as text."""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -59,7 +87,7 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/api/status")
     def status() -> dict[str, Any]:
         return {
-            "matches": [_as_json(match) for match in overview.look()],
+            "matches": [_as_json(match, *_run_of(context, match)) for match in overview.look()],
             "arrivals": [each.model_dump(mode="json") for each in _arrivals(context)],
         }
 
@@ -67,7 +95,8 @@ def routes(context: PageContext) -> APIRouter:
     def page() -> HTMLResponse:
         serving = served_state(context.store.url).read_serving()
         dashboard = "" if serving is None else serving.prefect.removesuffix("/api")
-        return HTMLResponse(status_html(overview.look(), _arrivals(context), dashboard))
+        rows = [StatusRow(match, *_run_of(context, match)) for match in overview.look()]
+        return HTMLResponse(status_html(rows, _arrivals(context), dashboard))
 
     @router.get("/status/page.css")
     def style() -> Response:
@@ -76,80 +105,115 @@ def routes(context: PageContext) -> APIRouter:
     return router
 
 
-def status_html(matches: Sequence[MatchStatus], arrivals: Iterable[Arrival], dashboard: str) -> str:
+@dataclass(frozen=True)
+class StatusRow:
+    """A match on the page.
+
+    Attributes:
+        match: its status.
+        at_work: state of its run as the other pages have it; None if none is at work.
+        prefect: page of its latest run at Prefect; empty if unknown.
+    """
+
+    match: MatchStatus
+    at_work: Mapping[str, Any] | None = None
+    prefect: str = ""
+
+
+def _run_of(context: PageContext, match: MatchStatus) -> tuple[Mapping[str, Any] | None, str]:
+    runs = context.continuing
+    return runs.state(match.match_id), runs.links().get(match.match_id, "")
+
+
+def status_html(rows: Sequence[StatusRow], arrivals: Iterable[Arrival], dashboard: str) -> str:
     """Render the page; every name and message is escaped.
 
     Args:
-        matches: all matches.
+        rows: all matches.
         arrivals: state of the inbox.
         dashboard: address of Prefect's dashboard; empty if unknown.
     """
-    arrived = {each.match_id: each for each in arrivals if each.match_id}
-    seen = {stage for match in matches for stage in match.stages}
+    seen = {stage for row in rows for stage in row.match.stages}
     stages = [stage.name for stage in METHOD if stage.name in seen]
-    counts = Counter(match.state for match in matches)
+    counts = Counter(row.match.state for row in rows)
     said = ", ".join(f"{count} {state}" for state, count in counts.most_common())
-    link = f'<a href="{escape(dashboard)}">Prefect dashboard</a>' if dashboard else ""
-    rows = "".join(_row(match, stages, arrived, dashboard) for match in matches)
-    heads = "".join(f"<th>{escape(name.replace('_', ' '))}</th>" for name in stages)
+    link = f'<a href="{escape(dashboard)}">Prefect</a>' if dashboard else ""
+    lines = "".join(_row(row, stages) for row in rows)
+    heads = "".join(f'<th class="stage">{escape(name.replace("_", " "))}</th>' for name in stages)
     table = (
-        f'<div class="wide"><table><tr><th>match</th><th>latest run</th>{heads}</tr>{rows}</table>'
+        f'<div class="wide"><table><tr><th>match</th><th>latest run</th>{heads}</tr>{lines}</table>'
         "</div>"
-        if matches
+        if rows
         else "<p>No match yet: put one into the inbox.</p>"
     )
-    details = "".join(map(_details, matches))
+    details = "".join(_details(row.match) for row in rows)
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>worldpose status</title>'
         f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">'
         '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
         '<link rel="stylesheet" href="/status/page.css"></head><body>'
-        f'<header><h1>worldpose status</h1><span class="dim">{escape(said)}</span>'
-        f'<a href="/">Pending review</a>{link}</header>'
-        f"<main>{table}{_inbox(arrivals)}{details}</main></body></html>"
+        '<header><nav aria-label="Where you are"><a href="/">worldpose review</a>'
+        '<span>&rsaquo;</span><span aria-current="page">Status</span></nav>'
+        f'<div class="right"><a href="/">Pending review</a>{link}</div></header>'
+        f"<main><h1>Matches <small>{escape(said)}</small></h1>"
+        f"{table}{_inbox(arrivals)}{details}</main></body></html>"
     )
 
 
-def _row(
-    match: MatchStatus, stages: Sequence[str], arrived: Mapping[str, Arrival], dashboard: str
-) -> str:
-    name = escape(match.match_id)
-    review = f'<a href="/#/match/{quote(match.match_id, safe="")}">{name}</a>'
-    arrival = arrived.get(match.match_id)
-    if dashboard and arrival is not None and arrival.flow_run:
-        link = f"{dashboard}/runs/flow-run/{quote(arrival.flow_run, safe='')}"
-        review += f' <small><a href="{escape(link)}">run</a></small>'
+def _row(row: StatusRow, stages: Sequence[str]) -> str:
+    match, name = row.match, quote(row.match.match_id, safe="")
+    links = []
+    if match.latest is not None and match.latest.state == "complete":
+        links.append(f'<a href="/api/matches/{name}/results/report">report</a>')
+    if row.prefect:
+        links.append(f'<a href="{escape(row.prefect)}">Prefect</a>')
+    title = f'<a href="/#/match/{name}">{escape(match.match_id)}</a>'
+    if links:
+        title += f"<br><small>{' · '.join(links)}</small>"
     state = f'<span class="state">{escape(match.state)}</span>'
+    if row.at_work is not None and row.at_work["state"] == "running":
+        state = _at_work(row.at_work)
     if match.latest is not None:
         run = match.latest
         state += f"<br><small>{escape(run.run_id)}, {_time(run.seconds)}, {run.gates}</small>"
+        state += f"<br><small>{match.cost}</small>"
     if match.problem:
         cells = f'<td class="failed" colspan="{max(1, len(stages))}">{escape(match.problem)}</td>'
     else:
         cells = "".join(_cell(match.stages.get(stage, ())) for stage in stages)
-    return f"<tr><td>{review}</td><td>{state}</td>{cells}</tr>"
+    return f'<tr><td class="match">{title}</td><td class="run">{state}</td>{cells}</tr>'
+
+
+def _at_work(run: Mapping[str, Any]) -> str:
+    """Render the run at work: percent, and what it does, with the time left."""
+    percent = float(run.get("percent", 0.0))
+    said = " ".join(run.get("lines", ()))
+    if not percent:
+        return f'<span class="state">at work</span><br><small>{escape(said)}</small>'
+    bar = f'<progress max="100" value="{percent:.0f}"></progress>'
+    return f'<span class="state">{percent:.0f} %</span> {bar}<br><small>{escape(said)}</small>'
 
 
 def _cell(units: Sequence[UnitSummary]) -> str:
     """Render one stage of a match: the worst unit state, units done, computation time."""
     if not units:
-        return "<td></td>"
+        return '<td class="cell"></td>'
     counts = Counter(unit.state for unit in units)
     worst = next(state for state in WORST_FIRST if counts[state])
     seconds = sum(unit.seconds or 0.0 for unit in units)
     others = [f"{counts[state]} {state}" for state in WORST_FIRST[:-1] if counts[state]]
-    words = "<br>".join([f"{counts['done']}/{len(units)} done", *others])
+    words = "<br>".join([f"{counts['done']}/{len(units)}", *others])
     since = [age(unit.waiting_since) for unit in units if unit.state == "waiting"]
-    waits = f", for {_time(max(since))}" if since else ""
+    waits = f"<br>for {_time(max(since))}" if since else ""
     took = f"<br><small>{_time(seconds)}</small>" if seconds else ""
-    return f'<td class="{worst}">{words}{waits}{took}</td>'
+    return f'<td class="cell"><span class="{worst}">{words}{waits}{took}</span></td>'
 
 
 def _details(match: MatchStatus) -> str:
     """Render a match's units, stage by stage."""
     rows = "".join(
         f"<tr><td>{escape(stage.replace('_', ' '))}</td><td>{escape(unit.unit)}</td>"
-        f'<td class="{unit.state}">{unit.state}</td>'
+        f'<td><span class="unit {unit.state}">{unit.state}</span></td>'
         f'<td class="n">{"" if unit.seconds is None else _time(unit.seconds)}</td>'
         f"<td><small>{escape(_describe_unit(unit))}</small></td></tr>"
         for stage, unit in match.units
@@ -182,13 +246,17 @@ def _inbox(arrivals: Iterable[Arrival]) -> str:
     return f'<h2>Inbox</h2><div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
 
 
-def _as_json(match: MatchStatus) -> dict[str, Any]:
+def _as_json(match: MatchStatus, at_work: Mapping[str, Any] | None, prefect: str) -> dict[str, Any]:
     return {
         "match": match.match_id,
         "state": match.state,
         "problem": match.problem,
         "run": None if match.latest is None else match.latest.run_id,
         "seconds": None if match.latest is None else match.latest.seconds,
+        "at_work": at_work,
+        "prefect": prefect,
+        "core_hours": match.cost.core_hours,
+        "bytes": match.cost.bytes,
         "stages": {
             stage: [
                 {

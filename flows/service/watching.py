@@ -27,11 +27,12 @@ from prefect.client.schemas.objects import State, StateType
 from prefect.deployments import arun_deployment
 
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
+from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
 from flows.service.metrics import ProjectFigures, metrics_server
 from flows.service.overview import Overview
-from flows.service.plan import ServePlan
-from flows.service.recovery import begin_again, may_begin_again
+from flows.service.plan import ServePlan, deployment_names
+from flows.service.recovery import begin_again, may_begin_again, name_scheduled_runs
 from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
@@ -64,11 +65,13 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    teller = AlertDispatcher(plan.state_folder, senders_of(os.environ))
+    teller = AlertDispatcher(
+        plan.state_folder, senders_of(os.environ, plan.state_folder.alert_settings)
+    )
     await asyncio.gather(  # each at its own interval: none blocks another
         _watch_bucket(plan),
         _watch_inbox(plan),
-        _begin_lost_runs_again(plan),
+        _begin_lost_runs_again(plan, store),
         _watch_alerts(plan, store, teller),
         *(_deliver(teller, sender) for sender in teller.senders),
     )
@@ -139,9 +142,12 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
     )
 
 
-async def _begin_lost_runs_again(plan: ServePlan) -> None:
-    trouble = Trouble("looking for lost runs")
+async def _begin_lost_runs_again(plan: ServePlan, store: Store) -> None:
+    trouble, naming = Trouble("looking for lost runs"), Trouble("naming runs and matches")
     while True:
+        with naming.log_failure():
+            await name_scheduled_runs(plan)
+            await offer_matches(plan, await asyncio.to_thread(store.matches))
         await asyncio.sleep(ALERT_SECONDS)
         with trouble.log_failure():
             await begin_again(plan)
@@ -177,10 +183,18 @@ async def failed_runs(plan: ServePlan) -> list[FailedRun]:
     async with get_client() as client:
         runs = await client.read_flow_runs(
             flow_run_filter=FlowRunFilter(state=FlowRunFilterState(type=bad), end_time=since),
-            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[plan.name])),
+            deployment_filter=DeploymentFilter(
+                name=DeploymentFilterName(any_=deployment_names(plan.name))
+            ),
         )
     return [
-        FailedRun(str(run.id), run.name, str(run.state_name).lower(), _describe_state(run.state))
+        FailedRun(
+            str(run.id),
+            run.name,
+            str(run.state_name).lower(),
+            _describe_state(run.state),
+            str(run.parameters.get("match_id") or ""),
+        )
         for run in runs
         if not may_begin_again(run)
     ]

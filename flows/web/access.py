@@ -7,12 +7,18 @@ import hashlib
 import hmac
 import json
 import secrets
+import stat
 import time
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from threading import Lock
-from typing import Final
+from typing import Annotated, Final, Literal
 
+from pydantic import Field, ValidationError
+
+from data_contracts.records import Record
 from flows.web.host_guard import LOOPBACK as LOOPBACK
 from worldpose.errors import UsageError
 
@@ -29,6 +35,63 @@ MOST_REMEMBERED: Final = 10_000
 """Wrong tokens and ended sessions that are remembered, the latest."""
 
 
+Role = Literal["viewer", "annotator", "approver"]
+"""viewer: sees all; annotator: also corrects; approver: also decides, runs and adds matches."""
+EDITING: Final = ("/corrections", "/withdrawals", "/acceptances")
+"""Suffixes of the paths by which an annotator changes something."""
+OF_ALL: Final = ("/api/logout", "/preview")
+"""Suffixes of the paths that change nothing of the project."""
+
+
+class User(Record):
+    """Entry of a file of users, under the person's name."""
+
+    role: Role
+    """What the person may do."""
+    token: str = Field(min_length=TOKEN_LENGTH)
+    """The person's own login token."""
+
+
+class UserFile(Record):
+    """users.toml: the people who may log in; without it, everybody with the one token may."""
+
+    users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User]
+    """Name to role and token."""
+
+
+def read_users(file: Path) -> Mapping[str, User]:
+    """Return the people of a file, by name.
+
+    Raises:
+        UsageError: it is missing or malformed, other users of the machine can read it, or two
+            people have the same token.
+    """
+    problem = ""
+    try:
+        if stat.S_IMODE(file.stat().st_mode) & 0o077:
+            problem = "one that others can read: chmod 600"
+        users = UserFile.model_validate(tomllib.loads(file.read_text(encoding="utf-8"))).users
+        if len({user.token for user in users.values()}) < len(users):
+            problem = "the same token of two people"
+        elif not all(name.isprintable() for name in users):
+            problem = "a name with characters that cannot be printed"
+    except OSError as error:
+        problem = str(error.strerror)
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    except ValueError:  # neither TOML nor UTF-8; its message can quote a token
+        problem = "something else, which may hold a token"
+    if problem:
+        raise UsageError(
+            f"--users {file}",
+            expected="tables [users.NAME] with role and token, readable by its owner alone",
+            found=problem,
+            todo="Correct the file; docs/how-to/review.md has an example.",
+        )
+    return users
+
+
 @dataclass(frozen=True)
 class Access:
     """Login token and sessions of the pages.
@@ -42,11 +105,14 @@ class Access:
         hosts: names under which browsers reach the server; any other name is a foreign one that
             points here.
         secure: whether pages are served with TLS.
+        users: people with a role and a token of their own, by name; None = everybody with the login
+            token is an approver.
     """
 
     token: str
     hosts: frozenset[str] = LOOPBACK
     secure: bool = False
+    users: Mapping[str, User] | None = None
     _ended: dict[str, float] = field(default_factory=dict, init=False, compare=False)
     _wrong: list[tuple[float, str]] = field(default_factory=list, init=False, compare=False)
     _lock: Lock = field(default_factory=Lock, init=False, compare=False)
@@ -59,7 +125,8 @@ class Access:
     def session(self, who: str, now: float | None = None) -> str:
         """Return a new session for `who`, as the cookie's value."""
         until = (time.time() if now is None else now) + SESSION_SECONDS
-        content = json.dumps({"who": who, "until": until, "nonce": secrets.token_hex(8)})
+        parts = {"who": who, "own": self._sign_own(who), "until": until}
+        content = json.dumps({**parts, "nonce": secrets.token_hex(8)})
         packed = base64.urlsafe_b64encode(content.encode()).decode().rstrip("=")
         return f"{packed}.{self._sign('session', packed)}"
 
@@ -69,6 +136,8 @@ class Access:
         if not self._same(signature, self._sign("session", packed)):
             return None
         content = json.loads(base64.urlsafe_b64decode(packed + "=" * (-len(packed) % 4)))
+        if content.get("own") != self._sign_own(content["who"]):  # also one of an earlier version
+            return None
         if content["until"] < (time.time() if now is None else now) or signature in self._ended:
             return None
         return str(content["who"])
@@ -100,9 +169,31 @@ class Access:
         """Return whether this is the session's form secret, in constant time."""
         return self._same(given, self.form_secret(session))
 
-    def has_token(self, given: str) -> bool:
-        """Return whether this is the token, in constant time."""
-        return self._same(given, self.token)
+    def has_token(self, who: str, given: str) -> bool:
+        """Return whether this is the person's token, in constant time."""
+        if self.users is None:
+            return self._same(given, self.token)
+        user = self.users.get(who)
+        return self._same(given, self.token if user is None else user.token) and user is not None
+
+    def role(self, who: str | None) -> Role:
+        """Return the role of a person who has logged in."""
+        user = None if self.users is None or who is None else self.users.get(who)
+        return "approver" if user is None else user.role
+
+    def may_change(self, who: str | None, path: str) -> bool:
+        """Return whether the person's role allows a request that changes what `path` names."""
+        role = self.role(who)
+        if role == "approver" or path.endswith(OF_ALL):
+            return True
+        return role == "annotator" and path.endswith(EDITING)
+
+    def _sign_own(self, who: str) -> str | None:
+        """Return what a session holds of the person; None if nobody of the name may log in."""
+        if self.users is None:
+            return ""
+        user = self.users.get(who)
+        return None if user is None else self._sign("own", user.token)
 
     def _sign(self, *parts: str) -> str:
         text = "\n".join(parts).encode()
@@ -113,7 +204,14 @@ class Access:
         return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), right.encode())
 
 
-def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bool) -> Access:
+def access_for(
+    host: str,
+    *,
+    token: str | None,
+    names: Iterable[str],
+    secure: bool,
+    users: Path | None = None,
+) -> Access:
     """Create the access control of a server that listens at `host`.
 
     Args:
@@ -121,10 +219,11 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
         token: chosen token; None = a random one, printed when the server starts.
         names: further names of the machine that browsers use.
         secure: whether TLS is used.
+        users: file of the people who may log in; None = everybody with the token.
 
     Raises:
-        UsageError: the token is short, or the server would listen to other machines without a
-            chosen token or without a name.
+        UsageError: the file or the token is not valid, or the server would listen to other
+            machines without a chosen token or without a name.
     """
     if token is not None and len(token) < TOKEN_LENGTH:
         raise UsageError(
@@ -133,9 +232,10 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
             found=f"{len(token)}",
             todo="Create a token with: openssl rand -hex 16.",
         )
+    people = None if users is None else read_users(users)
     hosts = {name.lower() for name in (*LOOPBACK, *names, host)} - {"0.0.0.0", "::"}
     if host not in LOOPBACK:
-        if token is None:
+        if token is None and people is None:
             raise UsageError(
                 f"--host {host}",
                 expected="WORLDPOSE_REVIEW_TOKEN, which people log in with from other machines",
@@ -149,4 +249,4 @@ def access_for(host: str, *, token: str | None, names: Iterable[str], secure: bo
                 found="none",
                 todo="Add the name, as in --host-name review.example.org.",
             )
-    return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure)
+    return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure, people)

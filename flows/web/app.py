@@ -127,7 +127,7 @@ def _sessions(context: PageContext) -> APIRouter:
                 status_code=429,
                 headers={"retry-after": "10"},
             )
-        if not access.has_token(given.token):
+        if not access.has_token(given.who, given.token):
             access.note_wrong(address)
             return JSONResponse({"error": "this is not the token"}, status_code=401)
         request.state.who = given.who
@@ -152,7 +152,8 @@ def _sessions(context: PageContext) -> APIRouter:
     @router.get("/api/session")
     def session(request: Request, who: Person) -> dict[str, str]:
         secret = access.form_secret(request.state.session)
-        return {"who": who, "form_secret": secret, "project": context.store.url}
+        role = access.role(who)
+        return {"who": who, "role": role, "form_secret": secret, "project": context.store.url}
 
     return router
 
@@ -306,6 +307,8 @@ class Guard:
             return refusal(401, "log in first")
         if method in SAFE:
             return None
+        if path not in OPEN and not self.access.may_change(who, path):
+            return refusal(403, f"the role of {who}, {self.access.role(who)}, does not allow this")
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
             return refusal(403, "this comes from a page of another server")
         if headers.get("content-type", "").partition(";")[0] != "application/json":

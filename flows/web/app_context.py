@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Annotated, Any
@@ -15,6 +16,13 @@ from fastapi import Depends, HTTPException, Request
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
+from flows.service.match_runs import (
+    AT_WORK,
+    QUEUED,
+    MatchRun,
+    UnreachablePrefectError,
+    match_runs_of,
+)
 from flows.stage import Match
 from flows.web.access import Access
 from worldpose.store import Store
@@ -59,85 +67,184 @@ Person = Annotated[str, Depends(_person)]
 _COMMAND = [sys.executable, "-c", "from flows.cli import main; main()", "run"]
 LAST_LINES = 12
 """Lines of a run's output that a page shows."""
-
-
-@dataclass
-class _Run:
-    process: subprocess.Popen[bytes]
-    said: Path
+FRESH_SECONDS = 2.0
+"""Maximum age of Prefect's answer that pages show [s]."""
 
 
 @dataclass
 class Continuing:
-    """Runs started from a page: at most one per match, each in its own process.
+    """Runs that pages start: of a served project by its deployment, as all other runs of it.
 
-    A run survives the end of the pages' server; a killed run is handled like any killed run.
+    Without a service there is no worker: the pages run one match after another, each by `worldpose
+    run` in its own process, which survives the end of the pages.
 
     Attributes:
         store: the project.
     """
 
     store: Store
-    _runs: dict[str, _Run] = field(default_factory=dict)
-    _once_more: set[str] = field(default_factory=set)
+    _local: LocalRuns = field(init=False)
+    _seen: _Seen | None = None
     _lock: Lock = field(default_factory=Lock)
 
+    def __post_init__(self) -> None:
+        self._local = LocalRuns(self.store)
+
     def go_on(self, match_id: str, gates: str | None = None) -> dict[str, Any]:
-        """Resume the match's suspended runs, or start `worldpose run`; return which of the two.
+        """Resume the match's suspended runs, or start one; return which of the two.
 
         Args:
             match_id: a registered match.
-            gates: gate policy of a match's first run; None = the command line's default.
+            gates: gate policy of the run; None = the default.
 
         Raises:
             InputError: a suspended run has undecided reviews.
+            UnreachablePrefectError: Prefect does not answer.
         """
         with self._lock:
-            if self._at_work(match_id):
-                # It can have created its review requests already, and miss new verdicts.
-                self._once_more.add(match_id)
-                return {"state": "running", "how": "once more when the run at work has ended"}
-            if has_server():
+            served = match_runs_of(self.store.url)
+            if served is None:
+                if has_server():
+                    resumed = resume(self.store, open_for_review(self.store, match_id))
+                    if resumed:
+                        return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"}
+                return self._local.go_on(match_id, gates)
+            states = {run.state for run in served.active() if run.match_id == match_id}
+            self._seen = None
+            if "PAUSED" in states:
                 resumed = resume(self.store, open_for_review(self.store, match_id))
                 if resumed:
                     return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"}
-            self._start(match_id, gates)
-            return {"state": "running", "how": "worldpose run"}
+            if states & set(QUEUED):
+                return {"state": "running", "how": "a run of it waits for its turn already"}
+            # A run at work may have missed what was decided or corrected a moment ago.
+            run = served.start(match_id, gates=gates)
+            how = "once more when the run at work has ended" if states else "the deployment"
+            return {"state": "running", "how": how, "prefect": run.link}
 
     def state(self, match_id: str) -> dict[str, Any] | None:
-        """Return the state of the last run that was started here; None if there was none."""
-        run = self._runs.get(match_id)
-        if run is None:
+        """Return the state of the match's run, or of the last one if that failed; else None."""
+        try:
+            seen = self._look()
+        except UnreachablePrefectError as error:
+            return {"state": "unknown", "code": 1, "lines": [str(error)]}
+        if seen is None:
+            return self._local.state(match_id)
+        own = [run for run in seen.active if run.match_id == match_id and run.state != "PAUSED"]
+        if own:
+            run = next((each for each in own if each.state in AT_WORK), own[0])
+            percent, doing = seen.progress.get(run.id, (0.0, run.message))
+            lines = [doing] if doing else []
+            if run.state in QUEUED:
+                ahead = [each for each in seen.active[: seen.active.index(run)] if each.is_ahead]
+                lines = [f"waits for its turn; {len(ahead)} runs are before it"]
+            return {"state": "running", "lines": lines, "percent": percent, "prefect": run.link}
+        last = seen.latest.get(match_id)
+        if last is None or last.state not in ("FAILED", "CRASHED"):
             return None
-        code = run.process.poll()
-        lines = run.said.read_text(errors="replace").splitlines()[-LAST_LINES:]
-        return {"state": "running" if code is None else "ended", "code": code, "lines": lines}
+        return {"state": "ended", "code": 1, "lines": [last.message], "prefect": last.link}
 
-    def _start(self, match_id: str, gates: str | None) -> None:
-        folder = Path(tempfile.mkdtemp(prefix="worldpose-run-"))
-        said = folder / "output.txt"
-        command = [*_COMMAND, match_id, "--project", self.store.url]
-        if gates is not None:
-            command += ["--gates", gates]
-        with said.open("wb") as output:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        self._runs[match_id] = _Run(process, said)
-        Thread(target=self._watch, args=[match_id, process], daemon=True).start()
+    def links(self) -> dict[str, str]:
+        """Return the page of each match's latest run at Prefect; empty without an answer."""
+        try:
+            seen = self._look()
+        except UnreachablePrefectError:
+            return {}
+        return {} if seen is None else {each: run.link for each, run in seen.latest.items()}
 
-    def _watch(self, match_id: str, process: subprocess.Popen[bytes]) -> None:
-        """Start the run again if that was requested while it was running."""
-        process.wait()
+    def _look(self) -> _Seen | None:
+        """Return the runs of the service, of the last seconds; None without a service.
+
+        Raises:
+            UnreachablePrefectError: Prefect does not answer, or did not a moment ago.
+        """
+        served = match_runs_of(self.store.url)
+        if served is None:
+            return None
+        if self._seen is None or time.monotonic() - self._seen.at > FRESH_SECONDS:
+            once = replace(served, tries=1)
+            try:
+                latest = {run.match_id: run for run in reversed(once.latest())}
+                seen = _Seen(time.monotonic(), once.active(), latest, once.progress())
+            except UnreachablePrefectError as error:
+                seen = _Seen(time.monotonic(), [], {}, {}, error)
+            self._seen = seen
+        if self._seen.problem is not None:
+            raise self._seen.problem
+        return self._seen
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Runs of the service at a time of the monotonic clock [s]."""
+
+    at: float
+    active: list[MatchRun]
+    latest: dict[str, MatchRun]
+    progress: dict[str, tuple[float, str]]
+    problem: UnreachablePrefectError | None = None
+
+
+@dataclass
+class LocalRuns:
+    """Runs of pages without a service, one after another.
+
+    Attributes:
+        store: the project.
+    """
+
+    store: Store
+    _waiting: list[tuple[str, str | None]] = field(default_factory=list)
+    _at_work: str | None = None
+    _ended: dict[str, tuple[int, Path]] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def go_on(self, match_id: str, gates: str | None) -> dict[str, Any]:
+        """Run the match when all earlier ones have ended, also if it is the one at work."""
         with self._lock:
-            if match_id in self._once_more:
-                self._once_more.discard(match_id)
-                self._start(match_id, None)
+            if self._at_work is None:
+                self._at_work = match_id
+                Thread(target=self._run_all, args=[match_id, gates], daemon=True).start()
+                return {"state": "running", "how": "worldpose run"}
+            if match_id not in dict(self._waiting):
+                self._waiting.append((match_id, gates))
+            # The run at work can have missed what was decided a moment ago.
+            is_same = self._at_work == match_id
+            how = "once more when the run at work has ended"
+            return {"state": "running", "how": how if is_same else f"after {self._at_work}"}
 
-    def _at_work(self, match_id: str) -> bool:
-        run = self._runs.get(match_id)
-        return run is not None and run.process.poll() is None
+    def state(self, match_id: str) -> dict[str, Any] | None:
+        """Return the state of the match's last run that was started here; None without one."""
+        with self._lock:
+            if match_id == self._at_work:
+                return {"state": "running", "lines": []}
+            if match_id in dict(self._waiting):
+                return {"state": "running", "lines": [f"waits for the run of {self._at_work}"]}
+            ended = self._ended.get(match_id)
+        if ended is None:
+            return None
+        code, said = ended
+        lines = said.read_text(errors="replace").splitlines()[-LAST_LINES:]
+        return {"state": "ended", "code": code, "lines": lines}
+
+    def _run_all(self, match_id: str, gates: str | None) -> None:
+        while True:
+            said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
+            command = [*_COMMAND, match_id, "--project", self.store.url]
+            if gates is not None:
+                command += ["--gates", gates]
+            with said.open("wb") as output:
+                code = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                ).wait()
+            with self._lock:
+                self._ended[match_id] = (code, said)
+                if not self._waiting:
+                    self._at_work = None
+                    return
+                match_id, gates = self._waiting.pop(0)
+                self._at_work = match_id

@@ -177,6 +177,6 @@ def test_an_interrupted_run_ends_at_once_and_says_how_to_go_on(number, tiny, tmp
     assert process.returncode not in (0, None)
     assert "Traceback" not in said, said
     if number == signal.SIGINT:
-        assert "run again to resume" in said
+        assert "kept; the same command continues" in said
         assert process.returncode == 128 + number
     succeed("run", tiny, "--project", tmp_path / "worldpose-data", "--until", "tracking")

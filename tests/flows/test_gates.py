@@ -294,7 +294,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
     answer = worldpose("run", tiny, "--gates", "auto", *at)
     assert answer.code == 3
     assert "6 reviews pending:" in answer.out
-    assert f"next: worldpose review list {TINY}" in answer.out
+    assert "next: worldpose review serve, to decide; then worldpose run" in answer.out
 
     def say(*arguments):
         """Return the output of a command, run in this process to save seconds."""

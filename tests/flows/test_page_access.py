@@ -307,3 +307,94 @@ def test_every_change_is_logged_with_who_and_what_came_of_it(ada, caplog):
         "nobody: 'POST /api/login': 401",
         "Bob: 'POST /api/login': 200",
     ]
+
+
+USERS = """
+[users.Vera]
+role = "viewer"
+token = "the token of Vera.."
+[users.Ann]
+role = "annotator"
+token = "the token of Ann..."
+[users."Åke Ö"]
+role = "approver"
+token = "the token of Åke..."
+"""
+
+
+def users_file(folder, text=USERS, mode=0o600):
+    file = folder / "users.toml"
+    file.write_text(text, encoding="utf-8")
+    file.chmod(mode)
+    return file
+
+
+def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
+    def access():
+        file = tmp_path / "users.toml"
+        return access_for("127.0.0.1", token=TOKEN, names=(), secure=False, users=file)
+
+    users_file(tmp_path)
+    served = create_app(str(project_copy), access())
+
+    def enter(who, token):
+        person = page_client.browser(served)
+        answer = person.post("/api/login", json={"who": who, "token": token})
+        if answer.status_code != 200:
+            return None
+        session = person.get("/api/session").json()
+        assert session["who"] == who
+        person.headers["x-form-secret"] = session["form_secret"]
+        return person, session["role"]
+
+    assert enter("Vera", "the token of Ann...") is None
+    assert enter("Vera", TOKEN) is None  # the server's own token lets nobody in
+    assert enter("Eve", TOKEN) is None
+    vera, role = enter("Vera", "the token of Vera..")
+    assert role == "viewer"
+    ann, role = enter("Ann", "the token of Ann...")
+    assert role == "annotator"
+    ake, role = enter("Åke Ö", "the token of Åke...")
+    assert role == "approver"
+    name, was = a_click(vera)
+    edit = moved(name, was, [was[0] + 1.0, was[1]])
+    refusal = vera.post(f"{MATCH}/corrections", json=edit)
+    assert refusal.status_code == 403 and "viewer" in refusal.json()["error"]
+    assert ann.post(f"{MATCH}/corrections", json=edit).status_code == 200
+    *_, last = read_journal(Store.open(str(project_copy)), TINY).records
+    assert last.who == "Ann"
+    changing = {path for method, path in every_route(served) if method != "GET"} - OPEN
+    for path in changing - {"/api/logout"}:
+        is_preview = path.endswith("/preview")
+        is_edit = path.endswith(("/corrections", "/withdrawals", "/acceptances"))
+        codes = [each.post(path, json={"no": 1}).status_code for each in (vera, ann, ake)]
+        may = [is_preview, is_preview or is_edit, True]
+        assert [code != 403 for code in codes] == may, path
+    assert vera.get(MATCH).status_code == 200
+    # A session ends with the person's entry, or with another token of the person.
+    before = access()
+    session = before.session("Ann")
+    assert before.person(session) == "Ann"
+    users_file(tmp_path, USERS.replace("of Ann...", "of Ann, new"))
+    assert access().person(session) is None
+    users_file(tmp_path, USERS.replace("Ann", "Anne"))
+    assert access().person(session) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "problem"),
+    [
+        (USERS, 0o640, "others can read"),
+        ("[users.A]\nrole = 'king'\ntoken = 'a secret, long enough'", 0o600, "users.A.role"),
+        ("[users.A]\nrole = 'viewer'\ntoken = 'short'", 0o600, "users.A.token"),
+        ("users.A = secret", 0o600, "may hold a token"),
+        (USERS.replace("of Ann...", "of Vera.."), 0o600, "same token"),
+        (USERS.replace("Vera]", '"V\\n"]'), 0o600, "printed"),
+    ],
+)
+def test_a_bad_file_of_users_is_refused_without_its_tokens(text, mode, problem, tmp_path):
+    with pytest.raises(UsageError, match=problem) as refusal:
+        access_for(
+            "127.0.0.1", token=None, names=(), secure=False, users=users_file(tmp_path, text, mode)
+        )
+    assert "the token of" not in str(refusal.value) and "a secret" not in str(refusal.value)

@@ -1,8 +1,27 @@
 """Progress reports of a running run."""
 
-import pytest
+import io
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
 
-from flows.progress import MOST_TOLD, Reporter
+import pytest
+from command_line import TINY, WORLDPOSE, worldpose
+from rich.console import Console
+
+from flows import progress
+from flows.cli import console
+from flows.progress import MOST_TOLD, Reporter, in_time
+from flows.registering import open_match
+from flows.run_plan import plan_run
+from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
+from worldpose.store import Store
+from worldpose.store.documents import seal
 
 
 class Heard(Reporter):
@@ -33,3 +52,136 @@ def test_every_failure_is_told_of_and_counts(caplog):
         heard.unit_failed(f"ingest/c{number}", "why")
     assert heard.left == 0
     assert len([each for each in caplog.records if each.levelname == "ERROR"]) == 1000
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The monotonic clock, which a test sets."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
+    heard = Heard()
+    heard.run_planned({"ingest": 10.0, "tracking": 30.0})
+    assert heard.run_progress.share == 1.0  # no stage has begun, and nothing is asked for yet
+    heard.stage_started("ingest", "take in", units=4, missing=4)
+    assert heard.run_progress.share == 0.0 and heard.run_progress.seconds_left is None
+    clock[0] += 5.0
+    heard.unit_done("ingest/a", 5.0, {})
+    assert (heard.stage_progress.share, heard.stage_progress.seconds_left) == (0.25, 15.0)
+    assert heard.run_progress.share == pytest.approx(2.5 / 40.0)
+    assert heard.run_progress.seconds_left == pytest.approx(75.0)
+    for unit in "bcd":
+        heard.unit_done(f"ingest/{unit}", 5.0, {})
+    heard.stage_started("static_calibration", "all there", units=3, missing=0)
+    assert heard.run_progress.share == 0.25
+    clock[0] += 15.0
+    heard.stage_started("tracking", "who is who", units=2, missing=2)
+    heard.unit_failed("tracking/a", "why")
+    assert heard.run_progress.share == pytest.approx(25.0 / 40.0)
+    assert heard.run_progress.seconds_left == pytest.approx(20.0 * 15.0 / 25.0)
+    assert str(heard.run_progress) == "62 % 12 s"
+    heard.unit_done("tracking/b", 5.0, {})
+    assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 s"),
+        (99.4, "99 s"),
+        (99.6, "2 min"),
+        (5900.0, "98 min"),
+        (6000.0, "1.7 h"),
+        (4e5, "5 d"),
+    ],
+)
+def test_a_duration_is_short(seconds, text):
+    assert in_time(seconds) == text
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_a_unit_is_one_line_of_80_columns_with_metrics_only_if_asked_for(verbose, monkeypatch):
+    terminal = Console(width=80, force_terminal=True, record=True, file=io.StringIO())
+    monkeypatch.setattr(console, "errors", terminal)
+    reporter = console.ConsoleReporter(verbose=verbose)
+    reporter.run_planned({"broadcast_calibration": 7200.0, "tracking": 9e5})
+    reporter.stage_started("broadcast_calibration", "a " * 60, units=300, missing=200)
+    name = "broadcast_calibration/a_clip_with_a_name_of_many_characters"
+    reporter._began = reporter._stage_began = time.monotonic() - 7000.0
+    reporter.unit_done(name, 5432.1, {"clicks_wrong": 1.0, "cam01.error_px": 2.0})
+    lines = terminal.export_text().splitlines()
+    assert len(lines) == 3 + verbose
+    assert all(len(each) <= 80 for each in lines), lines
+    row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 2042 d$"
+    assert re.search(row, lines[2]), lines
+    assert ("clicks_wrong 1" in lines[-1]) == verbose
+
+
+def test_expected_work_comes_from_the_latest_run(project_copy):
+    store = Store.open(str(project_copy))
+    match, latest = open_match(store, TINY), latest_run(store, TINY)
+    units = [
+        each
+        for each in plan_run(store, match, {"tracking": {"gate_m": 0.7}})
+        if each.name.startswith("tracking/")
+    ]
+    key = latest.results["tracking/clip"]
+    seconds = store.manifest(TINY, "tracking", "clip", key).seconds
+    assert expected_work(store, units, latest) == {"tracking": pytest.approx(seconds)}
+    assert expected_work(store, units * 3, None) == {"tracking": 3.0 * UNIT_SECONDS["tracking"]}
+
+
+def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
+    store = Store.open(str(project_copy))
+    other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    run_id = store.reserve_run(TINY)
+    (mine,) = store.unfinished_runs(TINY)
+    require_no_other_run(store, TINY)  # it is this process's own
+    path = next(project_copy.rglob(f"{run_id}.open.json"))
+    try:
+        path.unlink()
+        theirs = mine.model_copy(update={"pid": other.pid, "started_at": datetime.now(UTC)})
+        store.blobs.put_new(str(path.relative_to(project_copy)), seal(theirs))
+        answer = worldpose("run", TINY, "--project", project_copy)
+        assert answer.code == 1
+        assert answer.err.count("\n") == 1, answer.err
+        assert f"found run {run_id}, process {other.pid}, since" in answer.err
+    finally:
+        other.communicate(b"\n")
+    require_no_other_run(store, TINY)  # its process has ended
+
+
+def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(server, tiny, tmp_path):
+    main, end = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80"}
+    environment.pop("PREFECT_API_URL")
+    command = [*WORLDPOSE, "run", str(tiny), "--project", str(tmp_path / "project")]
+    process = subprocess.Popen(
+        command, stdin=end, stdout=end, stderr=end, env=environment, start_new_session=True
+    )
+    os.close(end)
+    said = b""
+    try:
+        while b"ingest/cam00" not in said:
+            said += os.read(main, 65536)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: all processes of the group
+        while True:
+            try:
+                said += os.read(main, 65536)
+            except OSError:  # every process that had the terminal has ended
+                break
+        assert process.wait(60) == 130
+    finally:
+        process.kill()
+        os.close(main)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", said.decode())
+    last = text.replace("\r", "\n").rstrip().splitlines()[-1]
+    told = r"interrupted: \d+ new results? (is|are) kept; the same command continues"
+    assert re.fullmatch(told, last), text
+    kept = int(last.split()[1])
+    found = [path.parent.name for path in (tmp_path / "project").rglob("manifest.json")]
+    assert len(found) >= kept >= 1
+    assert "working" not in last and "Traceback" not in text and "leaked" not in text

@@ -1,8 +1,8 @@
 """Stale results of an edit, by match, found without a run."""
 
 import json
-import sys
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 from command_line import TINY, succeed
@@ -23,16 +23,9 @@ from flows.run_status import run_status
 from flows.running import RunRequest
 from flows.service import deployed
 from flows.stages.tracking import STAGE
-from worldpose.errors import InputError
+from worldpose.errors import InputError, WorldposeError
 from worldpose.store import ResultId, Store
 from worldpose.store.paths import record_path
-
-FLOW = [
-    sys.executable,
-    "-c",
-    "import json, sys; from flows.service.deployed import reprocess as flow; "
-    "print(json.dumps(flow(sys.argv[1])))",
-]
 
 
 @pytest.fixture
@@ -245,11 +238,47 @@ def test_a_match_that_fails_stops_no_other(store, tiny, tmp_path, monkeypatch):
         ("complete", None),
     ]
     assert exit_code(second) == 4
-    with pytest.raises(deployed.UnprocessedError, match="halves is failed: its folder is gone"):
-        deployed.reprocess.fn(store.url)
     rehearsed = reprocess_matches(store, (TINY,), request, is_rehearsal=True)
     assert [each.state for each in rehearsed] == ["stale"]
-    assert len(ran) == 3
+    assert len(ran) == 2
+
+
+class Runs:
+    """A service's runs, one of which has not ended."""
+
+    def __init__(self, *at_work):
+        self.at_work, self.started = at_work, []
+
+    def active(self):
+        return [SimpleNamespace(match_id=each) for each in self.at_work]
+
+    def start(self, match_id, **given):
+        self.started.append((match_id, given))
+
+
+def test_the_deployment_starts_a_run_of_each_stale_match_in_the_background(store, monkeypatch):
+    runs = Runs()
+    monkeypatch.setattr(deployed, "match_runs_of", lambda url: runs)
+    assert deployed.reprocess.fn(store.url) == {TINY: "current"}
+    edit_box(store)
+    finish(store, gates="auto", overrides={"tracking": {"gate_m": 0.5}}, iteration=2)
+    assert deployed.reprocess.fn(store.url) == {TINY: "started"}
+    ((match_id, given),) = runs.started
+    assert match_id == TINY
+    assert given == {
+        "priority": "background",
+        "settings": {"tracking": {"gate_m": 0.5}},
+        "until_stage": None,
+        "gates": "auto",
+        "iterations": 2,
+        "time_limits": None,
+    }
+    runs.at_work = (TINY,)
+    assert deployed.reprocess.fn(store.url) == {TINY: "has a run"}
+    assert len(runs.started) == 1
+    monkeypatch.setattr(deployed, "match_runs_of", lambda url: None)
+    with pytest.raises(WorldposeError, match="is not served on this machine"):
+        deployed.reprocess.fn(store.url)
 
 
 def test_the_exit_code_says_how_far_it_came():
@@ -281,8 +310,3 @@ def test_reprocessing_computes_what_was_listed(server, store):
     assert store.run(TINY).parent == "0001"
     again = succeed("reprocess", "--project", store.url, "--json").json["matches"]
     assert [(each["state"], each["executed"]) for each in again] == [("untouched", [])]
-    # As a deployment does it.
-    edit_identity(store)
-    assert succeed(store.url, program=FLOW).json == {TINY: "complete"}
-    executed = store.run(TINY, "0003").executed
-    assert set(executed) == made_from(store, "tracking/clip")

@@ -21,8 +21,8 @@ pytestmark = pytest.mark.slow  # three servers, each started twice
 
 TOKEN = "a token for the served run"
 DEPLOYING = """
-from flows.match import process_match
-process_match.serve(name="reviewed", pause_on_shutdown=False)
+from flows.service.deployed import match
+match.serve(name="reviewed", pause_on_shutdown=False)
 """
 PATIENCE = 300.0
 """Maximum time for the start of a process and for a flow on two busy cores [s]."""

@@ -21,8 +21,8 @@ from worldpose.store import Store
 pytestmark = pytest.mark.slow  # five processes that import and serve, one after the other
 
 SERVING = """
-from flows.match import process_match
-process_match.serve(name="suspension", pause_on_shutdown=False)
+from flows.service.deployed import match
+match.serve(name="suspension", pause_on_shutdown=False)
 """
 PATIENCE = 240.0
 """Maximum time for the start and end of a flow's process on two busy cores [s]."""

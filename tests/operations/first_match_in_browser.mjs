@@ -25,7 +25,7 @@ const prefect = await open({ errors: [], outside: seen.outside }, 900);
 await prefect.goto(`${task.prefect}/runs`);
 await prefect.getByPlaceholder("admin:pass").fill(task.login);
 await prefect.getByRole("button", { name: "Login" }).click();
-const run = prefect.getByRole("link", { name: task.match, exact: true }).first();
+const run = prefect.getByRole("link", { name: `${task.match}, ` }).first();
 await run.waitFor({ timeout: 1000 * task.patience });
 note("run in the dashboard");
 await shot(prefect, "runs");

@@ -8,6 +8,7 @@ from email import message_from_bytes
 from threading import Thread
 
 import pytest
+from command_line import succeed, worldpose
 
 from flows.service.alerts import Alert, AlertDispatcher
 from flows.service.layout import StateFolder
@@ -181,3 +182,74 @@ def test_ways_are_named_by_the_environment_and_a_bad_one_says_no_secret():
         with pytest.raises(UsageError) as refused:
             senders_of({"WORLDPOSE_ALERT_MAIL": bad})
         assert "secret@" not in str(refused.value)
+
+
+FILE = """
+webhook = "{webhook}"
+
+[mail]
+server = "smtp://127.0.0.1:{port}"
+sender = "worldpose@example.org"
+receivers = ["ada@example.org", "bob@example.org"]
+"""
+
+
+def write_settings(project, text, mode=0o600):
+    file = StateFolder(project / "operations").alert_settings
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    file.chmod(mode)
+    return file
+
+
+def test_channels_of_a_file_get_a_test_alert_by_a_command(post_office, webhook, tmp_path):
+    project = tmp_path / "project"
+    server = post_office()
+    text = FILE.format(webhook=webhook.address, port=server.port)
+    file = write_settings(project, text)
+    command = ("serve", "--test-alerts", "--project", project)
+    answer = succeed(*command)
+    assert answer.out.splitlines() == [
+        "webhook: accepted a test alert",
+        "mail: accepted a test alert",
+    ]
+    ((_, posted),) = webhook.posted
+    assert posted["alert"] == "test" and "arrive here" in posted["text"]
+    (letter,) = server.letters
+    assert set(letter["to"]) == {"ada@example.org", "bob@example.org"}
+    assert letter["message"]["From"] == "worldpose@example.org"
+    # The environment comes first; a channel that fails is named, without its address.
+    webhook.codes = [403]
+    answer = worldpose(*command, "--json", environment={"WORLDPOSE_ALERT_URL": webhook.address})
+    assert (answer.code, answer.json["channels"]) == (1, {"webhook": "HTTPError 403", "mail": ""})
+    assert "secret" not in answer.out + answer.err
+    file.unlink()
+    answer = worldpose(*command)
+    assert answer.code == 2 and "found none" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "problem"),
+    [
+        ("webhook = 'http://h/'", 0o644, "mode 644"),
+        ("webhook = http://secret/", 0o600, "may hold a secret"),
+        ("hook = 'http://secret/'", 0o600, "hook"),
+        ("[mail]\nserver = 'smtp://h'\nreceivers = []", 0o600, "mail.receivers"),
+        ("[mail]\nserver = 'secret'\nreceivers = ['a@b']", 0o600, "may hold a secret"),
+        ("webhook = 'secret'", 0o600, "may hold a secret"),
+    ],
+)
+def test_a_bad_file_is_refused_without_its_secrets(text, mode, problem, tmp_path):
+    file = write_settings(tmp_path, text, mode)
+    with pytest.raises(UsageError, match=problem) as refused:
+        senders_of({}, file)
+    assert "http://secret" not in str(refused.value)
+    assert senders_of({}, tmp_path / "absent") == ()
+
+
+def test_a_login_of_the_file_may_have_any_characters(tmp_path):
+    login = "server = 'smtps://h:4650'\nuser = 'a@b'\npassword = 'p:/?#@ä'"
+    file = write_settings(tmp_path, f"[mail]\n{login}\nreceivers = ['c+d@e']")
+    (mail,) = senders_of({}, file)
+    assert (mail.host, mail.port, mail.user, mail.password) == ("h", 4650, "a@b", "p:/?#@ä")
+    assert (mail.sender, mail.receivers, mail.is_secure) == ("c+d@e", ("c+d@e",), True)

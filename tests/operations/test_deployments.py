@@ -4,6 +4,7 @@ import asyncio
 import importlib
 import os
 import re
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import uuid4
 
@@ -13,14 +14,18 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas.actions import DeploymentUpdate, WorkPoolUpdate
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
-from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
+from prefect.states import Cancelling, Completed, Crashed, Running, Scheduled, Suspended
 from prefect.workers.process import ProcessWorker
 
+from data_contracts.release import EXPORT_FORMATS
+from flows.method import METHOD
 from flows.service import recovery
 from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, RefusedRunError, install, require_installed
-from flows.service.plan import FLOWS, ServePlan
-from flows.service.recovery import begin_again
+from flows.service.forms import offer_matches
+from flows.service.match_runs import MatchRuns
+from flows.service.plan import FLOWS, ServePlan, deployment_name
+from flows.service.recovery import begin_again, name_scheduled_runs
 from flows.service.watching import failed_runs
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
@@ -51,7 +56,7 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
             pools = {name: await client.read_work_pool(name) for name in ("ops", "ops-arrivals")}
             queues = await client.match_work_queues([""], "ops")
             deployments = {
-                each.flow: await client.read_deployment_by_name(f"{each.flow}/ops")
+                each.flow: await client.read_deployment_by_name(f"{each.flow}/ops-{each.flow}")
                 for each in DEPLOYED
             }
         return pools, queues, deployments
@@ -83,7 +88,7 @@ def test_pools_and_deployments_that_were_changed_are_put_right(plan):
         async with get_client() as client:
             template = ProcessWorker.get_default_base_job_template()
             await client.update_work_pool("ops", WorkPoolUpdate(base_job_template=template))
-            match = await client.read_deployment_by_name("match/ops")
+            match = await client.read_deployment_by_name("match/ops-match")
             steps = [{"prefect.deployments.steps.run_shell_script": {"script": "id"}}]
             changed = DeploymentUpdate(entrypoint="os.system", pull_steps=steps)
             await client.update_deployment(match.id, changed)
@@ -91,7 +96,7 @@ def test_pools_and_deployments_that_were_changed_are_put_right(plan):
     async def look():
         async with get_client() as client:
             pool = await client.read_work_pool("ops")
-            return pool.base_job_template, await client.read_deployment_by_name("match/ops")
+            return pool.base_job_template, await client.read_deployment_by_name("match/ops-match")
 
     asyncio.run(change())
     installed = asyncio.run(install(plan))
@@ -101,6 +106,80 @@ def test_pools_and_deployments_that_were_changed_are_put_right(plan):
     assert (match.entrypoint, match.pull_steps) == ("flows.service.deployed.match", [])
     assert installed[match.id].entrypoint == match.entrypoint
     assert len(installed) == len(DEPLOYED)
+
+
+def test_forms_ask_for_typed_values_and_offer_choices(plan):
+    async def look():
+        async with get_client() as client:
+            found = [
+                await client.read_deployment_by_name(deployment_name("ops", flow)) for flow in FLOWS
+            ]
+        return {each.name: each.parameter_openapi_schema["properties"] for each in found}
+
+    asyncio.run(offer_matches(plan, ("lab", "away")))
+    forms = asyncio.run(look())
+    assert len(forms) == len(FLOWS)  # each deployment has a name of its own
+    match = forms["ops-match"]
+    assert match["match_id"]["enum"] == ["away", "lab"]
+    assert match["until_stage"]["enum"] == [stage.name for stage in METHOD]
+    assert set(match["gates"]["enum"]) == {"never", "auto", "always"}
+    assert forms["ops-release"]["formats"]["items"]["enum"] == list(EXPORT_FORMATS)
+    assert forms["ops-reprocess"]["matches"]["items"]["enum"] == ["away", "lab"]
+    for form in forms.values():
+        assert not {"project", "plan"} & set(form)  # a run must not change them
+        for field in form.values():
+            assert field.get("type") not in (None, "null") and "anyOf" not in field, field
+    asyncio.run(install(plan))
+    asyncio.run(offer_matches(plan, ()))
+    assert "enum" not in asyncio.run(look())["ops-match"]["match_id"]
+
+
+def test_runs_have_readable_names_of_their_own(plan, monkeypatch):
+    runs = MatchRuns(plan.prefect, "ops", os.environ["PREFECT_API_AUTH_STRING"])
+    run = runs.start("lab", priority="urgent", key="twice", gates="never")
+    assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", run.name)
+    assert runs.start("lab", key="twice").id == run.id
+    assert [each.id for each in runs.active() if each.match_id == "lab"] == [run.id]
+
+    async def scheduled():
+        async with get_client() as client:
+            ingest = await client.read_deployment_by_name(deployment_name("ops", "ingest"))
+            due = datetime.now(UTC) + timedelta(hours=1)
+            made = await client.create_flow_run_from_deployment(
+                ingest.id, name="macho-mongrel", state=Scheduled(scheduled_time=due)
+            )
+            real = recovery._runs
+
+            async def of_a_schedule(*given):
+                return [
+                    each.model_copy(update={"auto_scheduled": True}) for each in await real(*given)
+                ]
+
+            monkeypatch.setattr(recovery, "_runs", of_a_schedule)
+            await name_scheduled_runs(plan)
+            named = await client.read_flow_run(made.id)
+            await client.delete_flow_run(made.id)
+            await client.delete_flow_run(run.id)
+        return named, due
+
+    named, due = asyncio.run(scheduled())
+    assert named.name == f"inbox, {due.astimezone():%d %b %H:%M:%S}"
+
+
+def test_deployments_of_an_earlier_version_are_removed(plan):
+    async def leave():
+        async with get_client() as client:
+            match = await client.read_deployment_by_name(deployment_name("ops", "match"))
+            for project in (plan.project, "/elsewhere"):
+                name = "ops" if project == plan.project else "others"
+                given = {"project": project}
+                await client.create_deployment(match.flow_id, name=name, parameters=given)
+        await install(plan)
+        async with get_client() as client:
+            return [each.name for each in await client.read_deployments()]
+
+    names = asyncio.run(leave())
+    assert "ops" not in names and "others" in names
 
 
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
@@ -118,7 +197,7 @@ def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan
         run("match", match, job_variables={"stream_output": False}),
         run("ingest", arrivals),
         run("release", {"project": plan.project, "match_id": "m", "name": "v1", "licence": "any"}),
-        run("reprocess", {"project": plan.project, "dask": None, "workers": None}),
+        run("reprocess", {"project": plan.project, "retry": True}),
     ]
     for each in good:
         assert require_installed(each, installed).entrypoint.endswith(
@@ -137,13 +216,14 @@ def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan
             run("match", {**match, "project": "/another"}),
             run("match", {"match_id": "m", "settings": {}}),
             run("ingest", {"plan": {**arrivals["plan"], "inbox": "/etc"}}),
-            run("reprocess", {"project": plan.project, "dask": "tcp://evil:8786"}),
+            run("reprocess", {"project": "/another"}),
         ],
         "parameters": [
             run("match", {"project": plan.project, "settings": {}}),
             run("match", {**match, "unknown": 1}),
             run("match", {**match, "settings": "no mapping"}),
-            run("match", {**match, "iteration": "many"}),
+            run("match", {**match, "iterations": "many"}),
+            run("reprocess", {"project": plan.project, "dask": "tcp://evil:8786"}),
         ],
     }
     for reason, runs in bad.items():
@@ -189,7 +269,7 @@ def test_killed_runs_begin_again_and_no_others(plan, monkeypatch):
             "done": (Completed(), dead),
         }
         async with get_client() as client:
-            deployment = await client.read_deployment_by_name("match/ops")
+            deployment = await client.read_deployment_by_name("match/ops-match")
             for name, (state, pid) in states.items():
                 run = await client.create_flow_run_from_deployment(deployment.id, name=name)
                 await client.set_flow_run_state(run.id, state, force=True)
@@ -229,7 +309,7 @@ async def set_state(name, state):
 def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, monkeypatch):
     async def kill_thrice():
         async with get_client() as client:
-            deployment = await client.read_deployment_by_name("match/ops")
+            deployment = await client.read_deployment_by_name("match/ops-match")
             run = await client.create_flow_run_from_deployment(deployment.id, name="poison")
             for _ in range(3):
                 await client.set_flow_run_state(run.id, Running(), force=True)

@@ -72,7 +72,7 @@ class Told:
         return ("m",)
 
     def manifest(self, *place):
-        return SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES)
+        return SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES, files=())
 
     def unfinished_runs(self, match):
         return tuple(SimpleNamespace(run_id=run, started_at=at) for run, at in self.begun)

@@ -10,7 +10,12 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.states import Completed, Crashed, Failed, Pending, Running
 
 from flows.service import recovery
-from flows.service.recovery import MOST_BEGINNINGS, may_begin_again
+from flows.service.recovery import (
+    DEATHS,
+    MOST_BEGINNINGS,
+    MOST_SERVICE_DEATHS,
+    may_begin_again,
+)
 
 LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
 
@@ -29,6 +34,17 @@ def test_runs_begin_again_that_ended_by_no_fault_of_their_own(state, again):
     assert may_begin_again(run) is again
     tired = run.model_copy(update={"run_count": MOST_BEGINNINGS})
     assert not may_begin_again(tired)
+
+
+def test_a_start_that_ended_with_the_whole_service_does_not_count():
+    state = Crashed(message="its process was killed")
+    run = FlowRun(flow_id=uuid4(), state=state, state_type=state.type, run_count=MOST_BEGINNINGS)
+    assert not may_begin_again(run)
+    killed = run.model_copy(update={"labels": {DEATHS: 1}})
+    assert may_begin_again(killed)
+    assert not may_begin_again(killed.model_copy(update={"run_count": MOST_BEGINNINGS + 1}))
+    often = {"labels": {DEATHS: 99}, "run_count": MOST_BEGINNINGS + MOST_SERVICE_DEATHS}
+    assert not may_begin_again(run.model_copy(update=often))
 
 
 class Server:

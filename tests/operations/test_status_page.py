@@ -9,7 +9,7 @@ from command_line import TINY
 from data_contracts.operations import Arrival
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, Overview, UnitSummary
-from flows.service.status_page import STYLE, status_html
+from flows.service.status_page import STYLE, StatusRow, status_html
 from flows.web.access import access_for
 from flows.web.app import create_app
 from worldpose.store import Store
@@ -46,7 +46,10 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     assert "default-src 'none'" in page.headers["content-security-policy"]
     text = page.text
     assert f'<a href="/#/match/{TINY}">' in text
-    assert "6/6 done" in text
+    assert '<span class="done">6/6' in text
+    assert f'<a href="/api/matches/{TINY}/results/report">' in text
+    assert browser.get(f"/api/matches/{TINY}/results").json()["run"] == "0001"
+    assert "core hours, " in text
     assert "<script" not in text
     assert "&lt;script&gt;" in text
     assert browser.get("/status/page.css").text == STYLE
@@ -66,7 +69,7 @@ def test_a_match_that_cannot_be_read_hides_no_other(project_copy):
     damaged.write_bytes(damaged.read_bytes().replace(b"complete", b"complote"))
     (match,) = Overview(store).look()
     assert match.state == "unreadable"
-    text = status_html([match, MatchStatus("other")], [], "")
+    text = status_html([StatusRow(match), StatusRow(MatchStatus("other"))], [], "")
     assert "other" in text
     assert "0001.json" in text
 
@@ -78,11 +81,14 @@ def test_the_worst_state_of_a_stage_is_what_is_seen():
         UnitSummary("cam02", "failed", why=EVIL),
     )
     match = MatchStatus("m", stages={"ingest": units[:1], "static_calibration": units})
-    run = "1f2e"
-    text = status_html([match], [arrival(match_id="m", flow_run=run)], "http://127.0.0.1:4200")
-    assert '<td class="failed">1/3 done<br>1 failed<br>1 waiting' in text
-    assert '<td class="done">1/1 done' in text
-    assert f'href="http://127.0.0.1:4200/runs/flow-run/{run}"' in text
+    run = "http://127.0.0.1:4200/runs/flow-run/1f2e"
+    at_work = {"state": "running", "percent": 41.6, "lines": [f"tracking {EVIL}"]}
+    text = status_html([StatusRow(match, at_work, run)], [], "http://127.0.0.1:4200")
+    assert '<span class="failed">1/3<br>1 failed<br>1 waiting<br>for 0' in text
+    assert '<span class="done">1/1' in text
+    assert f'href="{run}"' in text and 'href="http://127.0.0.1:4200"' in text
+    assert '42 %</span> <progress max="100" value="42">' in text
+    assert "results/report" not in text  # no run of it is complete
     assert "<script" not in text
 
 

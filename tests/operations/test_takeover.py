@@ -95,7 +95,7 @@ def scheduled(command=None):
 
 
 def deployment_of(served, flow="ingest"):
-    return served.ask(f"/deployments/name/{flow}/worldpose")
+    return served.ask(f"/deployments/name/{flow}/worldpose-{flow}")
 
 
 def settle(served, runs):
@@ -437,7 +437,7 @@ def test_a_page_of_another_site_reads_and_does_nothing_in_a_browser(served, pwne
     create = f"/api/deployments/{deployment}/create_flow_run"
     given = {
         "read": {
-            "deployments": f"{at['prefect']}/api/deployments/name/ingest/worldpose",
+            "deployments": f"{at['prefect']}/api/deployments/name/ingest/worldpose-ingest",
             "health": f"{at['prefect']}/api/health",
             "ui": f"{at['prefect']}/ui-settings",
             "settings": f"{at['prefect']}/api/admin/settings",

@@ -1,0 +1,146 @@
+"""OpenLineage events of a run, made from the manifests of its results.
+
+Each computed or failed unit is a run of the job `<match>.<stage>.<unit>`; each result is a dataset
+with its key as version. Specification: https://openlineage.io/spec/2-0-2/OpenLineage.json.
+"""
+
+from __future__ import annotations
+
+import functools
+import http.client
+import json
+import logging
+import os
+import uuid
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import unquote, urlsplit
+
+from data_contracts.run import RunRecord
+from worldpose.store import Store
+
+LOG: Final = logging.getLogger("worldpose.run")
+URL: Final = "OPENLINEAGE_URL"
+"""Variable of OpenLineage's clients: `https://HOST`, or `file:///PATH` for a file of JSON lines."""
+SCHEMA: Final = "https://openlineage.io/spec/2-0-2/OpenLineage.json#/$defs/RunEvent"
+FACETS: Final = "https://openlineage.io/spec/facets"
+ANSWER_SECONDS: Final = 5.0
+"""Timeout of the receiver: a run waits for it once at most."""
+
+
+def tell_lineage(store: Store, record: RunRecord) -> None:
+    """Send the events of a recorded run to OPENLINEAGE_URL, if it is set.
+
+    A failure is logged and stops nothing.
+    """
+    address = os.environ.get(URL)
+    if not address:
+        return
+    try:
+        _send(address, [json.dumps(each) for each in lineage_events(store, record)])
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        LOG.warning("%s took not all lineage of %s: %s", URL, record.match_id, error)
+
+
+def lineage_events(store: Store, record: RunRecord) -> Iterator[dict[str, Any]]:
+    """Yield a START and a COMPLETE or FAIL event for each unit that a run computed or failed."""
+    for name in record.executed:
+        stage, _, unit = name.partition("/")
+        manifest = store.manifest(record.match_id, stage, unit, record.results[name])
+        end = manifest.created_at
+        start = end - timedelta(seconds=manifest.seconds)
+        used = manifest.recipe.inputs.items()
+        inputs = [_dataset(store, record, name_of_input, key) for name_of_input, key in used]
+        inputs += [_source(record, each) for each in sorted(manifest.recipe.sources)]
+        output = _dataset(store, record, name, manifest.key)
+        yield {**_event(store, record, name, "START", start), "inputs": inputs}
+        yield {
+            **_event(store, record, name, "COMPLETE", end),
+            "inputs": inputs,
+            "outputs": [output],
+        }
+    for failure in record.failed:
+        facet = {
+            "message": failure.message,
+            "programmingLanguage": "Python",
+            **_facet("1-0-1/ErrorMessageRunFacet"),
+        }
+        yield _event(store, record, failure.unit, "START", record.started_at)
+        event = _event(store, record, failure.unit, "FAIL", record.finished_at)
+        event["run"]["facets"]["errorMessage"] = facet
+        yield event
+
+
+def _event(store: Store, record: RunRecord, unit: str, kind: str, at: datetime) -> dict[str, Any]:
+    namespace = os.environ.get("OPENLINEAGE_NAMESPACE", "worldpose")
+    run = f"{store.url} {record.match_id} {record.run_id}"
+    job = f"{record.match_id}.{unit.replace('/', '.')}"
+    parent = {
+        "run": {"runId": _uuid(run)},
+        "job": {"namespace": namespace, "name": record.match_id},
+        **_facet("1-0-1/ParentRunFacet"),
+    }
+    return {
+        "eventType": kind,
+        "eventTime": at.isoformat(),
+        "run": {"runId": _uuid(f"{run} {unit}"), "facets": {"parent": parent}},
+        "job": {"namespace": namespace, "name": job},
+        "producer": _producer(),
+        "schemaURL": SCHEMA,
+    }
+
+
+def _dataset(store: Store, record: RunRecord, unit: str, key: str) -> dict[str, Any]:
+    facet = {"datasetVersion": key, **_facet("1-0-1/DatasetVersionDatasetFacet")}
+    namespace = store.url if "://" in store.url else f"file://{store.url}"
+    name = f"results/{record.match_id}/{unit}"
+    return {"namespace": namespace, "name": name, "facets": {"version": facet}}
+
+
+def _source(record: RunRecord, name: str) -> dict[str, Any]:
+    """Return a file or value of the match folder, without its place: it may move."""
+    return {"namespace": "worldpose.match", "name": f"{record.match_id}/{name}"}
+
+
+def _facet(name: str) -> dict[str, str]:
+    at, _, kind = name.partition("/")
+    return {"_producer": _producer(), "_schemaURL": f"{FACETS}/{at}/{kind}.json#/$defs/{kind}"}
+
+
+@functools.cache
+def _producer() -> str:
+    return f"https://pypi.org/project/worldpose/{version('worldpose')}"
+
+
+def _uuid(name: str) -> str:
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, name))
+
+
+def _send(address: str, events: list[str]) -> None:
+    parts = urlsplit(address)
+    if parts.scheme == "file":
+        with Path(unquote(parts.path)).open("a", encoding="utf-8") as file:
+            file.write("".join(f"{event}\n" for event in events))
+        return
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise ValueError("expected https://HOST, http://HOST or file:///PATH")
+    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+    endpoint = os.environ.get("OPENLINEAGE_ENDPOINT", "api/v1/lineage")
+    path = f"{parts.path.rstrip('/')}/{endpoint.lstrip('/')}"
+    headers = {"content-type": "application/json"}
+    key = os.environ.get("OPENLINEAGE_API_KEY")
+    if key:
+        headers["authorization"] = f"Bearer {key}"
+    connection = kind(parts.hostname, parts.port, timeout=ANSWER_SECONDS)
+    try:
+        for event in events:  # over one connection
+            connection.request("POST", path, event.encode(), headers)
+            answer = connection.getresponse()
+            answer.read()
+            if answer.status >= 300:
+                raise ValueError(f"it answers {answer.status}")
+    finally:
+        connection.close()

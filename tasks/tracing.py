@@ -1,0 +1,116 @@
+"""OpenTelemetry traces of runs, exported as the usual OTEL_* variables say.
+
+Prefect makes a span of each flow and task, and carries the trace from the flow to the workers. Our
+spans lie below the flow's: one for each stage, and one for each computed unit. Tracing is off, and
+nothing of it is imported, unless a variable names an exporter.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from importlib.metadata import entry_points
+from typing import Final
+
+LOG: Final = logging.getLogger("worldpose.run")
+ENDPOINTS: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+PROTOCOLS: Final = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
+FLUSH_MS: Final = 5000
+"""Maximum time for sending the last spans of a process [ms]."""
+
+
+def is_traced() -> bool:
+    """Return whether the environment names an exporter of traces."""
+    exporter = os.environ.get("OTEL_TRACES_EXPORTER", "")
+    if exporter == "none" or os.environ.get("OTEL_SDK_DISABLED", "").lower() == "true":
+        return False
+    return bool(exporter) or any(os.environ.get(name) for name in ENDPOINTS)
+
+
+def start_tracing() -> None:
+    """Export the spans of this process from now on; a second call does nothing."""
+    if not is_traced():
+        return
+    try:
+        from opentelemetry import trace
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    except ImportError:
+        LOG.warning("no traces: OTEL_* names an exporter, but the extra `tracing` is not installed")
+        return
+    if isinstance(trace.get_tracer_provider(), TracerProvider):
+        return
+    os.environ.setdefault("OTEL_SERVICE_NAME", "worldpose")
+    provider = TracerProvider()
+    for name in os.environ.get("OTEL_TRACES_EXPORTER", "otlp").split(","):
+        asked = name.strip() or "otlp"
+        if asked == "otlp":
+            protocols = [os.environ[each] for each in PROTOCOLS if os.environ.get(each)]
+            asked = "otlp_proto_grpc" if protocols[:1] == ["grpc"] else "otlp_proto_http"
+        found = list(entry_points(group="opentelemetry_traces_exporter", name=asked))
+        if not found:
+            LOG.warning("no traces to %s: its exporter is not installed", asked)
+            continue
+        provider.add_span_processor(BatchSpanProcessor(found[0].load()()))
+    trace.set_tracer_provider(provider)
+
+
+def flush_spans() -> None:
+    """Send the spans of this process that are not sent yet."""
+    if not is_traced():
+        return
+    from opentelemetry import trace
+
+    flush = getattr(trace.get_tracer_provider(), "force_flush", None)
+    if flush is not None:
+        flush(FLUSH_MS)
+
+
+@contextmanager
+def stage_span(stage: str, units: int) -> Iterator[None]:
+    """Make a span of the enclosed stage, below the current one."""
+    if not is_traced():
+        yield
+        return
+    from opentelemetry import trace
+
+    tracer = trace.get_tracer("worldpose")
+    given: dict[str, str | int] = {"worldpose.stage": stage, "worldpose.units": units}
+    with tracer.start_as_current_span(f"stage {stage}", attributes=given):
+        yield
+
+
+def add_unit_span(
+    unit: str, key: str, end: datetime, seconds: float, figures: Mapping[str, float]
+) -> None:
+    """Add the span of a computed unit, below the current one.
+
+    Args:
+        unit: `stage/unit`.
+        key: key of its result.
+        end: time of publication.
+        seconds: computing time before it [s].
+        figures: its metrics; those of single cameras are left out.
+    """
+    if not is_traced():
+        return
+    from opentelemetry import trace
+
+    metrics = {f"worldpose.figure.{name}": value for name, value in figures.items()}
+    span = trace.get_tracer("worldpose").start_span(
+        unit,
+        attributes={
+            "worldpose.unit": unit,
+            "worldpose.key": key,
+            **{name: value for name, value in metrics.items() if name.count(".") == 2},
+        },
+        start_time=_nanoseconds(end - timedelta(seconds=seconds)),
+    )
+    span.end(_nanoseconds(end))
+
+
+def _nanoseconds(at: datetime) -> int:
+    return round(at.timestamp() * 1e9)

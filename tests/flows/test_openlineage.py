@@ -1,0 +1,124 @@
+"""Lineage of a run as OpenLineage events, checked against the published schema."""
+
+import json
+import os
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from command_line import TINY
+from jsonschema import Draft202012Validator
+
+from data_contracts.run import UnitFailure
+from flows.openlineage import lineage_events, tell_lineage
+from worldpose.store import Store
+
+SCHEMA = os.environ.get("WORLDPOSE_OPENLINEAGE_SCHEMA")
+
+
+@pytest.fixture
+def store(tiny_run):
+    return Store.open(str(tiny_run))
+
+
+@pytest.fixture
+def record(store):
+    failed = UnitFailure(unit="refitting/clip", error="ValueError", message="no body", key="a" * 32)
+    return store.run(TINY).model_copy(update={"failed": (failed,)})
+
+
+def test_every_result_leads_back_to_the_files_of_the_match(store, record):
+    events = list(lineage_events(store, record))
+    assert len(events) == 2 * (len(record.executed) + 1)
+    done = {each["job"]["name"]: each for each in events if each["eventType"] == "COMPLETE"}
+    assert len(done) == len(record.executed)
+    made = {each["outputs"][0]["name"]: each for each in done.values()}
+    versions = {
+        name: each["outputs"][0]["facets"]["version"]["datasetVersion"]
+        for name, each in made.items()
+    }
+    assert versions == {f"results/{TINY}/{name}": key for name, key in record.results.items()}
+
+    def sources(name):
+        inputs = made[name]["inputs"]
+        found = {each["name"] for each in inputs if each["namespace"] == "worldpose.match"}
+        results = [each for each in inputs if each["namespace"] != "worldpose.match"]
+        assert all(versions[each["name"]] for each in results)
+        return found.union(*(sources(each["name"]) for each in results))
+
+    assert sources(f"results/{TINY}/body_fitting/clip")
+    started = [each for each in events if each["eventType"] == "START"]
+    assert {each["run"]["runId"] for each in started} == {each["run"]["runId"] for each in events}
+    for each in done.values():
+        (start,) = [one for one in started if one["run"] == each["run"]]
+        assert start["eventTime"] < each["eventTime"]
+    (failed,) = [each for each in events if each["eventType"] == "FAIL"]
+    assert failed["run"]["facets"]["errorMessage"]["message"] == "no body"
+    assert len({each["run"]["facets"]["parent"]["run"]["runId"] for each in events}) == 1
+
+
+@pytest.mark.skipif(SCHEMA is None, reason="WORLDPOSE_OPENLINEAGE_SCHEMA names no schema")
+def test_events_follow_the_published_schema(store, record):
+    schema = json.loads(Path(SCHEMA).read_text())
+    check = Draft202012Validator(
+        {**schema, "oneOf": [{"$ref": "#/$defs/RunEvent"}]},
+        format_checker=Draft202012Validator.FORMAT_CHECKER,
+    )
+    for event in lineage_events(store, record):
+        check.validate(event)
+        assert event["schemaURL"] == f"{schema['$id']}#/$defs/RunEvent"
+    assert not check.is_valid({**event, "eventType": "DONE"})
+    assert not check.is_valid({**event, "run": {"runId": 1}})
+
+
+@pytest.fixture
+def receiver():
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_POST(self):
+            body = self.rfile.read(int(self.headers["content-length"]))
+            self.server.got.append((self.path, self.headers["authorization"], json.loads(body)))
+            self.send_response(self.server.code)
+            self.send_header("content-length", "0")
+            self.end_headers()
+
+        def log_message(self, *arguments):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.got, server.code = [], 201
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def test_events_go_to_a_server_or_a_file(store, record, receiver, tmp_path, monkeypatch, caplog):
+    tell_lineage(store, record)  # nothing is set, nothing is sent
+    events = list(lineage_events(store, record))
+    monkeypatch.setenv("OPENLINEAGE_URL", f"http://127.0.0.1:{receiver.server_port}")
+    monkeypatch.setenv("OPENLINEAGE_API_KEY", "secret")
+    tell_lineage(store, record)
+    assert [body for _, _, body in receiver.got] == events
+    assert {each[:2] for each in receiver.got} == {("/api/v1/lineage", "Bearer secret")}
+    monkeypatch.setenv("OPENLINEAGE_URL", f"file://{tmp_path}/lineage.ndjson")
+    tell_lineage(store, record)
+    lines = (tmp_path / "lineage.ndjson").read_text().splitlines()
+    assert [json.loads(each) for each in lines] == events
+    assert caplog.messages == []
+    receiver.code = 500
+    for address in (f"http://127.0.0.1:{receiver.server_port}", "http://127.0.0.1:9", "ftp://h"):
+        monkeypatch.setenv("OPENLINEAGE_URL", address)
+        tell_lineage(store, record)
+    assert len(caplog.messages) == 3
+    assert "secret" not in caplog.text
+
+
+def test_the_events_of_a_run_take_less_than_a_hundredth_of_it(store, record, tmp_path, monkeypatch):
+    monkeypatch.setenv("OPENLINEAGE_URL", f"file://{tmp_path}/lineage.ndjson")
+    began = time.perf_counter()
+    tell_lineage(store, record)
+    assert time.perf_counter() - began < 0.01 * record.seconds
