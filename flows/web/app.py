@@ -24,6 +24,7 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.service import status_page
 from flows.web import (
     calibration,
+    corrections,
     decisions,
     detections,
     evidence,
@@ -35,6 +36,7 @@ from flows.web import (
 )
 from flows.web.access import NAME_LENGTH, SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
+from flows.web.browser_words import describe_error
 from flows.web.host_guard import refusal, refuse_foreign
 from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
 from flows.web.intake import routes as routes_of_intake
@@ -98,6 +100,7 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
     for module in (
         queue,
         decisions,
+        corrections,
         evidence,
         outliers,
         calibration,
@@ -194,13 +197,13 @@ def add_answers(app: FastAPI) -> None:
     @app.exception_handler(StaleEditError)
     def stale(request: Request, error: StaleEditError) -> JSONResponse:
         return JSONResponse(
-            {"error": str(error), "difference": dict(error.difference)}, status_code=409
+            {"error": describe_error(error), "difference": dict(error.difference)}, status_code=409
         )
 
     @app.exception_handler(InputError)
     def unfit(request: Request, error: InputError) -> JSONResponse:
         parts = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
-        return JSONResponse({"error": str(error), **parts}, status_code=422)
+        return JSONResponse({"error": describe_error(error), **parts}, status_code=422)
 
     @app.exception_handler(RequestValidationError)
     def answer_malformed(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -221,7 +224,7 @@ def add_answers(app: FastAPI) -> None:
         LOG.warning("%s %r failed: %s", request.method, request.url.path, said)
         cause = error.__cause__
         is_full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
-        return JSONResponse({"error": str(error)}, status_code=507 if is_full else 500)
+        return JSONResponse({"error": describe_error(error)}, status_code=507 if is_full else 500)
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, error: Exception) -> JSONResponse:

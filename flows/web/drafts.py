@@ -27,6 +27,7 @@ from pydantic import Field, JsonValue
 from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
+from flows.web.browser_words import in_browser
 from flows.web.video_folders import VIDEO_SUFFIXES, is_video, open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats import whole_file
@@ -492,7 +493,8 @@ _QUEUES: Final = ("urgent", "background")
 
 def _describe(error: InputError, folder: Path | None = None) -> dict[str, str]:
     """Return an error's place in match.yaml, and its message without paths of this machine."""
-    where, message = error.where, f"expected {error.expected}, found {error.found}. {error.todo}"
+    where, todo = error.where, in_browser(error.todo)
+    message = f"expected {error.expected}, found {error.found}. {todo}"
     if folder is not None:
         where = where.replace(f"{folder}/", "").replace(str(folder), "the match")
         message = message.replace(f"{folder}/", "")

@@ -19,6 +19,7 @@ from data_contracts.operations import Priority
 from data_contracts.records import Count, Record
 from flows.service.layout import served_state
 from flows.web.app_context import PageContext, Person
+from flows.web.browser_words import in_browser
 from flows.web.drafts import DraftFile, Drafts
 from flows.web.video_folders import list_videos, open_video
 
@@ -91,7 +92,9 @@ def routes(context: PageContext, intake: Intake | None) -> APIRouter:
             "inbox": None if intake is None else str(intake.inbox),
             "folders": [] if intake is None else [str(folder) for folder in intake.folders],
             "arrivals": [
-                each.model_dump(mode="json") for each in arrivals if each.state != "taken"
+                {**each.model_dump(mode="json"), "reason": in_browser(each.reason)}
+                for each in arrivals
+                if each.state != "taken"
             ],
         }
 
