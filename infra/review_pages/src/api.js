@@ -36,6 +36,13 @@ async function ask(method, path, body) {
   return content;
 }
 
+export async function getBytes(path) {
+  const answer = await fetch(path);
+  if (answer.status === 401) location.assign("/login");
+  if (!answer.ok) throw new Refusal(answer.status, await answer.json().catch(() => ({})));
+  return answer.arrayBuffer();
+}
+
 // Send bytes, and return what the server says of them: the caller decides what a refusal means.
 export async function putBytes(path, bytes) {
   const answer = await fetch(path, {
