@@ -7,7 +7,7 @@ export const task = JSON.parse(readFileSync(process.argv[2], "utf8"));
 const { chromium } = createRequire(task.modules)("playwright-core");
 export const browser = await chromium.launch({
   executablePath: task.chromium,
-  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+  args: ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update"],
 });
 

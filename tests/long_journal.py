@@ -6,6 +6,8 @@ from data_contracts.review import Correction, JournalEntry, MovedKeypoint, Moved
 from flows.registering import open_for_review
 from worldpose.store.documents import record_checksum, seal
 
+SESSION = 500
+"""Corrections of one person in one session."""
 POINTS_EVERY = 10
 """One in so many corrections moves a clicked point, the others move keypoints."""
 
@@ -33,9 +35,9 @@ def write_corrections(store, match_id, count):
             id=f"{edit.kind}.{number:012x}",
             match_id=match_id,
             edit=edit,
-            who="Ada",
-            made_at=began + timedelta(seconds=number),
-            based_on={},
+            who=("Ada", "Bob")[number // SESSION % 2],
+            made_at=began + timedelta(seconds=number, hours=number // SESSION),
+            based_on={f"static_calibration/{camera}": "0" * 32},
         )
         entry = JournalEntry(match_id=match_id, number=number, previous=tip, records=(correction,))
         (folder / f"{number:06d}.json").write_bytes(seal(entry))

@@ -8,11 +8,13 @@ import urllib.error
 import urllib.request
 import warnings
 from contextlib import contextmanager
+from pathlib import Path
 
 from command_line import TINY, WORLDPOSE
 
 from flows.web.access import access_for
 from flows.web.app import create_app
+from flows.web.intake import Intake
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the web framework, about its own test client
@@ -24,9 +26,9 @@ MATCH = f"/api/matches/{TINY}"
 
 
 def served(project):
-    """The server of a project's pages."""
+    """The server of a project's pages, with an inbox for new matches."""
     access = access_for("127.0.0.1", token=TOKEN, names=(), secure=False)
-    app = create_app(str(project), access)
+    app = create_app(str(project), access, Intake(Path(project) / "inbox"))
     app.state.access = access
     return app
 
@@ -45,23 +47,32 @@ def log_in(app, who):
     return logged_in
 
 
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return free.getsockname()[1]
+
+
+def wait_until_up(base):
+    """Wait until a server of pages answers."""
+    for _ in range(240):
+        try:
+            with urllib.request.urlopen(f"{base}/api/health"):
+                return
+        except urllib.error.URLError:
+            time.sleep(0.5)
+
+
 @contextmanager
 def serving(project, folder):
     """The address of a process that serves a project's pages; its log lies in a folder."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     environment = {**os.environ, "WORLDPOSE_REVIEW_TOKEN": TOKEN}
     command = [*WORLDPOSE, "review", "serve", "--port", str(port), "--project", str(project)]
     with (folder / "pages.log").open("wb") as log:
         server = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
     base = f"http://127.0.0.1:{port}"
     try:
-        for _ in range(240):
-            try:
-                with urllib.request.urlopen(f"{base}/api/health"):
-                    break
-            except urllib.error.URLError:
-                time.sleep(0.5)
+        wait_until_up(base)
         yield base
     finally:
         server.terminate()

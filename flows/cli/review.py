@@ -223,7 +223,7 @@ def withdraw(
     Example: worldpose review withdraw tiny-1 moved_point.0a1b2c3d4e5f --who Ada
     """
     store = Store.open(project)
-    verdicts.withdraw(store, open_match(store, match), correction, who=who, why=why)
+    verdicts.withdraw(store, open_match(store, match), [correction], who=who, why=why)
     if as_json:
         print_json({"withdrawn": correction})
         return

@@ -33,6 +33,12 @@ def serve(
         Path | None,
         typer.Option("--inbox", help="Folder of arriving matches; PROJECT/inbox by default."),
     ] = None,
+    videos: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder whose videos people can pick on the pages, read-only; repeatable."
+        ),
+    ] = None,
     bucket: Annotated[
         str | None,
         typer.Option("--bucket", help="s3:// URL of further arrivals; copied to the inbox."),
@@ -121,10 +127,19 @@ def serve(
             found="none, and a project on object storage",
             todo="Name a folder, as in --inbox /data/arriving.",
         )
+    for each in videos or ():
+        if not each.is_dir():
+            raise UsageError(
+                f"--videos {each}",
+                expected="a folder",
+                found="something else" if each.exists() else "nothing",
+                todo="Name a folder with videos, as in --videos /data/recordings.",
+            )
     given = os.environ.get("PREFECT_API_URL")
     plan = ServePlan(
         project=url,
         inbox=(inbox or Path(url) / "inbox").resolve(),
+        videos=tuple(each.resolve() for each in videos or ()),
         bucket=bucket,
         state=folder.folder,
         name=name,

@@ -8,6 +8,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from flows.renames import rename_settings
@@ -157,12 +158,8 @@ def write_broadcast_videos(
     for clip, camera in broadcast_cameras(run).items():
         if clips is not None and clip not in clips:
             continue
-        result = run[f"broadcast_calibration/{clip}"]
-        expected = np.nan_to_num(result["reprojection_error"].values)
-        most = round(LENGTH * fps)
-        begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
-        chosen = np.arange(begin, min(begin + most, len(expected)), every)
-        frames = result["frame"].values[chosen]
+        chosen = broadcast_video_frames(run, clip, fps)
+        frames = run[f"broadcast_calibration/{clip}"]["frame"].values[chosen]
         start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
         stop = start + int(chosen[-1] - chosen[0]) + 1
         file = page.with_name(f"{page.stem}-{clip}.mp4")
@@ -183,6 +180,15 @@ def write_broadcast_videos(
             write_video(draft, drawn, fps / every, quality=23)
         files.append(file)
     return files
+
+
+def broadcast_video_frames(run: Run, clip: str, fps: float) -> NDArray[np.int64]:
+    """Return the indices of the frames of a clip's video: the part of the largest error."""
+    expected = np.nan_to_num(run[f"broadcast_calibration/{clip}"]["reprojection_error"].values)
+    most = round(LENGTH * fps)
+    begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
+    every = max(1, round(fps / FRAME_RATE))
+    return np.arange(begin, min(begin + most, len(expected)), every)
 
 
 def broadcast_tables(run: Run, match: Match) -> list[Table]:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.reports.broadcast import write_broadcast_videos
+from flows.reports.broadcast import broadcast_video_frames, write_broadcast_videos
 from flows.reports.match_pictures import frame_pictures
 from flows.results.best_results import (
     body_tracks,
@@ -74,8 +74,7 @@ def write_clip_video(
     fps = match.folder.spec.fps
     every = max(1, round(fps / RATE))
     tracks = joint_tracks(run, clip)
-    spare = max(0, len(tracks.frames) - round(LENGTH * fps)) // 2
-    frames = tracks.frames[spare : len(tracks.frames) - spare : every]
+    frames = video_frames(run, match, clip, owner)
     camera = static_cameras(run, match.folder.spec)[owner]
     cameras = Camera.stack([camera])[np.zeros(len(frames), dtype=np.intp)]
     width, height = camera.image_size.tolist()
@@ -88,3 +87,15 @@ def write_clip_video(
     bodies = body_tracks(run, clip)
     drawn = overlay_frames(pictures(), cameras, tracks, frames, match.folder.pitch, bodies)
     write_video(file, drawn, fps / every, quality=23)
+
+
+def video_frames(run: Run, match: Match, clip: str, owner: str) -> NDArray[np.int64]:
+    """Return the match frames of a clip's video, as `write_clip_video` writes it for `owner`."""
+    fps = match.folder.spec.fps
+    if owner == clip:
+        frames = run[f"broadcast_calibration/{clip}"]["frame"].values
+        return np.asarray(frames[broadcast_video_frames(run, clip, fps)])
+    every = max(1, round(fps / RATE))
+    all_frames = joint_tracks(run, clip).frames
+    spare = max(0, len(all_frames) - round(LENGTH * fps)) // 2
+    return np.asarray(all_frames[spare : len(all_frames) - spare : every])

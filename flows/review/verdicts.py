@@ -270,16 +270,23 @@ def correct(
     return corrections
 
 
-def withdraw(store: Store, match: Match, correction: str, *, who: str, why: str) -> None:
-    """Withdraw a correction.
+def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str, why: str) -> None:
+    """Withdraw corrections, all or none.
+
+    Args:
+        store: the store that holds the journal.
+        match: the match.
+        corrections: their ids.
+        who: name of the reviewer.
+        why: the reviewer's comment.
 
     Raises:
-        InputError: no such correction is in force.
+        InputError: one of them is not in force.
     """
     say(
         store,
         match.match_id,
-        lambda journal: [withdrawal(journal, correction, who=who, why=why)],
+        lambda journal: [withdrawal(journal, each, who=who, why=why) for each in corrections],
     )
 
 

@@ -65,6 +65,7 @@ def watch(plan: ServePlan) -> None:
 def pages(plan: ServePlan) -> None:
     """Serve the review pages and the status page until this process ends."""
     from flows.web.access import access_for
+    from flows.web.intake import Intake
     from flows.web.serving import serve
 
     access = access_for(
@@ -77,7 +78,8 @@ def pages(plan: ServePlan) -> None:
     tls = None
     if plan.certificate is not None and plan.key is not None:
         tls = (plan.certificate, plan.key)
-    serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls)
+    intake = Intake(plan.inbox, plan.videos)
+    serve(plan.project, access, host=plan.host, port=plan.pages_port, tls=tls, intake=intake)
 
 
 PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}

@@ -33,6 +33,8 @@ class ServePlan(Record):
     """Folder or URL of the store."""
     inbox: Path
     """Folder for arriving matches."""
+    videos: tuple[Path, ...] = ()
+    """Folders whose videos people can pick on the pages, read-only."""
     bucket: str | None = None
     """Address of an inbox in object storage, copied to the inbox folder."""
     state: Path

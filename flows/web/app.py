@@ -24,6 +24,7 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.service import status_page
 from flows.web import (
     calibration,
+    corrections,
     decisions,
     detections,
     evidence,
@@ -35,7 +36,10 @@ from flows.web import (
 )
 from flows.web.access import NAME_LENGTH, SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
+from flows.web.browser_words import describe_error
 from flows.web.host_guard import refusal, refuse_foreign
+from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
+from flows.web.intake import routes as routes_of_intake
 from worldpose.errors import InputError, InternalError, WorldposeError
 from worldpose.store import Store
 
@@ -65,12 +69,13 @@ class Login(Record):
         return who
 
 
-def create_app(project: str, access: Access) -> FastAPI:
+def create_app(project: str, access: Access, intake: Intake | None = None) -> FastAPI:
     """Create the server of a project's pages.
 
     Args:
         project: folder or URL of the store.
         access: access control.
+        intake: where people put new matches; None: they create none here.
 
     Raises:
         InputError: there is no such project.
@@ -95,6 +100,7 @@ def create_app(project: str, access: Access) -> FastAPI:
     for module in (
         queue,
         decisions,
+        corrections,
         evidence,
         outliers,
         calibration,
@@ -105,6 +111,7 @@ def create_app(project: str, access: Access) -> FastAPI:
         status_page,
     ):
         app.include_router(module.routes(context))
+    app.include_router(routes_of_intake(context, intake))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)
     return app
@@ -191,13 +198,13 @@ def add_answers(app: FastAPI) -> None:
     @app.exception_handler(StaleEditError)
     def stale(request: Request, error: StaleEditError) -> JSONResponse:
         return JSONResponse(
-            {"error": str(error), "difference": dict(error.difference)}, status_code=409
+            {"error": describe_error(error), "difference": dict(error.difference)}, status_code=409
         )
 
     @app.exception_handler(InputError)
     def unfit(request: Request, error: InputError) -> JSONResponse:
         parts = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
-        return JSONResponse({"error": str(error), **parts}, status_code=422)
+        return JSONResponse({"error": describe_error(error), **parts}, status_code=422)
 
     @app.exception_handler(RequestValidationError)
     def answer_malformed(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -218,7 +225,7 @@ def add_answers(app: FastAPI) -> None:
         LOG.warning("%s %r failed: %s", request.method, request.url.path, said)
         cause = error.__cause__
         is_full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
-        return JSONResponse({"error": str(error)}, status_code=507 if is_full else 500)
+        return JSONResponse({"error": describe_error(error)}, status_code=507 if is_full else 500)
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, error: Exception) -> JSONResponse:
@@ -249,8 +256,8 @@ class Guard:
 
     Host: a foreign name that points here (DNS rebinding) is refused. Session: all but `OPEN` needs
         one. Changes: need the session's form secret, and this origin if the browser states one.
-        Size: at most `BODY_BYTES`. Every login and every requested change is logged with person,
-        request and response.
+        Size: at most `BODY_BYTES`, or `CHUNK_BYTES` of a chunk of a file. Every login and every
+        requested change is logged with person, request and response.
     """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
@@ -280,7 +287,8 @@ class Guard:
         async def send_sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _seal(MutableHeaders(scope=message), scope["path"])
-                asked = scope["path"].endswith(ASKING) and message["status"] < 400
+                is_frequent = scope["path"].endswith((ASKING, CHUNK_SUFFIX))
+                asked = is_frequent and message["status"] < 400
                 # A client that disconnected in the middle of its request requested nothing.
                 if scope["method"] not in SAFE and not asked and not is_gone:
                     place = f"{scope['method']} {scope['path']}"
@@ -311,8 +319,10 @@ class Guard:
             return refusal(403, f"the role of {who}, {self.access.role(who)}, does not allow this")
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
             return refusal(403, "this comes from a page of another server")
-        if headers.get("content-type", "").partition(";")[0] != "application/json":
-            return refusal(415, "only JSON is taken in")
+        is_chunk = method == "PUT" and path.endswith(CHUNK_SUFFIX)
+        kind = "application/octet-stream" if is_chunk else "application/json"
+        if headers.get("content-type", "").partition(";")[0] != kind:
+            return refusal(415, "only bytes are taken in" if is_chunk else "only JSON is taken in")
         if path not in OPEN and not self.access.has_form_secret(
             session or "", headers.get("x-form-secret", "")
         ):
@@ -320,8 +330,9 @@ class Guard:
         length = headers.get("content-length", "")
         if not (length.isascii() and length.isdigit()):  # without a length, the size is unbounded
             return refusal(411, "state its length")
-        if len(length) > 12 or int(length) > BODY_BYTES:
-            return refusal(413, f"at most {BODY_BYTES} bytes are taken in")
+        limit = CHUNK_BYTES if is_chunk else BODY_BYTES
+        if len(length) > 12 or int(length) > limit:
+            return refusal(413, f"at most {limit} bytes are taken in")
         return None
 
 

@@ -1,4 +1,4 @@
-"""Decisions on a page: verdicts, corrections, and the continuation of a run."""
+"""Decisions on a page: verdicts, and the continuation of a run."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from pydantic import Field
 from data_contracts.records import Name, Record
 from data_contracts.review import Edit
 from data_contracts.run import GatePolicy
-from flows.review.corrections import keep_edits
-from flows.review.descriptions import correction_json
-from flows.review.verdicts import decide, still_waiting, withdraw
+from flows.review.verdicts import decide, still_waiting
 from flows.run_record import latest_run
 from flows.web.app_context import PageContext, Person
 
@@ -53,15 +51,6 @@ class Edits(Record):
     """The person's comment."""
 
 
-class Withdrawing(Record):
-    """A correction to withdraw."""
-
-    correction: Name
-    """Its id."""
-    why: str = Field(default="", max_length=2000)
-    """The person's comment."""
-
-
 class GoingOn(Record):
     """Options for continuing a run."""
 
@@ -82,19 +71,6 @@ def routes(context: PageContext) -> APIRouter:
         waiting = still_waiting(context.store, context.match(match_id), latest)
         run = context.continuing.go_on(match_id) if given.go_on and not waiting else None
         return {"waiting": len(waiting), "run": run}
-
-    @router.post("/corrections")
-    def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:
-        edits = {each.id: each.edit for each in given.edits}
-        kept = keep_edits(
-            context.store, lambda: context.match(match_id), edits, who=who, note=given.note
-        )
-        return {"kept": [correction_json(each) for each in kept]}
-
-    @router.post("/withdrawals")
-    def take_back(match_id: str, given: Withdrawing, who: Person) -> dict[str, Any]:
-        withdraw(context.store, context.match(match_id), given.correction, who=who, why=given.why)
-        return {"withdrawn": given.correction}
 
     @router.post("/runs")
     def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from typing import Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 
-from data_contracts.review import Correction, ReviewRequest
+from data_contracts.review import ReviewRequest
 from flows.gates import GATES
-from flows.review.descriptions import correction_json, in_words, review_json
+from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.browser_words import describe_error, in_browser
+from flows.web.corrections import count_corrections, describe_groups
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
-
-CORRECTIONS: Final = 200
-"""Maximum per response: a match can have many thousand, and a page shows the last ones."""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -38,7 +37,7 @@ def routes(context: PageContext) -> APIRouter:
             "reviews": [
                 describe_review(each) for each in reviews_of(context.store, opened, latest)
             ],
-            **_corrections(opened),
+            "groups": describe_groups(opened),
             "cameras": [
                 {
                     "id": camera.id,
@@ -50,41 +49,16 @@ def routes(context: PageContext) -> APIRouter:
                 for camera in folder.spec.static_cameras
             ],
             "clips": [_clip(context, opened, clip.id) for clip in folder.spec.clips],
-            "failures": [] if latest is None else [each.model_dump() for each in latest.failed],
+            "failures": []
+            if latest is None
+            else [
+                {**each.model_dump(), "message": in_browser(each.message)} for each in latest.failed
+            ],
             "left_out": {} if latest is None else latest.left_out,
-            "warnings": [] if latest is None else list(latest.warnings),
+            "warnings": [] if latest is None else [in_browser(each) for each in latest.warnings],
         }
 
-    @router.get("/{match_id}/corrections")
-    def corrections(match_id: str, skip: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
-        return _corrections(context.match(match_id), skip)
-
     return router
-
-
-def _corrections(match: Match, skip: int = 0) -> dict[str, Any]:
-    """Return the last corrections in force; those that no longer apply come after all others.
-
-    Args:
-        match: the match with all corrections.
-        skip: number of last corrections that the page has already.
-    """
-    count = len(match.corrections) + len(match.stale)
-    end = max(0, count - skip)
-    first = max(0, end - CORRECTIONS)
-    applied: list[tuple[Correction, str | None]] = [
-        (each, None) for each in match.corrections[first:end]
-    ]
-    stale = match.stale[
-        max(0, first - len(match.corrections)) : max(0, end - len(match.corrections))
-    ]
-    return {
-        "corrections": [
-            {**correction_json(each), "words": in_words(each), "objection": why}
-            for each, why in [*applied, *stale]
-        ],
-        "corrections_before": first,
-    }
 
 
 def describe_review(review: Review) -> dict[str, Any]:
@@ -98,7 +72,7 @@ def _at_a_glance(context: PageContext, name: str) -> dict[str, Any]:
     try:
         return _glance(context, context.match(name))
     except (OSError, WorldposeError) as error:
-        return {"match": name, "problem": str(error), "waiting": [], "run": None}
+        return {"match": name, "problem": describe_error(error), "waiting": [], "run": None}
 
 
 def _glance(context: PageContext, match: Match) -> dict[str, Any]:
@@ -119,6 +93,7 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
             }
         )
     folder = match.folder
+    corrections, first_clicks = count_corrections(match)
     clicked = {**folder.calibrations, **folder.clicked}
     return {
         "match": match.match_id,
@@ -135,7 +110,8 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
         },
         "waiting": waiting,
         "to_click": [each.id for each in folder.spec.static_cameras if each.id not in clicked],
-        "corrections": len(match.corrections),
+        "corrections": corrections,
+        "first_clicks": first_clicks,
         "stale": len(match.stale),
         "at_work": _at_work(store, context, match.match_id),
     }
@@ -145,7 +121,7 @@ def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any
     """Return the run started on a page, or else one started elsewhere that has not ended."""
     state = context.continuing.state(match_id)
     if state is not None:
-        return state
+        return {**state, "lines": [in_browser(line) for line in state["lines"]]}
     open_runs = store.unfinished_runs(match_id)
     if not open_runs:
         return None

@@ -1,4 +1,4 @@
-"""Results of a complete run in the browser: the report, overlay videos, and exports to download."""
+"""Results of a complete run in the browser: 3D view, report, overlay videos, and exports."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, HTTPException
-from fastapi.responses import FileResponse
+from fastapi import APIRouter, HTTPException, Query
+from fastapi.responses import FileResponse, Response
 
 from data_contracts.release import EXPORT_FORMATS
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
+from flows.reports.scene_data import describe_frames, describe_scene
 from flows.results.best_results import clips_of
 from flows.results.export import Origin, export
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from worldpose.errors import WorldposeError
 from worldpose.store import Run, open_run
 
+BINARY: Final = "application/octet-stream"
 KEPT: Final = 12
 """Files that the server keeps; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
@@ -55,6 +58,11 @@ class _Files:
         return file
 
 
+def _require_clip(run: Run, clip: str) -> None:
+    if clip not in clips_of(run.record):
+        raise HTTPException(404, "the run has no such clip")
+
+
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
@@ -67,12 +75,32 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
         match, run = open_latest(match_id)
-        clips = clips_of(run.record)
+        try:
+            clips = clips_of(run.record)
+        except WorldposeError:  # it ended on purpose before people were placed in 3D
+            return {"run": run.record.run_id, "formats": [], "clips": []}
         return {
             "run": run.record.run_id,
             "formats": list(EXPORT_FORMATS),
             "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
         }
+
+    @router.get("/scenes/{clip}")
+    def scene(match_id: str, clip: str) -> Response:
+        match, run = open_latest(match_id)
+        _require_clip(run, clip)
+        return Response(describe_scene(run, match, clip), media_type=BINARY)
+
+    @router.get("/scenes/{clip}/frames")
+    def frames(
+        match_id: str,
+        clip: str,
+        first: Annotated[int, Query(ge=0)],
+        count: Annotated[int, Query(ge=1, le=10_000)],
+    ) -> Response:
+        match, run = open_latest(match_id)
+        _require_clip(run, clip)
+        return Response(describe_frames(run, match, clip, first, count), media_type=BINARY)
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:

@@ -8,6 +8,7 @@ from pathlib import Path
 from flows.web.access import LOOPBACK, Access
 from flows.web.app import create_app
 from flows.web.http_server import serve_http
+from flows.web.intake import Intake
 
 
 def serve(
@@ -18,6 +19,7 @@ def serve(
     port: int,
     tls: tuple[Path, Path] | None,
     announce: Callable[[], None] = lambda: None,
+    intake: Intake | None = None,
 ) -> None:
     """Serve a project's pages; return when interrupted.
 
@@ -28,13 +30,14 @@ def serve(
         port: 0 = any free one.
         tls: certificate and key files.
         announce: called when the port is ours.
+        intake: where people put new matches; None: they create none here.
 
     Raises:
         InputError: there is no such project, or the port is taken.
     """
     certificate, key = (None, None) if tls is None else map(str, tls)
     serve_http(
-        create_app(project, access),
+        create_app(project, access, intake),
         host=host,
         port=port,
         announce=announce,

@@ -31,7 +31,7 @@ export default defineConfig({
       output: {
         entryFileNames: "assets/pages.js",
         chunkFileNames: "assets/[name].js",
-        assetFileNames: "assets/pages[extname]",
+        assetFileNames: "assets/[name][extname]",
       },
     },
   },

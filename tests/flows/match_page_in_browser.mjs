@@ -11,17 +11,36 @@ seen.notes = await page.locator("p.note").allInnerTexts();
 seen.rows = await page.locator("table tbody tr").allInnerTexts();
 await shoot(page, "match");
 
-// Corrections come a part at a time, from the last one back.
-const listed = page.locator("section.panel ul li span:first-child");
+// Corrections come in groups; those of a group a part at a time, from the last one back.
+await page.click("[data-group] button[aria-expanded]");
+await page.waitForSelector("[data-group] ol li");
+const listed = page.locator("[data-group] ol li");
 seen.listed = [await listed.count()];
 for (let k = 0; k < 2; k++) {
   await page.click("text=Show earlier ones");
-  await page.waitForFunction(
-    (count) => document.querySelectorAll("section.panel ul li > span:first-child").length > count,
-    seen.listed.at(-1),
-  );
+  await page.waitForFunction((count) => document.querySelectorAll("[data-group] ol li").length > count, seen.listed.at(-1));
   seen.listed.push(await listed.count());
 }
 seen.more = await page.locator("text=Show earlier ones").count();
 await shoot(page, "corrections");
+
+// A whole group is undone after a second click; what is refused stays until it is dismissed.
+await page.route("**/withdrawal", (route) => route.fulfill({ status: 422, json: { error: "refused for a test" } }));
+await page.click("text=Undo all 450");
+await page.click("text=Yes");
+await page.waitForSelector("text=refused for a test");
+await page.waitForTimeout(7000); // the page asks for news every three seconds
+seen.stays = await page.locator("[role=alert] >> text=refused for a test").count();
+await page.click("text=Dismiss");
+seen.dismissed = await page.locator("text=refused for a test").count();
+await page.unroute("**/withdrawal");
+await page.click("text=Undo all 450");
+await page.click("text=Yes");
+await page.waitForFunction(() => !document.querySelector("[data-group]"));
+for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
+  await page.setViewportSize({ width, height });
+  seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  await shoot(page, `undone_${width}`);
+}
+seen.errors = seen.errors.filter((text) => !text.includes("422"));
 await tell(seen);

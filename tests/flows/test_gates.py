@@ -171,7 +171,7 @@ def test_a_rejected_result_waits_for_its_correction_which_reaches_nothing_else(s
     latest = latest_run(store, TINY).results
     assert units(refused.list_held_units("static_calibration", latest)) == [WRONG]
     # After the withdrawal the state is the former one; the rejection stands until an approval.
-    withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
+    withdraw(store, match, [match.corrections[0].id], who="Bob", why="it was right")
     again = open_match(store, TINY)
     assert {unit.name: unit.key for unit in plan_run(store, again, {})} == before
     record = run(store, "auto")
@@ -201,7 +201,7 @@ def test_a_corrected_result_needs_no_verdict_and_asks_about_the_new_one(store):
     after = {unit.name: unit for unit in plan_run(store, match, {})}
     assert not after[WRONG].published
     # Taken back, the question is open again.
-    withdraw(store, match, match.corrections[0].id, who="Bob", why="it was right")
+    withdraw(store, match, [match.corrections[0].id], who="Bob", why="it was right")
     assert states()[wrong] == "waits"
 
 

@@ -16,7 +16,7 @@ pytestmark = [*IN_BROWSER, pytest.mark.timeout(1200)]
 SCRIPT = Path(__file__).with_name("match_page_in_browser.mjs")
 
 
-def test_a_left_out_camera_and_earlier_corrections_are_seen(tiny, tmp_path):
+def test_a_left_out_camera_and_groups_of_corrections_are_seen(tiny, tmp_path):
     folder = shutil.copytree(tiny, tmp_path / "match")
     file = folder / "annotations" / "static_calibration" / "cam01.json"
     clicked = json.loads(file.read_text())
@@ -34,3 +34,5 @@ def test_a_left_out_camera_and_earlier_corrections_are_seen(tiny, tmp_path):
     (row,) = [text for text in seen["rows"] if text.startswith("cam01")]
     assert "left out" in row
     assert (seen["listed"], seen["more"]) == ([200, 400, 450], 0)
+    assert (seen["stays"], seen["dismissed"]) == (1, 0)
+    assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]

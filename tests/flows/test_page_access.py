@@ -21,7 +21,7 @@ from worldpose.store import Store
 def every_route(app):
     """Method and path of every route of the server, from the server itself."""
     names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
-    names["form"] = "joints"
+    names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f"}
     for path, methods in app.openapi()["paths"].items():
         for method in methods:
             yield method.upper(), path.format_map(names)
@@ -33,7 +33,13 @@ def refused(browser, method, path, **keywords):
 
 def test_every_route_but_log_in_and_health_refuses_a_stranger(app, stranger):
     routes = list(every_route(app))
-    assert {path for _, path in routes} >= {MATCH, f"{MATCH}/decisions", "/", "/api/session"}
+    assert {path for _, path in routes} >= {
+        MATCH,
+        f"{MATCH}/decisions",
+        "/",
+        "/api/session",
+        "/api/drafts",
+    }
     for method, path in routes:
         answer = refused(stranger, method, path, json={} if method == "POST" else None)
         if path in OPEN:

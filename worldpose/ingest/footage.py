@@ -117,6 +117,7 @@ def read_footage(
     image_size: tuple[int, int],
     frames: UnitFrames,
     clips: Sequence[tuple[str, int, int]],
+    index: FrameIndex | None = None,
 ) -> Footage:
     """Return a video's synchronization with the match's clock, decoding only its first frame.
 
@@ -126,11 +127,12 @@ def read_footage(
         image_size: width, height from match.yaml [px].
         frames: the unit's frames in the match.
         clips: id, first match frame and number of frames of each clip.
+        index: of the video; None = read it.
 
     Raises:
         InputError: no video, another size or rate, or a clip of which it has no frame.
     """
-    index = index_video(path)
+    index = index_video(path) if index is None else index
     if index.size != image_size:
         raise InputError(
             str(path),
@@ -173,10 +175,12 @@ def footage_size(spec: MatchSpec, unit_id: str) -> tuple[int, int]:
     return camera.width, camera.height
 
 
-def require_footage(spec: MatchSpec, unit_id: str, path: Path) -> None:
+def require_footage(
+    spec: MatchSpec, unit_id: str, path: Path, index: FrameIndex | None = None
+) -> None:
     """Raise InputError as `read_footage` if a video contradicts match.yaml."""
     frames, clips = unit_frames(spec, unit_id), footage_clips(spec, unit_id)
-    read_footage(path, spec.fps, footage_size(spec, unit_id), frames, clips)
+    read_footage(path, spec.fps, footage_size(spec, unit_id), frames, clips, index)
 
 
 def stretches(numbers: NDArray[np.int64]) -> list[list[int]]:

@@ -48,12 +48,25 @@ def validate_record(model: type[R], data: object, file: str) -> R:
         # Through JSON, so that strict rules hold (no "25" for 25) yet a list is a tuple.
         return model.model_validate_json(text, strict=True)
     except ValidationError as error:
-        details = error.errors(include_url=False)
-    # An entry that fails leaves its list "too short" as well: only the deepest errors are causes.
+        causes = _causes(error)
+    raise _input_error(model, causes[0], file, len(causes) - 1)
+
+
+def list_problems(model: type[Record], data: object, file: str) -> list[InputError]:
+    """Return every error in JSON data, the first one as `validate_record` raises it."""
+    try:
+        model.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        return [_input_error(model, cause, file, 0) for cause in _causes(error)]
+    return []
+
+
+def _causes(error: ValidationError) -> list[ErrorDetails]:
+    """Return the deepest errors, misspelt keys first: a failed entry leaves its list too short."""
+    details = error.errors(include_url=False)
     within = {detail["loc"][:n] for detail in details for n in range(len(detail["loc"]))}
     details = [detail for detail in details if detail["loc"] not in within]
-    details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-    raise _input_error(model, details[0], file, len(details) - 1)
+    return sorted(details, key=lambda detail: detail["type"] != "extra_forbidden")
 
 
 def _input_error(model: type[Record], detail: ErrorDetails, file: str, others: int) -> InputError:

@@ -31,6 +31,6 @@ form.addEventListener("submit", async (event) => {
       message.textContent = (await answer.json()).error || "That did not work.";
     }
   } catch {
-    message.textContent = "The server does not answer. Is the command that serves these pages still running?";
+    message.textContent = "The server does not answer. Try again, or ask its operator.";
   }
 });

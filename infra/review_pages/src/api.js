@@ -36,6 +36,24 @@ async function ask(method, path, body) {
   return content;
 }
 
+export async function getBytes(path) {
+  const answer = await fetch(path);
+  if (answer.status === 401) location.assign("/login");
+  if (!answer.ok) throw new Refusal(answer.status, await answer.json().catch(() => ({})));
+  return answer.arrayBuffer();
+}
+
+// Send bytes, and return what the server says of them: the caller decides what a refusal means.
+export async function putBytes(path, bytes) {
+  const answer = await fetch(path, {
+    method: "PUT",
+    headers: { "content-type": "application/octet-stream", "x-form-secret": session?.form_secret ?? "" },
+    body: bytes,
+  });
+  if (answer.status === 401) location.assign("/login");
+  return { status: answer.status, content: await answer.json().catch(() => ({})) };
+}
+
 export const matchPath = (match) => `/api/matches/${encodeURIComponent(match)}`;
 
 export function picturePath(match, owner, part = "", frame = null) {

@@ -1,6 +1,7 @@
 // The people in one frame of a camera: what is seen, what the other cameras say, what was corrected.
 
 import { get, matchPath, newId, post } from "./api.js";
+import { messages } from "./messages.svelte.js";
 
 export class People {
   info = $state(null);
@@ -82,8 +83,8 @@ export class People {
       try {
         await step();
       } catch (error) {
+        messages.tell(error.message);
         await this.load(this.info.frame);
-        this.problem = error.message;
       } finally {
         this.busy = false;
       }

@@ -34,3 +34,8 @@ export const parts = (unit) => {
   const at = unit.indexOf("/");
   return [unit.slice(0, at), unit.slice(at + 1)];
 };
+
+export function bytes(count) {
+  if (count < 1e6) return `${Math.ceil(count / 1e3)} kB`;
+  return count < 1e9 ? `${(count / 1e6).toFixed(0)} MB` : `${(count / 1e9).toFixed(1)} GB`;
+}

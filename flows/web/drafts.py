@@ -1,0 +1,525 @@
+"""Matches that people create on the pages: drafts beside the inbox, until they are finished.
+
+A draft is a folder in `INBOX/.drafts`, whose dot keeps it out of every scan of the inbox. Videos
+grow in its `parts`, move to its match folder when they are whole, and the match folder moves into
+the inbox in one step. The state is on disk: a restart of the server loses none of it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from threading import Lock
+from typing import Any, Final, Literal
+
+import yaml
+from pydantic import Field, JsonValue
+
+from data_contracts.match import MatchSpec
+from data_contracts.operations import Priority
+from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
+from flows.web.browser_words import in_browser
+from flows.web.video_folders import VIDEO_SUFFIXES, is_video, open_video
+from worldpose.errors import InputError, WorldposeError
+from worldpose.formats import whole_file
+from worldpose.ingest import MatchFolder, read_match
+from worldpose.ingest.footage import require_footage
+from worldpose.ingest.validation import list_problems, validate_record
+from worldpose.store import Store
+from worldpose.video import FrameIndex, index_frames
+
+DRAFTS: Final = ".drafts"
+"""Folder of all drafts in the inbox."""
+MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
+"""Files beside videos that a person can add."""
+MAX_FILES: Final = 200
+"""Files of one draft."""
+MAX_DRAFTS: Final = 200
+SPARE_BYTES: Final = 1 << 30
+"""Disk space that a new file leaves free: results need some [byte]."""
+PIECE_BYTES: Final = 1 << 24
+"""Bytes that are copied from a named folder in one step."""
+
+LOG: Final = logging.getLogger("worldpose.pages")
+
+
+class DraftFile(Record):
+    """A file of a draft: on its way, or whole."""
+
+    id: Name
+    name: str
+    """Path in the match folder."""
+    title: str
+    """Its name where it comes from."""
+    size: Count
+    """[byte]"""
+    modified_ms: int = Field(default=0, ge=0, le=1 << 53)
+    """Time of its last change at its origin [ms]: tells whether a chosen file is the same."""
+    folder: int | None = None
+    """Index of the named folder that it is copied from; None if a browser sends it."""
+    source: str = ""
+    """Its path in that folder."""
+
+
+class Draft(Record):
+    """draft.json: a match that a person is creating."""
+
+    contract: Literal[1] = CONTRACT_VERSION
+    id: Name
+    who: str
+    created_at: datetime
+    revision: Count = 0
+    """Number of saved forms: tells whether another person saved in between."""
+    content: dict[str, JsonValue]
+    """match.yaml as filled in so far, valid or not."""
+    files: tuple[DraftFile, ...] = ()
+    finished_as: str | None = None
+    """Path in the inbox, written before the match folder moves there."""
+
+
+@dataclass
+class Drafts:
+    """The drafts of an inbox.
+
+    Attributes:
+        inbox: folder of arriving matches.
+        folders: folders whose videos people can pick.
+        store: the project, whose ids are taken.
+    """
+
+    inbox: Path
+    folders: Sequence[Path]
+    store: Store
+    _lock: Lock = field(default_factory=Lock)
+    _locks: dict[str, Lock] = field(default_factory=dict)
+    _indexes: dict[str, FrameIndex | InputError] = field(default_factory=dict)
+    _jobs: set[str] = field(default_factory=set)
+    _copying: dict[str, str] = field(default_factory=dict)
+    _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
+
+    def all(self) -> list[Draft]:
+        """Return all drafts, the newest first; one that was finished is removed."""
+        found = []
+        for folder in self._root.glob("[!.]*"):
+            with suppress(WorldposeError, OSError, ValueError):  # damaged, or just removed
+                draft = self.read(folder.name)
+                if draft.finished_as is not None and not (folder / "match").exists():
+                    shutil.rmtree(folder, ignore_errors=True)  # killed after the match had moved
+                    continue
+                found.append(draft)
+        return sorted(found, key=lambda draft: draft.created_at, reverse=True)
+
+    def create(self, who: str) -> Draft:
+        """Create an empty draft.
+
+        Raises:
+            InputError: there are too many.
+        """
+        if len(self.all()) >= MAX_DRAFTS:
+            raise _refusal("drafts", f"at most {MAX_DRAFTS}", "more", "Finish or discard some.")
+        content: dict[str, JsonValue] = {"contract": 1, "cameras": [], "clips": []}
+        draft = Draft(
+            id=secrets.token_hex(8), who=who, created_at=datetime.now(UTC), content=content
+        )
+        for inner in ("match/videos", "parts"):
+            (self._folder(draft.id) / inner).mkdir(parents=True)
+        self._write(draft)
+        return draft
+
+    def read(self, draft_id: str) -> Draft:
+        """Return a draft.
+
+        Raises:
+            InputError: there is none with this id.
+        """
+        file = self._folder(draft_id) / "draft.json"
+        try:
+            content = file.read_bytes()
+        except FileNotFoundError:
+            raise _refusal(
+                "draft", "a match being created", "none: finished or discarded", "See the queue."
+            ) from None
+        return Draft.model_validate_json(content)
+
+    def save(self, draft_id: str, content: dict[str, JsonValue], revision: int) -> bool:
+        """Save the form of a draft; return False if another one was saved since `revision`."""
+        with self._hold(draft_id):
+            draft = self.read(draft_id)
+            if draft.revision != revision:
+                return False
+            self._write(draft.model_copy(update={"content": content, "revision": revision + 1}))
+            return True
+
+    def discard(self, draft_id: str) -> None:
+        """Remove a draft with all its files."""
+        with self._hold(draft_id):
+            folder = self._folder(self.read(draft_id).id)
+            gone = folder.with_name(f".{folder.name}.discarded")
+            folder.rename(gone)
+            shutil.rmtree(gone, ignore_errors=True)
+
+    def add(self, draft_id: str, file: DraftFile) -> DraftFile:
+        """Begin a file, or return the same one that was begun before: its transfer continues.
+
+        Args:
+            draft_id: of the draft.
+            file: its id and name in the match folder are chosen here.
+
+        Raises:
+            InputError: it is no video and no file of a match folder, it is empty, the disk is too
+                small for it, or the draft has too many files.
+        """
+        title = PurePosixPath(file.title.replace("\\", "/")).name
+        if title not in MATCH_FILES and not is_video(title):
+            known = " ".join(VIDEO_SUFFIXES)
+            raise _refusal(
+                title,
+                f"a video ({known}) or one of {', '.join(sorted(MATCH_FILES))}",
+                "another file",
+                "Convert a video with any video tool.",
+            )
+        with self._hold(draft_id):
+            draft = self.read(draft_id)
+            same = {"id", "name"}
+            for each in draft.files:
+                if each.model_dump(exclude=same) == file.model_dump(exclude=same):
+                    return each
+            if len(draft.files) >= MAX_FILES or file.size == 0:
+                raise _refusal(
+                    title, f"a file with content, one of at most {MAX_FILES}", "another", "Omit it."
+                )
+            free = shutil.disk_usage(self.inbox).free
+            underway = sum(each.size - self._count_received(draft_id, each) for each in draft.files)
+            if file.size + underway + SPARE_BYTES > free:
+                raise _refusal(
+                    title,
+                    f"{(file.size + underway + SPARE_BYTES) / 1e9:.1f} GB of free disk space",
+                    f"{free / 1e9:.1f} GB at the inbox",
+                    "Free some, or ask the operator.",
+                )
+            name = _choose_name(title, {each.name for each in draft.files})
+            chosen = file.model_copy(update={"id": secrets.token_hex(6), "name": name})
+            self._write(draft.model_copy(update={"files": (*draft.files, chosen)}))
+            return chosen
+
+    def remove(self, draft_id: str, file_id: str) -> None:
+        """Remove a file from a draft."""
+        with self._hold(draft_id):
+            draft, file = self._find(draft_id, file_id)
+            files = tuple(each for each in draft.files if each.id != file_id)
+            self._write(draft.model_copy(update={"files": files}))
+            for path in (self._part(draft_id, file), self._whole(draft_id, file)):
+                path.unlink(missing_ok=True)
+
+    def append(self, draft_id: str, file_id: str, offset: int, chunk: bytes) -> tuple[bool, int]:
+        """Append a chunk that a browser sent; return whether it fitted, and the bytes now there.
+
+        A chunk at another place than the end is not taken: the browser continues at the end.
+
+        Raises:
+            InputError: there is no such file, or the chunk is longer than its rest.
+        """
+        with self._hold(draft_id):
+            _, file = self._find(draft_id, file_id)
+            received = self._count_received(draft_id, file)
+            if file.folder is not None or offset != received:
+                return False, received
+            if received + len(chunk) > file.size:
+                raise _refusal(
+                    file.title, f"{file.size} bytes", "more", "Remove it, and choose it again."
+                )
+            self._write_piece(draft_id, file, chunk)
+            return True, received + len(chunk)
+
+    def view(self, draft_id: str) -> dict[str, Any]:
+        """Return a draft for the pages, with all that is wrong or missing.
+
+        Raises:
+            InputError: there is none with this id.
+        """
+        with self._hold(draft_id):  # it writes match.yaml
+            return self._view(self.read(draft_id))
+
+    def _view(self, draft: Draft) -> dict[str, Any]:
+        files = [self._describe_file(draft.id, file) for file in draft.files]
+        problems = self._problems(draft, files)
+        return {
+            "id": draft.id,
+            "who": draft.who,
+            "created_at": draft.created_at,
+            "revision": draft.revision,
+            "content": draft.content,
+            "files": files,
+            "problems": problems,
+            "is_ready": not problems,
+        }
+
+    def finish(self, draft_id: str, priority: Priority) -> str:
+        """Move a draft's match folder into the inbox in one step; return its path there.
+
+        Raises:
+            InputError: something is wrong or missing.
+        """
+        with self._hold(draft_id):
+            draft = self.read(draft_id)
+            problems = self._view(draft)["problems"]
+            if problems:
+                raise _refusal(
+                    "match", "nothing missing", problems[0]["message"], "Complete it, then finish."
+                )
+            match_id = str(draft.content["match_id"])
+            name = match_id if priority == "normal" else f"{priority}/{match_id}"
+            folder = self._folder(draft_id)
+            target = self.inbox / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            self._write(draft.model_copy(update={"finished_as": name}))
+            try:
+                (folder / "match").rename(target)
+            except OSError:
+                self._write(draft)
+                raise
+            shutil.rmtree(folder, ignore_errors=True)
+            return name
+
+    def continue_copies(self) -> None:
+        """Continue the copies that a restart of the server interrupted."""
+        for draft in self.all():
+            for file in draft.files:
+                self._describe_file(draft.id, file)
+
+    @property
+    def _root(self) -> Path:
+        return self.inbox / DRAFTS
+
+    def _folder(self, draft_id: str) -> Path:
+        if not re.fullmatch(r"[0-9a-f]{16}", draft_id):
+            raise _refusal("draft", "the id of a draft", "another text", "See the queue.")
+        return self._root / draft_id
+
+    def _part(self, draft_id: str, file: DraftFile) -> Path:
+        return self._folder(draft_id) / "parts" / file.id
+
+    def _whole(self, draft_id: str, file: DraftFile) -> Path:
+        return self._folder(draft_id) / "match" / file.name
+
+    def _write(self, draft: Draft) -> None:
+        with whole_file(self._folder(draft.id) / "draft.json") as file:
+            file.write_text(draft.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+    @contextmanager
+    def _hold(self, draft_id: str) -> Iterator[None]:
+        """Hold a draft: one change at a time."""
+        self._folder(draft_id)
+        with self._lock:
+            lock = self._locks.setdefault(draft_id, Lock())
+        with lock:
+            yield
+
+    def _find(self, draft_id: str, file_id: str) -> tuple[Draft, DraftFile]:
+        draft = self.read(draft_id)
+        for file in draft.files:
+            if file.id == file_id:
+                return draft, file
+        raise _refusal("file", "a file of this match", "one that was removed", "Choose it again.")
+
+    def _count_received(self, draft_id: str, file: DraftFile) -> int:
+        if self._whole(draft_id, file).exists():
+            return file.size
+        with suppress(FileNotFoundError):
+            return self._part(draft_id, file).stat().st_size
+        return 0
+
+    def _write_piece(self, draft_id: str, file: DraftFile, piece: bytes) -> None:
+        """Append bytes to a file that is on its way, all or none; move it when it is whole."""
+        part = self._part(draft_id, file)
+        with part.open("ab", buffering=0) as opened:
+            before = opened.seek(0, os.SEEK_END)
+            try:
+                rest = memoryview(piece)
+                while rest:
+                    rest = rest[opened.write(rest) :]
+                os.fdatasync(opened.fileno())
+            except OSError:  # the disk is full: what it took of the piece is removed
+                opened.truncate(before)
+                raise
+            size = before + len(piece)
+        if size == file.size:
+            part.rename(self._whole(draft_id, file))
+
+    def _describe_file(self, draft_id: str, file: DraftFile) -> dict[str, Any]:
+        """Return the state of a file; begin what is to be done with it in the background."""
+        received = self._count_received(draft_id, file)
+        content = {**file.model_dump(), "received": received, "problem": ""}
+        key = f"{draft_id} {file.id}"
+        if received < file.size:
+            if file.folder is None:
+                return {**content, "state": "uploading"}
+            problem = self._copying.get(key, "")
+            if not problem:
+                self._begin(key, self._copy, draft_id, file)
+            return {**content, "state": "broken" if problem else "copying", "problem": problem}
+        if not is_video(file.name):
+            return {**content, "state": "ready"}
+        index = self._indexes.get(key)
+        if index is None:
+            self._begin(key, self._read_index, draft_id, file)
+            return {**content, "state": "reading"}
+        if isinstance(index, InputError):
+            problem = f"expected {index.expected}, found {_shorten(index.found)}. {index.todo}"
+            return {**content, "state": "broken", "problem": problem}
+        width, height = index.size
+        shape = {"width": width, "height": height, "fps": index.fps, "frames": len(index)}
+        return {**content, "state": "ready", **shape}
+
+    def _begin(self, key: str, job: Any, draft_id: str, file: DraftFile) -> None:  # noqa: ANN401
+        with self._lock:
+            if key in self._jobs:
+                return
+            self._jobs.add(key)
+
+        def work() -> None:
+            try:
+                job(key, draft_id, file)
+            except Exception:
+                LOG.exception("%s of a match being created", file.title)
+            finally:
+                self._jobs.discard(key)
+
+        self._pool.submit(work)
+
+    def _read_index(self, key: str, draft_id: str, file: DraftFile) -> None:
+        path = self._whole(draft_id, file)
+        try:
+            self._indexes[key] = index_frames(path)
+        except InputError as error:
+            self._indexes[key] = error
+
+    def _copy(self, key: str, draft_id: str, file: DraftFile) -> None:
+        """Copy a video from a named folder, from where an earlier copy ended."""
+        assert file.folder is not None  # the caller asks for a copy only of such files
+        try:
+            with open_video(self.folders, file.folder, file.source) as source:
+                while True:
+                    status = os.fstat(source)
+                    is_same = status.st_mtime_ns // 1_000_000 == file.modified_ms
+                    if not is_same or status.st_size != file.size:
+                        self._copying[key] = (
+                            "It changed while it was copied. Remove it, pick it again."
+                        )
+                        return
+                    with self._hold(draft_id):
+                        self._find(draft_id, file.id)
+                        received = self._count_received(draft_id, file)
+                        piece = os.pread(source, PIECE_BYTES, received)
+                        if received < file.size and piece:
+                            self._write_piece(draft_id, file, piece)
+                    if received + len(piece) >= file.size or not piece:
+                        return
+        except InputError as error:
+            self._copying[key] = str(error)
+        except OSError as error:
+            self._copying[key] = error.strerror or str(error)
+
+    def _problems(self, draft: Draft, files: list[dict[str, Any]]) -> list[dict[str, str]]:
+        """Return what is wrong or missing, each with its place in match.yaml or a file's name."""
+        found = [
+            _describe(error) for error in list_problems(MatchSpec, draft.content, "match.yaml")
+        ]
+        cameras = draft.content.get("cameras")
+        used = {
+            str(camera.get("video"))
+            for camera in (cameras if isinstance(cameras, list) else [])
+            if isinstance(camera, dict)
+        }
+        for file in files:
+            title, state = str(file["title"]), file["state"]
+            share = f"{100 * file['received'] // file['size']} % of it are there"
+            said = {
+                "uploading": f"{title}: {share}",
+                "copying": f"{title}: {share}",
+                "reading": f"{title} is being read",
+                "broken": f"{title}: {file['problem']}",
+            }.get(state)
+            if said is None and is_video(title) and file["name"] not in used:
+                said = f"{title} belongs to no camera: choose it at its camera, or remove it"
+            if said is not None:
+                found.append({"place": f"file {file['id']}", "message": said})
+        return found or self._folder_problems(draft)
+
+    def _folder_problems(self, draft: Draft) -> list[dict[str, str]]:
+        """Return the errors that ingest finds in the match folder."""
+        folder = self._folder(draft.id) / "match"
+        with whole_file(folder / "match.yaml") as file:
+            file.write_text(
+                yaml.safe_dump(draft.content, sort_keys=False, allow_unicode=True), encoding="utf-8"
+            )
+        spec = validate_record(MatchSpec, draft.content, "match.yaml")
+        is_taken = spec.match_id in self.store.matches()
+        if is_taken or any((self.inbox / at / spec.match_id).exists() for at in (".", *_QUEUES)):
+            message = "expected an id of its own, found that of another match. Choose another one."
+            return [{"place": "match_id", "message": message}]
+        try:
+            match = read_match(folder)
+        except InputError as error:
+            return [_describe(error, folder)]
+        return list(self._footage_problems(draft, match))
+
+    def _footage_problems(self, draft: Draft, match: MatchFolder) -> Iterator[dict[str, str]]:
+        by_name = {file.name: file for file in draft.files}
+        owners = {clip.id: clip.broadcast for clip in match.spec.clips}
+        numbers = {camera.id: number for number, camera in enumerate(match.spec.cameras)}
+        for unit, path in match.videos.items():
+            file = by_name[path.relative_to(match.folder).as_posix()]
+            index = self._indexes.get(f"{draft.id} {file.id}")
+            assert isinstance(index, FrameIndex)  # all files are whole and read
+            try:
+                require_footage(match.spec, unit, path, index)
+            except InputError as error:
+                number = numbers[owners.get(unit) or unit]
+                yield {**_describe(error, match.folder), "place": f"cameras[{number}].video"}
+
+
+_QUEUES: Final = ("urgent", "background")
+
+
+def _describe(error: InputError, folder: Path | None = None) -> dict[str, str]:
+    """Return an error's place in match.yaml, and its message without paths of this machine."""
+    where, todo = error.where, in_browser(error.todo)
+    message = f"expected {error.expected}, found {error.found}. {todo}"
+    if folder is not None:
+        where = where.replace(f"{folder}/", "").replace(str(folder), "the match")
+        message = message.replace(f"{folder}/", "")
+    file, _, place = where.partition(": ")
+    if file != "match.yaml":
+        return {"place": "", "message": f"{where}: {message}"}
+    return {"place": place, "message": message}
+
+
+def _choose_name(title: str, taken: set[str]) -> str:
+    """Return a path in the match folder that is not taken, with safe characters only."""
+    if title in MATCH_FILES:
+        if title in taken:
+            raise _refusal(title, "one such file", "a second one", "Remove the first one.")
+        return title
+    stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or "video"
+    names = (f"videos/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
+    return next(name for name in names if name not in taken)
+
+
+def _shorten(text: str) -> str:
+    """Return a message without the path of the file that it names."""
+    return re.sub(r"'?/[^ ']*/", "", text)
+
+
+def _refusal(where: str, expected: str, found: str, todo: str) -> InputError:
+    return InputError(where, expected=expected, found=found, todo=todo)

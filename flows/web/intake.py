@@ -1,0 +1,194 @@
+"""Creation of matches on a page: uploads, picked videos, the form of match.yaml, and the inbox."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import JSONResponse
+from pydantic import Field, JsonValue
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from data_contracts.operations import Priority
+from data_contracts.records import Count, Record
+from flows.service.layout import served_state
+from flows.web.app_context import PageContext, Person
+from flows.web.browser_words import in_browser
+from flows.web.drafts import DraftFile, Drafts
+from flows.web.video_folders import list_videos, open_video
+
+CHUNK_BYTES: Final = 1 << 23
+"""Maximum size of one chunk of an upload [byte]."""
+CHUNK_SUFFIX: Final = "/bytes"
+"""Suffix of the paths that take chunks; all others take JSON."""
+
+
+@dataclass(frozen=True)
+class Intake:
+    """Where pages put new matches, and where they find videos.
+
+    Attributes:
+        inbox: folder of arriving matches.
+        folders: folders whose videos people can pick, read-only.
+    """
+
+    inbox: Path
+    folders: Sequence[Path] = ()
+
+
+class SavedForm(Record):
+    """The form of a match that is being created."""
+
+    revision: Count
+    """Of the form that the person saw."""
+    content: dict[str, JsonValue]
+    """match.yaml as filled in so far."""
+
+
+class NewUpload(Record):
+    """A file that the browser will send in chunks."""
+
+    name: str = Field(min_length=1, max_length=255)
+    size: Count
+    """[byte]"""
+    modified_ms: int = Field(default=0, ge=0, le=1 << 53)
+    """Time of its last change [ms]."""
+
+
+class Pick(Record):
+    """A video of a named folder."""
+
+    folder: int
+    """Index of the folder."""
+    path: str = Field(min_length=1, max_length=4096)
+    """Path in the folder."""
+
+
+class Finish(Record):
+    """The request to put a match into the inbox."""
+
+    priority: Priority = "normal"
+
+
+def routes(context: PageContext, intake: Intake | None) -> APIRouter:
+    """Create the routes of arrivals and of matches being created.
+
+    Args:
+        context: shared context of all pages.
+        intake: inbox and folders; None: this server creates no matches.
+    """
+    router = APIRouter()
+
+    @router.get("/api/inbox")
+    def inbox() -> dict[str, Any]:
+        arrivals = served_state(context.store.url).arrivals().values()
+        return {
+            "inbox": None if intake is None else str(intake.inbox),
+            "folders": [] if intake is None else [str(folder) for folder in intake.folders],
+            "arrivals": [
+                {**each.model_dump(mode="json"), "reason": in_browser(each.reason)}
+                for each in arrivals
+                if each.state != "taken"
+            ],
+        }
+
+    if intake is not None:
+        drafts = Drafts(intake.inbox, intake.folders, context.store)
+        Thread(target=drafts.continue_copies, daemon=True).start()
+        router.include_router(_draft_routes(drafts, intake))
+    return router
+
+
+def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
+    router = APIRouter(prefix="/api/drafts")
+
+    @router.get("")
+    def all_drafts() -> dict[str, Any]:
+        return {
+            "drafts": [
+                {
+                    "id": draft.id,
+                    "match_id": draft.content.get("match_id"),
+                    "who": draft.who,
+                    "created_at": draft.created_at,
+                    "files": len(draft.files),
+                }
+                for draft in drafts.all()
+            ]
+        }
+
+    @router.post("")
+    def create(who: Person) -> dict[str, Any]:
+        return {"id": drafts.create(who).id}
+
+    @router.get("/videos")
+    def videos(folder: int, path: Annotated[str, Query(max_length=4096)] = "") -> dict[str, Any]:
+        return list_videos(intake.folders, folder, path)
+
+    @router.get("/{draft}")
+    def view(draft: str) -> dict[str, Any]:
+        return drafts.view(draft)
+
+    @router.post("/{draft}/form")
+    def save(draft: str, given: SavedForm) -> dict[str, Any]:
+        if not drafts.save(draft, given.content, given.revision):
+            raise HTTPException(409, "another page saved this form first: load it again")
+        return drafts.view(draft)
+
+    @router.post("/{draft}/files")
+    def begin_upload(draft: str, given: NewUpload) -> dict[str, Any]:
+        file = DraftFile(
+            id="new", name="", title=given.name, size=given.size, modified_ms=given.modified_ms
+        )
+        return {"file": drafts.add(draft, file).id}
+
+    @router.post("/{draft}/picks")
+    def pick(draft: str, given: Pick) -> dict[str, Any]:
+        with open_video(intake.folders, given.folder, given.path) as video:
+            status = os.fstat(video)
+        file = DraftFile(
+            id="new",
+            name="",
+            title=given.path.rpartition("/")[2],
+            size=status.st_size,
+            modified_ms=max(0, status.st_mtime_ns // 1_000_000),
+            folder=given.folder,
+            source=given.path,
+        )
+        drafts.add(draft, file)
+        return drafts.view(draft)
+
+    @router.put("/{draft}/files/{file}" + CHUNK_SUFFIX)
+    async def take_chunk(
+        draft: str, file: str, offset: Annotated[int, Query(ge=0)], request: Request
+    ) -> JSONResponse:
+        try:
+            chunk = await request.body()
+        except ClientDisconnect:
+            # Nothing of the chunk is kept: the browser sends it again.
+            return JSONResponse({"error": "the connection ended"}, status_code=400)
+        # Writing waits for the disk: other requests are answered meanwhile.
+        is_taken, received = await run_in_threadpool(drafts.append, draft, file, offset, chunk)
+        return JSONResponse({"received": received}, status_code=200 if is_taken else 409)
+
+    @router.post("/{draft}/files/{file}/removal")
+    def remove(draft: str, file: str) -> dict[str, Any]:
+        drafts.remove(draft, file)
+        return drafts.view(draft)
+
+    @router.post("/{draft}/removal")
+    def discard(draft: str) -> dict[str, Any]:
+        drafts.discard(draft)
+        return {"discarded": draft}
+
+    @router.post("/{draft}/finish")
+    def finish(draft: str, given: Finish) -> dict[str, Any]:
+        return {"arrived": drafts.finish(draft, given.priority)}
+
+    return router

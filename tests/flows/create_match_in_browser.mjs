@@ -1,0 +1,74 @@
+// A person creates a match: uploads a video over a slow line while the server restarts and the page is loaded again, picks
+// another one on the server, fills in the form, and puts the match into the inbox. Prints what it saw as one JSON object.
+
+import { existsSync, writeFileSync } from "node:fs";
+import { open, shoot, task, tell } from "../chromium.mjs";
+
+const seen = { errors: [], outside: [] };
+const page = await open(seen, 900);
+page.on("dialog", (dialog) => dialog.accept());
+await page.goto(`${task.base}/login#token=${task.token}`);
+await page.fill("#who", "Ada");
+await page.click("button");
+await page.waitForSelector("[data-create]");
+await page.waitForSelector("text=No match is registered");
+seen.empty = await page.locator("main").innerText();
+await shoot(page, "empty");
+
+await page.click("[data-create]");
+await page.waitForSelector("[data-missing]");
+await shoot(page, "new");
+seen.link = page.url();
+const line = await page.context().newCDPSession(page);
+const slow = (bytes) =>
+  line.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: bytes });
+const percent = (least) =>
+  page.waitForFunction((wanted) => {
+    const bar = document.querySelector("progress");
+    return bar && bar.value >= wanted * bar.max;
+  }, least);
+
+await slow(task.size / 12);
+await page.setInputFiles("[data-upload]", task.video);
+await percent(0.1);
+await shoot(page, "uploading");
+writeFileSync(`${task.signal}.restart`, ""); // the test restarts the server now
+await page.waitForSelector("li[data-file] >> text=trying again");
+await shoot(page, "waiting");
+writeFileSync(`${task.signal}.seen`, "");
+await percent(0.4);
+seen.restarted = existsSync(`${task.signal}.restarted`);
+await page.reload();
+await page.waitForSelector("text=choose the same file again, and it continues");
+seen.kept = await page.evaluate(() => document.querySelector("progress").value);
+await shoot(page, "interrupted");
+await slow(-1);
+await page.setInputFiles("[data-upload]", task.video);
+await page.waitForSelector('li[data-state="ready"]');
+
+await page.click("text=Pick videos on the server");
+await page.click("text=📁 day 1");
+await page.waitForSelector("text=second.mp4");
+await shoot(page, "picking");
+await page.click("dialog li >> text=Pick");
+await page.waitForSelector("text=✓ picked");
+await page.click("dialog >> text=Close");
+await page.waitForFunction(() => document.querySelectorAll('li[data-state="ready"]').length === 2);
+await page.click("text=Add cameras for 2 videos");
+await page.fill('[data-field="match_id"]', "cup final");
+await page.waitForSelector("label.wrong >> text=letters, digits");
+seen.message = await page.locator("label.wrong .said").innerText();
+await shoot(page, "wrong");
+await page.fill('[data-field="match_id"]', "cup_final");
+await page.waitForSelector("text=Nothing is missing");
+for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
+  await page.setViewportSize({ width, height });
+  seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  await shoot(page, `ready_${width}`);
+}
+await page.click("[data-finish]");
+await page.waitForSelector("text=cup_final");
+await shoot(page, "arrived");
+// The restart was meant: while the server was away, the browser said so in its console.
+seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|409|Failed to fetch/.test(text));
+await tell(seen);

@@ -1,0 +1,34 @@
+// Looks at the 3D view of a complete run; prints what it saw as one JSON object.
+
+import { logIn, open, shoot, task, tell } from "../chromium.mjs";
+
+const seen = { errors: [], outside: [] };
+const page = await open(seen, 900);
+await logIn(page, task.base, "Ada");
+await page.goto(`${task.base}/#/match/${encodeURIComponent(task.match)}`);
+await page.click("text=in 3D");
+await page.waitForSelector('[data-scene="ready"]');
+const canvas = page.locator("[data-scene]");
+await page.waitForTimeout(1500);
+await canvas.screenshot({ path: task.picture });
+for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
+  await page.setViewportSize({ width, height });
+  await page.waitForTimeout(700);
+  seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  await shoot(page, `view_${width}`);
+}
+await page.setViewportSize({ width: 1280, height: 720 });
+seen.first = Number(await canvas.getAttribute("data-frame"));
+await page.locator("[data-scrub]").fill("7");
+await page.waitForFunction((first) => Number(document.querySelector("[data-scene]").dataset.frame) === first + 7, seen.first);
+await page.keyboard.press("ArrowRight");
+await page.click("[data-play]");
+await page.waitForFunction((first) => Number(document.querySelector("[data-scene]").dataset.frame) !== first + 8, seen.first);
+await page.click("[data-play]");
+await page.selectOption("[aria-label=Camera]", "cam00");
+await page.waitForTimeout(500);
+await shoot(page, "through_cam00");
+await page.click(".people button >> nth=0");
+await page.waitForTimeout(500);
+await shoot(page, "follow");
+await tell(seen);

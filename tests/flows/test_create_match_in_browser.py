@@ -1,0 +1,93 @@
+"""A match is created in a real browser, through a restart of the server and a reload."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import page_client
+import pytest
+from chromium import IN_BROWSER, drive
+
+from worldpose.ingest import read_match
+from worldpose.store import Store
+from worldpose.video import write_video
+
+pytestmark = [*IN_BROWSER, pytest.mark.timeout(900)]
+SCRIPT = Path(__file__).with_name("create_match_in_browser.mjs")
+SERVER = """
+import sys
+from pathlib import Path
+from flows.web.access import access_for
+from flows.web.intake import Intake
+from flows.web.serving import serve
+place, port, token = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+access = access_for("127.0.0.1", token=token, names=(), secure=False)
+intake = Intake(place / "inbox", (place / "videos",))
+serve(str(place / "project"), access, host="127.0.0.1", port=port, tls=None, intake=intake)
+"""
+
+
+def write_noise(file, frames):
+    """A video that does not compress."""
+    random = np.random.default_rng(0)
+    images = (random.integers(0, 256, (180, 320, 3), dtype=np.uint8) for _ in range(frames))
+    write_video(file, images, 25, quality=10)
+
+
+def wait_for(file):
+    while not file.exists():
+        time.sleep(0.05)
+
+
+def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
+    Store.create(str(tmp_path / "project"))
+    (tmp_path / "inbox").mkdir()
+    recordings = tmp_path / "videos" / "day 1"
+    recordings.mkdir(parents=True)
+    write_noise(tmp_path / "first.mp4", 60)
+    write_noise(recordings / "second.mp4", 40)
+    size = (tmp_path / "first.mp4").stat().st_size
+    assert size > 2_000_000
+    port, signal = page_client.free_port(), tmp_path / "signal"
+    command = [sys.executable, "-c", SERVER, str(tmp_path), str(port), page_client.TOKEN]
+    servers = [subprocess.Popen(command, env=os.environ)]
+
+    def restart():
+        wait_for(signal.with_suffix(".restart"))
+        servers[0].kill()
+        servers[0].wait()
+        wait_for(signal.with_suffix(".seen"))
+        servers.append(subprocess.Popen(command, env=os.environ))
+        signal.with_suffix(".restarted").touch()
+
+    threading.Thread(target=restart, daemon=True).start()
+    base = f"http://127.0.0.1:{port}"
+    try:
+        page_client.wait_until_up(base)
+        task = {
+            "base": base,
+            "token": page_client.TOKEN,
+            "video": str(tmp_path / "first.mp4"),
+            "size": size,
+            "signal": str(signal),
+        }
+        seen = drive(SCRIPT, task, tmp_path, 600)
+    finally:
+        for server in servers:
+            server.kill()
+            server.wait()
+    assert str(tmp_path / "inbox") in seen["empty"]
+    assert "worldpose" not in seen["empty"].lower().replace(str(tmp_path).lower(), "")
+    assert seen["restarted"]
+    assert seen["kept"] >= 0.4 * size  # nothing that was sent before is sent again
+    assert "letters, digits" in seen["message"]
+    assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
+    match = read_match(tmp_path / "inbox" / "cup_final")
+    first, second = (match.videos[name].read_bytes() for name in ("first", "second"))
+    assert first == (tmp_path / "first.mp4").read_bytes()
+    assert second == (recordings / "second.mp4").read_bytes()
+    assert (match.spec.fps, match.spec.clips[0].frame_count) == (25, 40)

@@ -1,0 +1,116 @@
+"""Corrections of a match on its page: in groups, with first clicks apart, and undone together."""
+
+from datetime import timedelta
+from itertools import pairwise
+
+import page_client
+import pytest
+from command_line import TINY
+from long_journal import SESSION, write_corrections
+from page_client import MATCH
+
+from data_contracts.review import MovedPoint
+from flows.registering import open_for_review, register
+from flows.review.corrections import keep_edits
+from flows.web.browser_words import in_browser
+from flows.web.corrections import SESSION_GAP
+from worldpose.store import Store
+
+
+@pytest.fixture
+def store(tiny, tmp_path):
+    """A project with a match that was not run."""
+    store = Store.create(str(tmp_path / "project"))
+    register(store, tiny, unfinished=True)
+    return store
+
+
+@pytest.fixture
+def ada(store, tmp_path):
+    return page_client.log_in(page_client.served(tmp_path / "project"), "Ada")
+
+
+def groups(browser):
+    return browser.get(MATCH).json()["groups"]
+
+
+def test_corrections_are_grouped_by_person_camera_and_session(store, ada):
+    count = 3 * SESSION + 10
+    write_corrections(store, TINY, count)
+    found = groups(ada)
+    assert timedelta(hours=1) > SESSION_GAP  # sessions of the journal are an hour apart
+    assert [group["who"] for group in found] == ["Bob", "Ada", "Bob", "Ada"]
+    assert [group["count"] for group in found] == [11, SESSION, SESSION, SESSION - 1]
+    assert {group["owner"] for group in found} == {"cam00"}
+    assert found[1]["kinds"] == {"moved_point": SESSION // 10, "moved_keypoint": SESSION * 9 // 10}
+    assert ada.get("/api/matches").json()["matches"][0]["corrections"] == count
+    path = f"{MATCH}/corrections/{found[1]['id']}"
+    pages = [ada.get(f"{path}?skip={skip}").json()["corrections"] for skip in (0, 200, 400, 600)]
+    assert [len(page) for page in pages] == [200, 200, 100, 0]
+    ids = [each["id"] for page in pages for each in page]
+    assert len(set(ids)) == SESSION
+    assert ids[-1] == found[1]["id"]
+
+
+def test_a_group_is_undone_as_a_whole_and_only_as_it_was_seen(store, ada):
+    write_corrections(store, TINY, SESSION + 10)
+    last, first = groups(ada)
+    path = f"{MATCH}/corrections/{last['id']}/withdrawal"
+    assert ada.post(path, json={"count": last["count"] - 1}).status_code == 409
+    entries = len(open_for_review(store, TINY).journal.entries)
+    answer = ada.post(path, json={"count": last["count"], "why": "wrong camera"})
+    assert answer.json() == {"withdrawn": last["count"]}
+    assert groups(ada) == [first]
+    journal = open_for_review(store, TINY).journal
+    assert len(journal.entries) == entries + 1  # all or none, however many there are
+    assert {each.why for each in journal.entries[-1].records} == {"wrong camera"}
+    assert ada.post(path, json={"count": last["count"]}).status_code == 409
+    assert ada.post(f"{MATCH}/corrections/none/withdrawal", json={"count": 0}).status_code == 409
+
+
+def test_first_clicks_are_no_corrections(store, ada):
+    clicked = open_for_review(store, TINY).folder.clicked["cam01"].points[0]
+    places = [(clicked.xy[0] + n, clicked.xy[1]) for n in range(3)]
+    for number, (was, xy) in enumerate(pairwise(places)):
+        edit = MovedPoint(camera="cam01", marking=clicked.name, was=was, xy=xy)
+        keep_edits(
+            store, lambda: open_for_review(store, TINY), {f"m.{number}": edit}, who="Ada", note=""
+        )
+    (match,) = ada.get("/api/matches").json()["matches"]
+    assert (match["corrections"], match["first_clicks"]) == (0, 2)
+    (group,) = groups(ada)
+    assert (group["is_first"], group["count"], group["owner"]) == (True, 2, "cam01")
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("It is dark.", "It is dark."),
+        ("Run it first: worldpose run final.", "Run the match on its page."),
+        ("Read with `worldpose review show`, go on.", "The page of the match shows what waits."),
+        ("Use --set a.click_noise_px=2.", "Ask the operator of this service."),
+        (
+            "It moved. Run worldpose run x --gates auto. It is late.",
+            "It moved. Run the match on its page. It is late.",
+        ),
+        ("the worldpose-data folder", "the worldpose-data folder"),
+    ],
+)
+def test_a_page_names_no_command(said, shown):
+    assert in_browser(said) == shown
+
+
+def test_what_is_refused_on_a_page_names_no_command(ada):
+    gone = ada.post(f"{MATCH}/withdrawals", json={"correction": "none"})
+    assert gone.status_code == 422
+    assert "no such correction" in gone.json()["error"]
+    for path in ("results", "results/report", "detections/cam00", "identities/clip"):
+        answer = ada.get(f"{MATCH}/{path}")
+        assert answer.status_code >= 400
+        said = str(answer.json().get("error", answer.json()))
+        assert "worldpose run" not in said
+        assert "`worldpose" not in said
+    for page in ("/login", "/login/page.js", "/status"):
+        text = ada.get(page).text
+        assert "worldpose serve" not in text
+        assert "command" not in text

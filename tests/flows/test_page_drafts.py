@@ -1,0 +1,375 @@
+"""People create a match on the pages: uploads, picked videos, the form, and the inbox."""
+
+import os
+import shutil
+import threading
+import time
+
+import numpy as np
+import page_client
+import pytest
+import yaml
+
+from flows.service.inbox import entries, fingerprint_of, missing_of
+from flows.web.access import access_for
+from flows.web.app import create_app
+from flows.web.intake import CHUNK_BYTES, Intake
+from worldpose.ingest import read_match
+from worldpose.store import Store
+from worldpose.video import write_video
+
+DRAFTS = "/api/drafts"
+SIZE, FPS, FRAMES = (96, 64), 25, 12
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory):
+    """A small video."""
+    file = tmp_path_factory.mktemp("footage") / "near left.mp4"
+    images = (np.full((SIZE[1], SIZE[0], 3), 5 * n, dtype=np.uint8) for n in range(FRAMES))
+    write_video(file, images, FPS, quality=30)
+    return file
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A project, its inbox, and a folder of videos that the operator named."""
+    Store.create(str(tmp_path / "project"))
+    for name in ("inbox", "videos"):
+        (tmp_path / name).mkdir()
+    return tmp_path
+
+
+def open_pages(place, who="Ada"):
+    """A browser at a server that has just started."""
+    access = access_for("127.0.0.1", token=page_client.TOKEN, names=(), secure=False)
+    intake = Intake(place / "inbox", (place / "videos",))
+    return page_client.log_in(create_app(str(place / "project"), access, intake), who)
+
+
+def put(browser, draft, file, offset, chunk):
+    path = f"{DRAFTS}/{draft}/files/{file}/bytes?offset={offset}"
+    return browser.put(path, content=chunk, headers={"content-type": "application/octet-stream"})
+
+
+def begin(browser, file):
+    """A new draft with one file that is to be uploaded."""
+    draft = browser.post(DRAFTS, json={}).json()["id"]
+    new = {"name": file.name, "size": file.stat().st_size, "modified_ms": 1}
+    return draft, browser.post(f"{DRAFTS}/{draft}/files", json=new).json()["file"], new
+
+
+def upload(browser, file):
+    draft, file_id, _ = begin(browser, file)
+    assert put(browser, draft, file_id, 0, file.read_bytes()).status_code == 200
+    return draft, settle(browser, draft)
+
+
+def settle(browser, draft, state="ready"):
+    """The draft when all its files have a state."""
+    for _ in range(300):
+        view = browser.get(f"{DRAFTS}/{draft}").json()
+        if all(file["state"] == state for file in view["files"]):
+            return view
+        time.sleep(0.05)
+    raise AssertionError(view["files"])
+
+
+def save(browser, view, content):
+    return browser.post(
+        f"{DRAFTS}/{view['id']}/form", json={"revision": view["revision"], "content": content}
+    )
+
+
+def a_match(file, **changes):
+    camera = {"id": "near_left", "width": SIZE[0], "height": SIZE[1], "video": file}
+    return {
+        "contract": 1,
+        "match_id": "final",
+        "fps": FPS,
+        "cameras": [camera | changes.pop("camera", {})],
+        "clips": [{"id": "goal", "frame_count": FRAMES}],
+        **changes,
+    }
+
+
+def test_an_uploaded_match_arrives_whole(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    (file,) = view["files"]
+    assert (file["name"], file["width"], file["height"]) == ("videos/near_left.mp4", *SIZE)
+    assert (file["fps"], file["frames"]) == (pytest.approx(FPS), FRAMES)
+    assert not view["is_ready"]
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    assert answer.status_code == 422
+    assert list(entries(place / "inbox")) == []
+    view = save(ada, view, a_match(file["name"])).json()
+    assert (view["problems"], view["is_ready"]) == ([], True)
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", json={"priority": "urgent"})
+    assert answer.json() == {"arrived": "urgent/final"}
+    (arrived,) = entries(place / "inbox")
+    assert (arrived.name, missing_of(arrived.path)) == ("urgent/final", "")
+    assert fingerprint_of(arrived.path)  # no links, only plain files
+    match = read_match(arrived.path)
+    assert match.videos["near_left"].read_bytes() == footage.read_bytes()
+    assert ada.get(DRAFTS).json() == {"drafts": []}
+    assert list((place / "inbox" / ".drafts").iterdir()) == []
+
+
+def test_an_upload_survives_a_reload_and_a_restart(place, footage):
+    content = footage.read_bytes()
+    draft, file, new = begin(ada := open_pages(place), footage)
+    assert put(ada, draft, file, 0, content[:700]).json() == {"received": 700}
+    ada = open_pages(place)  # another process with the same token would be no different
+    again = ada.post(f"{DRAFTS}/{draft}/files", json=new).json()["file"]
+    assert again == file
+    # Sent again, or with a gap: not taken, and the browser learns where to continue.
+    for offset in (0, 900):
+        answer = put(ada, draft, file, offset, content[offset : offset + 10])
+        assert (answer.status_code, answer.json()) == (409, {"received": 700})
+    assert put(ada, draft, file, 700, content[700:] + b"more").status_code == 422
+    assert put(ada, draft, file, 700, content[700:]).json() == {"received": len(content)}
+    settle(ada, draft)
+    whole = place / "inbox" / ".drafts" / draft / "match" / "videos" / "near_left.mp4"
+    assert whole.read_bytes() == content
+    # Another file of the same name is another file.
+    other = ada.post(f"{DRAFTS}/{draft}/files", json={**new, "modified_ms": 2}).json()["file"]
+    assert other != file
+
+
+def test_chunks_from_two_pages_are_not_mixed(place, footage):
+    content = footage.read_bytes()
+    ada = open_pages(place)
+    bob = page_client.log_in(ada.app, "Bob")
+    draft, file, _ = begin(ada, footage)
+
+    def send(browser):
+        offset = 0
+        while offset < len(content):
+            answer = put(browser, draft, file, offset, content[offset : offset + 97])
+            offset = answer.json()["received"]
+
+    threads = [threading.Thread(target=send, args=[each]) for each in (ada, bob)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    settle(ada, draft)
+    whole = place / "inbox" / ".drafts" / draft / "match" / "videos" / "near_left.mp4"
+    assert whole.read_bytes() == content
+
+
+def test_the_form_has_the_messages_of_match_yaml_at_its_fields(place, footage):
+    ada = open_pages(place)
+    _, view = upload(ada, footage)
+    name = view["files"][0]["name"]
+    wrong = a_match(name, camera={"id": "near left", "heigth": 64, "offset_frames": "3"}, fps=0)
+    said = {each["place"]: each["message"] for each in save(ada, view, wrong).json()["problems"]}
+    assert set(said) == {"fps", "cameras[0].id", "cameras[0].heigth", "cameras[0].offset_frames"}
+    assert "Did you mean 'height'?" in said["cameras[0].heigth"]
+    folder = place / "by hand"
+    folder.mkdir()
+    (folder / "match.yaml").write_text(yaml.safe_dump(wrong))
+    with pytest.raises(Exception, match="Did you mean 'height'") as error:
+        read_match(folder)
+    assert said["cameras[0].heigth"].removesuffix(".") in str(error.value)
+    # Another page had the form open before: it must not overwrite.
+    assert save(ada, view, a_match(name)).status_code == 409
+
+
+@pytest.mark.parametrize(
+    ("changes", "place_of_it", "message"),
+    [
+        ({"camera": {"video": None}}, "file", "belongs to no camera"),
+        ({"camera": {"width": 100}}, "cameras[0].video", "expected 100 x 64 px"),
+        ({"fps": 60}, "cameras[0].video", "expected 60 frames per second"),
+        ({"clips": [{"id": "goal", "first_frame": 900, "frame_count": 5}]}, "cameras", "900"),
+        ({"camera": {"offset_frames": 0.5}}, "", "must be whole"),
+        ({"camera": {"id": "goal"}}, "", "must differ"),
+        ({"match_id": "taken"}, "match_id", "another match"),
+        ({"match_id": "../final"}, "match_id", "letters"),
+        ({"camera": {"video": "../../draft.json"}}, "file", "belongs to no camera"),
+    ],
+)
+def test_what_contradicts_the_videos_is_said(place, footage, changes, place_of_it, message):
+    (place / "inbox" / "background" / "taken").mkdir(parents=True)
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    view = save(ada, view, a_match(view["files"][0]["name"], **changes)).json()
+    first = view["problems"][0]
+    assert first["place"].startswith(place_of_it)
+    assert message in first["message"]
+    assert str(place) not in first["message"]
+    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).status_code == 422
+
+
+def test_a_video_is_picked_from_a_named_folder(place, footage):
+    recordings = place / "videos" / "day 1"
+    recordings.mkdir()
+    shutil.copy(footage, recordings / "cam.mp4")
+    (recordings / "notes.txt").write_text("no video")
+    (recordings / "link.mp4").symlink_to(footage)
+    (place / "videos" / "linked").symlink_to(recordings)
+    (recordings / "private").mkdir()
+    ada = open_pages(place)
+    assert ada.get("/api/inbox").json()["folders"] == [str(place / "videos")]
+    found = ada.get(f"{DRAFTS}/videos?folder=0").json()
+    assert (found["folders"], found["videos"]) == (["day 1"], [])
+    found = ada.get(f"{DRAFTS}/videos?folder=0&path=day 1").json()
+    assert found["folders"] == ["private"]
+    assert found["videos"] == [{"name": "cam.mp4", "size": footage.stat().st_size}]
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    picked = ada.post(f"{DRAFTS}/{draft}/picks", json={"folder": 0, "path": "day 1/cam.mp4"})
+    assert picked.status_code == 200
+    view = settle(ada, draft)
+    assert view["files"][0]["frames"] == FRAMES
+    view = save(ada, view, a_match(view["files"][0]["name"])).json()
+    assert ada.post(f"{DRAFTS}/{draft}/finish", json={}).json() == {"arrived": "final"}
+    assert (recordings / "cam.mp4").read_bytes() == footage.read_bytes()
+    copied = place / "inbox" / "final" / "videos" / "cam.mp4"
+    assert not copied.is_symlink()
+    assert copied.stat().st_ino != (recordings / "cam.mp4").stat().st_ino
+
+
+def test_an_interrupted_copy_continues_after_a_restart(place, footage):
+    shutil.copy(footage, place / "videos" / "cam.mp4")
+    ada = open_pages(place)
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    ada.post(f"{DRAFTS}/{draft}/picks", json={"folder": 0, "path": "cam.mp4"})
+    view = settle(ada, draft)
+    folder = place / "inbox" / ".drafts" / draft
+    whole, part = folder / "match" / "videos" / "cam.mp4", folder / "parts" / view["files"][0]["id"]
+    whole.rename(part)
+    os.truncate(part, 1000)  # as if the process had been killed there
+    settle(open_pages(place), draft)
+    assert whole.read_bytes() == footage.read_bytes()
+    # A source that has changed since is not mixed with what was copied before.
+    whole.rename(part)
+    os.truncate(part, 1000)
+    os.utime(place / "videos" / "cam.mp4", (1, 1))
+    view = settle(open_pages(place), draft, "broken")
+    assert "changed" in view["files"][0]["problem"]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../secret.mp4", "/etc/passwd", "a/../../secret.mp4", "link.mp4", "linked/secret.mp4",
+        "pipe.mp4", "", ".", "a//b.mp4", "notes.txt", "day.mp4", "none.mp4", "nul\0.mp4",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out_of_a_named_folder(place, footage, path):
+    shutil.copy(footage, place / "secret.mp4")
+    videos = place / "videos"
+    (videos / "link.mp4").symlink_to(place / "secret.mp4")
+    (videos / "linked").symlink_to(place)
+    os.mkfifo(videos / "pipe.mp4")
+    (videos / "day.mp4").mkdir()
+    (videos / "notes.txt").write_text("text")
+    ada = open_pages(place)
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    answer = ada.post(f"{DRAFTS}/{draft}/picks", json={"folder": 0, "path": path})
+    assert answer.status_code == 422
+    for folder in (1, -1):
+        answer = ada.post(f"{DRAFTS}/{draft}/picks", json={"folder": folder, "path": "a.mp4"})
+        assert answer.status_code == 422
+    if path and path != "day.mp4":
+        assert ada.get(f"{DRAFTS}/videos", params={"folder": 0, "path": path}).status_code == 422
+    assert ada.get(f"{DRAFTS}/videos?folder=0&path=linked").status_code == 422
+    assert ada.get(f"{DRAFTS}/{draft}").json()["files"] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("../../match.yaml.mp4", "videos/match.yaml.mp4"),
+        ("C:\\recordings\\Kamera 1 ü.MOV", "videos/Kamera_1.mov"),
+        ("....mp4", "videos/video.mp4"),
+        ("calibration.toml", "calibration.toml"),
+    ],
+)
+def test_names_from_a_browser_are_safe_paths(place, name, kept):
+    ada = open_pages(place)
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    new = {"name": name, "size": 3, "modified_ms": 0}
+    assert ada.post(f"{DRAFTS}/{draft}/files", json=new).status_code == 200
+    assert ada.get(f"{DRAFTS}/{draft}").json()["files"][0]["name"] == kept
+
+
+@pytest.mark.parametrize(
+    "new",
+    [
+        {"name": "match.yaml", "size": 3},
+        {"name": "run.sh", "size": 3},
+        {"name": "a.mp4", "size": 0},
+        {"name": "a.mp4", "size": 1 << 52},
+        {"name": "a.mp4", "size": -1},
+    ],
+)
+def test_what_no_match_needs_is_refused(place, new):
+    ada = open_pages(place)
+    draft = ada.post(DRAFTS, json={}).json()["id"]
+    assert ada.post(f"{DRAFTS}/{draft}/files", json=new).status_code == 422
+
+
+def test_a_file_that_is_no_video_is_said_to_be_none(place, tmp_path):
+    file = tmp_path / "cam.mp4"
+    file.write_bytes(b"no video at all" * 100)
+    ada = open_pages(place)
+    draft, file_id, _ = begin(ada, file)
+    put(ada, draft, file_id, 0, file.read_bytes())
+    view = settle(ada, draft, "broken")
+    assert "expected a video" in view["files"][0]["problem"]
+    assert str(place) not in str(view)
+    assert ada.post(f"{DRAFTS}/{draft}/files/{file_id}/removal", json={}).json()["files"] == []
+    assert ada.post(f"{DRAFTS}/{draft}/removal", json={}).status_code == 200
+    assert ada.get(f"{DRAFTS}/{draft}").status_code == 422
+    assert list((place / "inbox" / ".drafts").iterdir()) == []
+
+
+def test_chunks_need_a_session_its_secret_bytes_and_a_limit(place, footage):
+    ada = open_pages(place)
+    draft, file, _ = begin(ada, footage)
+    stranger = page_client.browser(ada.app)
+    assert put(stranger, draft, file, 0, b"abc").status_code == 401
+    assert stranger.get(DRAFTS).status_code == 401
+    path = f"{DRAFTS}/{draft}/files/{file}/bytes?offset=0"
+    assert ada.put(path, json={"a": 1}).status_code == 415
+    assert put(ada, draft, file, 0, bytes(CHUNK_BYTES + 1)).status_code == 413
+    answer = ada.post(f"{DRAFTS}/{draft}/finish", content=b"abc")
+    assert answer.status_code == 415
+    del ada.headers["x-form-secret"]
+    assert put(ada, draft, file, 0, b"abc").status_code == 403
+
+
+@pytest.mark.parametrize("draft", ["..", "%2e%2e", "0123456789abcdef", "x" * 16])
+def test_only_a_draft_is_a_draft(place, draft):
+    (place / "inbox" / ".drafts" / "x").mkdir(parents=True)
+    ada = open_pages(place)
+    assert ada.get(f"{DRAFTS}/{draft}").status_code in (404, 422)
+    assert ada.post(f"{DRAFTS}/{draft}/removal", json={}).status_code in (404, 405, 422)
+
+
+def test_a_server_without_an_inbox_creates_nothing(place):
+    access = access_for("127.0.0.1", token=page_client.TOKEN, names=(), secure=False)
+    ada = page_client.log_in(create_app(str(place / "project"), access), "Ada")
+    assert ada.get("/api/inbox").json()["inbox"] is None
+    assert ada.get(DRAFTS).status_code == 404
+    assert ada.post(DRAFTS, json={}).status_code == 404
+
+
+def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    save(ada, view, a_match(view["files"][0]["name"]))
+    folder = place / "inbox" / ".drafts" / draft
+    kept = shutil.copytree(folder, place / "kept")
+    ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    shutil.rmtree(kept / "match")
+    shutil.copytree(kept, folder)  # the match has moved, the rest is still there
+    text = (folder / "draft.json").read_text()
+    done = text.replace('"finished_as": null', '"finished_as": "final"')
+    (folder / "draft.json").write_text(done)
+    assert ada.get(DRAFTS).json() == {"drafts": []}
+    assert not folder.exists()
+    assert (place / "inbox" / "final" / "match.yaml").exists()
