@@ -32,6 +32,7 @@ EXPORT_FORMATS: Final = (
     "trc",
     "c3d",
     "bvh",
+    "gltf",
     "csv",
     "parquet",
     "challenge",

@@ -48,6 +48,13 @@ def export(
         bool,
         typer.Option("--filled", help="Interpolate joints that are missing for a while; flagged."),
     ] = False,
+    surface: Annotated[
+        bool,
+        typer.Option(
+            "--surface",
+            help="With gltf: also the surface of a body model with terms of its own (--licence).",
+        ),
+    ] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -74,6 +81,7 @@ def export(
         registration,
         stage,
         filled=filled,
+        surface=surface,
         licence=None if licence is None else licence.read_text(encoding="utf-8").strip(),
     )
     if release is None or origin.licence is None:

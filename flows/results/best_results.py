@@ -153,6 +153,8 @@ class Origin:
     """Interpolate joints that are missing for a while."""
     licence: str | None = None
     """Text of the data's licence; None = not stated."""
+    surface: bool = False
+    """Write also the surface of a body model that has terms of its own."""
 
     @property
     def spec(self) -> MatchSpec:
@@ -182,6 +184,30 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
     )
     return find_body(fits.attrs["body_model"]), poses, fits["person"].values
+
+
+def broadcast_camera(run: Run, clip: str) -> Camera:
+    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
+
+    Raises:
+        InputError: the run has no such camera.
+    """
+    todo = (
+        "This format is about the broadcast camera's picture: calibrate that camera first, or "
+        "choose another format."
+    )
+    require_result(run, f"broadcast_calibration/{clip}", todo)
+    bodies = bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
+    return camera_in_frames(run, clip, frames)
+
+
+def camera_in_frames(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
+    """Return the moving camera of a clip in these match frames, NaN where it is unknown."""
+    found = run[broadcast_unit(run, clip)]
+    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
+    arrays = by_frame.reindex(frame=frames).data_vars
+    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
 
 def require_result(run: Run, unit: str, todo: str) -> str:

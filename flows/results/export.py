@@ -16,11 +16,11 @@ from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManife
 from flows.results.best_results import (
     Origin,
     bodies_unit,
-    broadcast_unit,
+    broadcast_camera,
+    camera_in_frames,
     clip_positions,
     fitted_bodies,
     placed_joints,
-    require_result,
     static_cameras,
 )
 from flows.results.tool_exports import TOOL_EXPORTS
@@ -52,39 +52,14 @@ from worldpose.formats.challenge import (
 )
 from worldpose.formats.joints_file import write_poses
 from worldpose.formats.tables import write_positions
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch import PitchTemplate
-from worldpose.store import Run, Store, pin_run
+from worldpose.store import Store, pin_run
 from worldpose.video import write_video
 
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
-
-
-def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
-
-    Raises:
-        InputError: the run has no such camera.
-    """
-    todo = (
-        "This format is about the broadcast camera's picture: calibrate that camera first, or "
-        "choose another format."
-    )
-    require_result(run, f"broadcast_calibration/{clip}", todo)
-    bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
-    return _camera_in(run, clip, frames)
-
-
-def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
-    found = run[broadcast_unit(run, clip)]
-    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    arrays = by_frame.reindex(frame=frames).data_vars
-    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
 
 
 def export_joints(origin: Origin, out: Path) -> list[Path]:
@@ -201,7 +176,7 @@ def export_recording(origin: Origin, out: Path) -> list[Path]:
     for clip in origin.clips:
         tracks = origin.tracks(clip)
         known = f"broadcast_calibration/{clip}" in origin.run
-        moving = _camera_in(origin.run, clip, tracks.frames) if known else None
+        moving = camera_in_frames(origin.run, clip, tracks.frames) if known else None
         written.append(out / "rerun" / f"{clip}.rrd")
         write_recording(
             written[-1],

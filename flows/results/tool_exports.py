@@ -16,10 +16,14 @@ from flows.results.best_results import (
     PLANE,
     Origin,
     bodies_unit,
+    broadcast_camera,
     clip_positions,
     fitted_bodies,
+    static_cameras,
 )
+from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
+from worldpose.formats.gltf_file import AnimatedBody, write_gltf
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
 from worldpose.formats.tables import (
     joints_table,
@@ -28,6 +32,7 @@ from worldpose.formats.tables import (
     write_csv,
     write_parquet,
 )
+from worldpose.ingest import read_match
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,6 +127,57 @@ def export_motion(origin: Origin, out: Path) -> list[Path]:
     return written
 
 
+def export_gltf(origin: Origin, out: Path) -> list[Path]:
+    """Write `scenes/<clip>.glb`: bodies, cameras and the pitch.
+
+    Raises:
+        UsageError: the surface of a body model with terms of its own was asked for without them.
+    """
+    # Imported here: it loads matplotlib's colours, which takes 0.5 s.
+    from worldpose.reports.drawing import markings
+
+    pitch = read_match(Path(origin.registration.folder)).pitch
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        free = model.name.startswith(OPEN_BODY)
+        if origin.surface and not free and origin.licence is None:
+            raise UsageError(
+                "--surface",
+                expected=f"--licence FILE with the terms of body model {model.name}",
+                found="none",
+                todo="Give their text, which goes into the file, or export without --surface.",
+            )
+        cameras = static_cameras(origin.run, origin.spec, origin.stage)
+        if f"broadcast_calibration/{clip}" in origin.run:
+            cameras["broadcast"] = broadcast_camera(origin.run, clip)
+        kinds = person_kinds(origin, clip)
+        people = [
+            AnimatedBody(
+                f"person_{person_id:03d}",
+                poses[person],
+                {"person": person_id, "kind": kinds[person_id], "body_model": model.name},
+            )
+            for person, person_id in enumerate(persons.tolist())
+        ]
+        notes = describe_clip(origin, clip)
+        notes["joints"] = f"the 24 joints of body model {model.name}, named as SMPL's"
+        notes |= {"units": "metres, seconds", "first_match_frame": f"{frames[0]}"}
+        written.append(out / "scenes" / f"{clip}.glb")
+        write_gltf(
+            written[-1],
+            model,
+            people,
+            origin.spec.fps,
+            cameras=cameras,
+            markings=[] if pitch is None else markings(pitch),
+            notes=notes,
+            surface=free or origin.surface,
+        )
+    return written
+
+
 def export_csv(origin: Origin, out: Path) -> list[Path]:
     """Write `tables/<clip>.<table>.csv` with its description, for the tables of `_tables`."""
     return _write_tables(origin, out, "csv", write_csv)
@@ -160,6 +216,7 @@ TOOL_EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "trc": export_markers,
     "c3d": export_c3d,
     "bvh": export_motion,
+    "gltf": export_gltf,
     "csv": export_csv,
     "parquet": export_parquet,
 }
