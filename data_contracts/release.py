@@ -32,6 +32,7 @@ EXPORT_FORMATS: Final = (
     "trc",
     "c3d",
     "bvh",
+    "mot",
     "gltf",
     "csv",
     "parquet",

@@ -25,6 +25,11 @@ from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
 from worldpose.formats.motion_capture import stretches, write_markers, write_motion
+from worldpose.formats.opensim_file import (
+    CONVENTION,
+    opensim_coordinates,
+    write_opensim_motion,
+)
 from worldpose.formats.tables import (
     joints_table,
     people_table,
@@ -127,6 +132,31 @@ def export_motion(origin: Origin, out: Path) -> list[Path]:
     return written
 
 
+def export_opensim(origin: Origin, out: Path) -> list[Path]:
+    """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        kinds = person_kinds(origin, clip)
+        notes = describe_clip(origin, clip) | {
+            "world": "x as in the world of the match, y up, z = minus its y",
+            "joints": CONVENTION,
+            "units": "degrees, metres, seconds; time is match frame / frames per second",
+        }
+        for person, person_id in enumerate(persons.tolist()):
+            for part in stretches(poses[person]):
+                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.mot"
+                written.append(out / "opensim" / clip / name)
+                write_opensim_motion(
+                    written[-1],
+                    opensim_coordinates(model, poses[person, part]),
+                    frames[part] / origin.spec.fps,
+                    notes | {"kind": kinds[person_id]},
+                )
+    return written
+
+
 def export_gltf(origin: Origin, out: Path) -> list[Path]:
     """Write `scenes/<clip>.glb`: bodies, cameras and the pitch.
 
@@ -216,6 +246,7 @@ TOOL_EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "trc": export_markers,
     "c3d": export_c3d,
     "bvh": export_motion,
+    "mot": export_opensim,
     "gltf": export_gltf,
     "csv": export_csv,
     "parquet": export_parquet,
