@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec, Registration
-from data_contracts.run import RunRecord
+from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.errors import InputError, UsageError, WorldposeError
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 
     from worldpose.reports.bodies import BodyTracks
 
-BODY_STAGES = ("body_fitting", "refitting")
-"""Stages that produce bodies, the best last."""
-JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
-"""Stages that produce 3D joints, the best last."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 MID_HIP = [11, 12]

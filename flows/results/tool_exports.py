@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from data_contracts.tracking import Track
 from flows.results.best_results import (
-    BODY_STAGES,
-    JOINT_STAGES,
     PLANE,
     Origin,
     bodies_unit,
