@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -37,7 +38,7 @@ COORDINATES: Final = (
 """Columns after `time`."""
 CONVENTION: Final = (
     "OpenSim, coordinates of Rajagopal et al. (2016): body axes x forward, y up, z right; order of "
-    "rotations z, x, y; ground y up; zero is the body model's T-pose with arms lowered"
+    "rotations z, x, y; ground y up; zero: body model's T-pose, arms and bones of legs hang down"
 )
 _JOINT: Final = {name: index for index, name in enumerate(SKELETONS["smpl24"])}
 
@@ -47,10 +48,13 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
 
     An angle is the one that the rotation of the child relative to its parent has in Rajagopal's
     order, z then x then y. The trunk is the pelvis's rotation to `spine3`, the arm the rotation
-    from there to the upper arm, collar included. Knees, ankles and elbows have one coordinate:
-    their rotation about z, of the same order; the rest of it is left out. The pelvis's place is
-    such that the middle of the hips of the unscaled model is that of the body.
+    from there to the upper arm, collar included. The axes of thighs and shanks are turned so that
+    their bones, which lean by some degrees in the T-pose, hang along -y at zero. Knees, ankles and
+    elbows have one coordinate: their rotation about z, of the same order; the rest of it is left
+    out. The pelvis's place is such that the middle of the hips of the unscaled model is that of the
+    body.
     """
+    rest = (model.joint_template + model.joint_directions @ poses.betas[0]) @ BODY_AXES.T
     turns = model.articulate(poses).local_rotations
     relative = BODY_AXES @ turns @ BODY_AXES.T
     pelvis = Y_UP @ Rigid.from_rotvec(poses.global_orient, np.zeros(3)).rotation @ BODY_AXES.T
@@ -71,12 +75,26 @@ def opensim_coordinates(model: BodyModel, poses: BodyParameters) -> Floats:
         hip, knee, ankle = (
             mirror @ turn(f"{side}_{name}") @ mirror for name in ("hip", "knee", "ankle")
         )
+        places = [rest[_JOINT[f"{side}_{name}"]] @ mirror for name in ("hip", "knee", "ankle")]
+        thigh, shank = (_hanging_axes(b - a) for a, b in pairwise(places))
+        hip, knee, ankle = hip @ thigh, thigh.T @ knee @ shank, shank.T @ ankle
         # Knees bend backwards: about -z, as the model counts flexion.
         leg = [_angles(hip), -_angles(knee)[:, :1], _angles(ankle)[:, :1]]
         columns[side] = (leg, [_angles(arm), _angles(elbow)[:, :1]])
     trunk = _angles(turn("spine1", "spine2", "spine3"))
     parts = [_angles(pelvis), place, *columns["right"][0], *columns["left"][0], trunk]
     return np.concatenate([*parts, *columns["right"][1], *columns["left"][1]], axis=-1)
+
+
+def _hanging_axes(bone: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) of -y to the direction of a bone."""
+    down, along = np.array([0.0, -1.0, 0.0]), bone / np.linalg.norm(bone)
+    axis = np.cross(down, along)
+    sine = np.linalg.norm(axis)
+    angle = np.arctan2(sine, down @ along)
+    turned = Rigid.from_rotvec(axis * (angle / max(sine, 1e-12)), np.zeros(3))
+    matrix: Floats = turned.rotation
+    return matrix
 
 
 def write_opensim_motion(

@@ -1,5 +1,7 @@
 """Joint angles of known poses come back from a .mot file, by pandas and by OpenSim."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,7 +22,14 @@ FORWARD, LEFT, UP = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.arr
 
 @pytest.fixture(scope="module")
 def model():
-    return load_open_body()
+    """The open body with legs that hang vertically in the T-pose: all its angles are known."""
+    straight = dataclasses.replace(load_open_body())
+    joints = straight.joint_template.copy()
+    for hip, knee, ankle in ((1, 4, 7), (2, 5, 8)):
+        joints[knee] = joints[hip] - [0.0, 0.4, 0.0]
+        joints[ankle] = joints[hip] - [0.0, 0.8, 0.0]
+    straight.__dict__["joint_template"] = joints
+    return straight
 
 
 def body(orient=(np.pi / 2, 0.0, 0.0), place=(0.0, 0.0, 0.0), **rotations):
@@ -164,6 +173,31 @@ def test_opensim_reads_the_file(model, tmp_path):
     assert table.getDependentColumn("knee_angle_r")[0] == pytest.approx(70.0, abs=1e-4)
     assert table.getTableMetaDataString("inDegrees") == "yes"
     assert table.getTableMetaDataString("licence") == "a b"
+
+
+def test_thighs_and_shanks_of_the_open_body_point_where_its_joints_are():
+    body_model = load_open_body()
+    rng = np.random.default_rng(0)
+    poses = BodyParameters(
+        rng.standard_normal((1, 10)),
+        rng.uniform(-3.0, 3.0, (20, 3)),
+        rng.uniform(-0.5, 0.5, (20, 69)),
+        rng.uniform(-50.0, 50.0, (20, 3)),
+    )
+    found = dict(zip(COORDINATES, opensim_coordinates(body_model, poses).T, strict=True))
+    joints = body_model.joints(poses)
+    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    pelvis = Rotation.from_euler(
+        "ZXY",
+        np.stack([found[f"pelvis_{name}"] for name in ("tilt", "list", "rotation")], axis=-1),
+        degrees=True,
+    )
+    for side, sign, hip, knee in (("r", 1.0, 2, 5), ("l", -1.0, 1, 4)):
+        thigh = pelvis.inv().apply((joints[:, knee] - joints[:, hip]) @ y_up.T)
+        x, y, z = (thigh / np.linalg.norm(thigh, axis=-1, keepdims=True)).T
+        flexion, adduction = np.degrees(np.arctan2(x, -y)), np.degrees(np.arcsin(-sign * z))
+        np.testing.assert_allclose(found[f"hip_flexion_{side}"], flexion, atol=TOLERANCE_DEG)
+        np.testing.assert_allclose(found[f"hip_adduction_{side}"], adduction, atol=TOLERANCE_DEG)
 
 
 def test_frames_without_a_body_are_refused(tmp_path):
