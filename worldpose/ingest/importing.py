@@ -314,7 +314,10 @@ def import_pose2sim(
         for kind in kinds
     ]
     if not poses:
-        notes.append(f"no 2D poses in {folder}: the run detects people in the videos")
+        notes.append(
+            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
+            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
+        )
     return spec, notes
 
 
