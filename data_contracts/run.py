@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field, JsonValue
 
@@ -106,6 +106,12 @@ GatePolicy = Literal["auto", "always", "never"]
 """When results need approval: if metrics exceed their limits, always, or never."""
 
 RunState = Literal["complete", "waiting", "partial", "failed"]
+
+
+BODY_STAGES: Final = ("body_fitting", "refitting")
+"""Stages that produce bodies, the best last."""
+JOINT_STAGES: Final = ("triangulation", "retriangulation", *BODY_STAGES)
+"""Stages that produce 3D joints, the best last."""
 
 
 class RunRecord(Record):

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress, TaskID
 
+from data_contracts.match import MatchSpec
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -28,6 +29,7 @@ from worldpose.ingest import (
     import_clicks,
     import_lenses,
     import_match,
+    import_pose2sim,
     import_videos,
     unclicked_clips,
 )
@@ -198,6 +200,13 @@ def import_command(
     videos: Annotated[
         Path | None, typer.Option(help="Videos instead of 2D poses, <camera>.mp4.")
     ] = None,
+    pose2sim: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Trial of Pose2Sim: Config.toml, calibration/, pose/ with OpenPose JSON, videos/.",
+        ),
+    ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
     match_id: Annotated[
         str | None, typer.Option(help="Id of the match; the folder's name by default.")
@@ -236,6 +245,17 @@ def import_command(
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
+    if pose2sim is not None:
+        if calibration or detections or videos or pitch or left_handed or clicks or lens or camera:
+            raise UsageError(
+                "--pose2sim",
+                expected="--pose2sim with --out, and --fps or --match-id",
+                found="options of another import",
+                todo="Import the trial first; clicks, lenses and a pitch can be added then.",
+            )
+        spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
+        _print_match(spec, out, notes, as_json=as_json)
+        return
     if lens:
         if calibration or detections or videos or fps or match_id or pitch or left_handed or clicks:
             raise UsageError(
@@ -284,14 +304,22 @@ def import_command(
         )
     else:
         spec = import_match(calibration, detections, fps, out, match_id=match_id)
+    _print_match(spec, out, [], as_json=as_json)
+
+
+def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:
+    """Print a match that was made, and sentences about what was found."""
     if as_json:
-        print_json({"match": spec.match_id, "folder": str(out)})
-    else:
-        clip = spec.clips[0]
-        line(
-            f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
-            f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
-        )
+        about = {"notes": notes} if notes else {}
+        print_json({"match": spec.match_id, "folder": str(out), **about})
+        return
+    clip = spec.clips[0]
+    for note in notes:
+        line(note)
+    line(
+        f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
+        f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
+    )
 
 
 def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:

@@ -42,8 +42,19 @@ def export(
     ] = None,
     licence: Annotated[
         Path | None,
-        typer.Option("--licence", help="Text of the data licence of a release."),
+        typer.Option("--licence", help="Text of the data licence, for a release or the files."),
     ] = None,
+    filled: Annotated[
+        bool,
+        typer.Option("--filled", help="Interpolate joints that are missing for a while; flagged."),
+    ] = False,
+    surface: Annotated[
+        bool,
+        typer.Option(
+            "--surface",
+            help="With gltf: also the surface of a body model with terms of its own (--licence).",
+        ),
+    ] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -52,27 +63,31 @@ def export(
     Example: worldpose export tiny-1 --format joints --out exported
     """
     from flows.registering import find_registration
-    from flows.results.export import Origin
+    from flows.results.best_results import Origin
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
-    if (release is None) != (licence is None):
+    if release is not None and (licence is None or filled):
         raise UsageError(
-            "worldpose export",
-            expected="both --release NAME and --licence FILE, or neither",
-            found="one of them",
-            todo="Give the text of the data licence with --licence.",
+            "worldpose export --release",
+            expected="--licence FILE, and no --filled: a release holds joints as computed",
+            found="no licence" if licence is None else "--filled",
+            todo="Give the text of the data licence, or export without --release.",
         )
     store = Store.open(project)
     registration = find_registration(store, match)
     origin = Origin(
-        open_run(project, registration.spec.match_id, run, complete=True), registration, stage
+        open_run(project, registration.spec.match_id, run, complete=True),
+        registration,
+        stage,
+        filled=filled,
+        surface=surface,
+        licence=None if licence is None else licence.read_text(encoding="utf-8").strip(),
     )
-    if release is None or licence is None:
+    if release is None or origin.licence is None:
         written = export_formats(origin, forms, out)
     else:
-        text = licence.read_text(encoding="utf-8").strip()
-        written = write_release(store, origin, forms, out, release, text)
+        written = write_release(store, origin, forms, out, release, origin.licence)
     if as_json:
         files = [str(path) for path in written]
         print_json({"match": registration.spec.match_id, "files": files})

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from data_contracts.match import MatchSpec
-from data_contracts.run import RunRecord
+from data_contracts.match import MatchSpec, Registration
+from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
-from worldpose.body import BodyParameters, find_body
-from worldpose.errors import UsageError, WorldposeError
+from worldpose.body import BodyModel, BodyParameters, find_body
+from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats import JointTracks
-from worldpose.formats.positions_file import Positions
+from worldpose.formats.joints_file import fill_gaps
+from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.store import Run
@@ -22,10 +25,6 @@ if TYPE_CHECKING:
 
     from worldpose.reports.bodies import BodyTracks
 
-BODY_STAGES = ("body_fitting", "refitting")
-"""Stages that produce bodies, the best last."""
-JOINT_STAGES = ("triangulation", "retriangulation", *BODY_STAGES)
-"""Stages that produce 3D joints, the best last."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 MID_HIP = [11, 12]
@@ -136,6 +135,91 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
         ),
         model=find_body(fits.attrs["body_model"]),
     )
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Source of an export."""
+
+    run: Run
+    registration: Registration
+    stage: str | None = None
+    """Stage whose joints are exported; None = the best available."""
+    filled: bool = False
+    """Interpolate joints that are missing for a while."""
+    licence: str | None = None
+    """Text of the data's licence; None = not stated."""
+    surface: bool = False
+    """Write also the surface of a body model that has terms of its own."""
+
+    @property
+    def spec(self) -> MatchSpec:
+        """Return the match."""
+        return self.registration.spec
+
+    @property
+    def clips(self) -> tuple[str, ...]:
+        """Return the clips that have joints."""
+        return clips_of(self.run.record)
+
+    def tracks(self, clip: str) -> JointTracks:
+        """Return the joints of one clip."""
+        tracks = joint_tracks(self.run, clip, self.stage)
+        return fill_gaps(tracks) if self.filled else tracks
+
+
+def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArray[np.int32]]:
+    """Return body model, poses (persons, frames) and person ids of a clip's fits.
+
+    Raises:
+        InputError: the run has no fitted bodies.
+    """
+    fits = run[require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
+    poses = BodyParameters(
+        fits["betas"].values[:, None],
+        *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
+    )
+    return find_body(fits.attrs["body_model"]), poses, fits["person"].values
+
+
+def broadcast_camera(run: Run, clip: str) -> Camera:
+    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
+
+    Raises:
+        InputError: the run has no such camera.
+    """
+    todo = (
+        "This format is about the broadcast camera's picture: calibrate that camera first, or "
+        "choose another format."
+    )
+    require_result(run, f"broadcast_calibration/{clip}", todo)
+    bodies = bodies_unit(run, clip)
+    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
+    return camera_in_frames(run, clip, frames)
+
+
+def camera_in_frames(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
+    """Return the moving camera of a clip in these match frames, NaN where it is unknown."""
+    found = run[broadcast_unit(run, clip)]
+    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
+    arrays = by_frame.reindex(frame=frames).data_vars
+    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
+
+
+def require_result(run: Run, unit: str, todo: str) -> str:
+    """Return the name of a result that the run has.
+
+    Raises:
+        InputError: it has none.
+    """
+    if unit not in run:
+        raise InputError(
+            f"run {run.record.run_id} of {run.record.match_id}",
+            expected=f"results of {unit}",
+            found=", ".join(sorted({name.partition("/")[0] for name in run})) or "none",
+            todo=todo,
+        )
+    return unit
 
 
 def placed_joints(run: Run, clip: str) -> xr.Dataset:

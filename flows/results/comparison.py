@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.run import RunRecord
+from data_contracts.run import BODY_STAGES, RunRecord
 from flows.registering import find_registration
-from flows.results.best_results import BODY_STAGES, bodies_unit, static_cameras
+from flows.results.best_results import bodies_unit, static_cameras
 from worldpose.geometry import Camera
 from worldpose.store import Run, Store
 

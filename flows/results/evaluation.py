@@ -8,9 +8,9 @@ from pathlib import Path
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.match import MatchSpec
+from data_contracts.run import JOINT_STAGES
 from flows.registering import find_match
 from flows.results.best_results import (
-    JOINT_STAGES,
     broadcast_cameras,
     clips_of,
     joint_tracks,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.match import MatchSpec, Registration
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results.best_results import (
+    Origin,
     bodies_unit,
-    broadcast_unit,
+    broadcast_camera,
+    camera_in_frames,
     clip_positions,
-    clips_of,
-    joint_tracks,
+    fitted_bodies,
     placed_joints,
     static_cameras,
 )
-from worldpose.body import BodyModel, BodyParameters, find_body
+from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset.manifest import (
     ORIGINS,
     origins_of,
@@ -33,7 +33,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import UsageError
 from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baselines.inputs import (
     write_baseline_settings,
@@ -51,86 +51,15 @@ from worldpose.formats.challenge import (
     write_submission,
 )
 from worldpose.formats.joints_file import write_poses
-from worldpose.formats.motion_capture import stretches, write_markers, write_motion
-from worldpose.formats.positions_file import write_positions
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.formats.tables import write_positions
 from worldpose.ingest import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch import PitchTemplate
-from worldpose.store import Run, Store, pin_run
+from worldpose.store import Store, pin_run
 from worldpose.video import write_video
 
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Source of an export."""
-
-    run: Run
-    registration: Registration
-    stage: str | None = None
-    """Stage whose joints are exported; None = the best available."""
-
-    @property
-    def spec(self) -> MatchSpec:
-        """Return the match."""
-        return self.registration.spec
-
-    @property
-    def clips(self) -> tuple[str, ...]:
-        """Return the clips that have joints."""
-        return clips_of(self.run.record)
-
-
-def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArray[np.int32]]:
-    """Return body model, poses (persons, frames) and person ids of a clip's fits.
-
-    Raises:
-        InputError: the run has no fitted bodies.
-    """
-    fits = run[_require_result(run, bodies_unit(run, clip), "Run the match to the end first.")]
-    poses = BodyParameters(
-        fits["betas"].values[:, None],
-        *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
-    )
-    return find_body(fits.attrs["body_model"]), poses, fits["person"].values
-
-
-def broadcast_camera(run: Run, clip: str) -> Camera:
-    """Return the moving camera of a clip in the frames of its fitted bodies, or all, (frames,).
-
-    Raises:
-        InputError: the run has no such camera.
-    """
-    todo = (
-        "This format is about the broadcast camera's picture: calibrate that camera first, or "
-        "choose another format."
-    )
-    _require_result(run, f"broadcast_calibration/{clip}", todo)
-    bodies = bodies_unit(run, clip)
-    frames = run[bodies if bodies in run else broadcast_unit(run, clip)]["frame"].values
-    return _camera_in(run, clip, frames)
-
-
-def _camera_in(run: Run, clip: str, frames: NDArray[np.int64]) -> Camera:
-    found = run[broadcast_unit(run, clip)]
-    by_frame = found[["focal", "principal_point", "distortion", "rotation", "translation"]]
-    arrays = by_frame.reindex(frame=frames).data_vars
-    return camera_from_arrays({**arrays, "image_size": found["image_size"]})
-
-
-def _require_result(run: Run, unit: str, todo: str) -> str:
-    if unit not in run:
-        raise InputError(
-            f"run {run.record.run_id} of {run.record.match_id}",
-            expected=f"results of {unit}",
-            found=", ".join(sorted({name.partition("/")[0] for name in run})) or "none",
-            todo=todo,
-        )
-    return unit
 
 
 def export_joints(origin: Origin, out: Path) -> list[Path]:
@@ -138,7 +67,7 @@ def export_joints(origin: Origin, out: Path) -> list[Path]:
     written = []
     for clip in origin.clips:
         path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
-        write_joints(path, joint_tracks(origin.run, clip, origin.stage))
+        write_joints(path, origin.tracks(clip))
         written.append(path)
     return written
 
@@ -147,7 +76,7 @@ def export_coco(origin: Origin, out: Path) -> list[Path]:
     """Write `<camera>.json` for each static camera, in `<clip>/` if there are several."""
     written = []
     for clip in origin.clips:
-        tracks = joint_tracks(origin.run, clip, origin.stage)
+        tracks = origin.tracks(clip)
         inliers = placed_joints(origin.run, clip)["inliers"]
         cameras = static_cameras(origin.run, origin.spec, origin.stage)
         for camera_id, camera in cameras.items():
@@ -177,32 +106,6 @@ def export_worldpose(origin: Origin, out: Path) -> list[Path]:
     for name, camera in static_cameras(origin.run, origin.spec, origin.stage).items():
         written.append(out / "cameras" / f"{name}.npz")
         write_static_camera(written[-1], camera.to_calibration(name))
-    return written
-
-
-def export_markers(origin: Origin, out: Path) -> list[Path]:
-    """Write `markers/<clip>/person_<id>.trc` for every person with a joint."""
-    written = []
-    for clip in origin.clips:
-        tracks = joint_tracks(origin.run, clip, origin.stage)
-        for person, person_id in enumerate(tracks.person_ids):
-            if np.isfinite(tracks.joints[:, person]).any():
-                written.append(out / "markers" / clip / f"person_{person_id:03d}.trc")
-                write_markers(written[-1], tracks, person, origin.spec.fps)
-    return written
-
-
-def export_motion(origin: Origin, out: Path) -> list[Path]:
-    """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
-    written = []
-    for clip in origin.clips:
-        model, poses, persons = fitted_bodies(origin.run, clip)
-        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
-        for person, person_id in enumerate(persons):
-            for part in stretches(poses[person]):
-                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.bvh"
-                written.append(out / "motion" / clip / name)
-                write_motion(written[-1], model, poses[person, part], origin.spec.fps)
     return written
 
 
@@ -271,9 +174,9 @@ def export_recording(origin: Origin, out: Path) -> list[Path]:
 
     written = []
     for clip in origin.clips:
-        tracks = joint_tracks(origin.run, clip, origin.stage)
+        tracks = origin.tracks(clip)
         known = f"broadcast_calibration/{clip}" in origin.run
-        moving = _camera_in(origin.run, clip, tracks.frames) if known else None
+        moving = camera_in_frames(origin.run, clip, tracks.frames) if known else None
         written.append(out / "rerun" / f"{clip}.rrd")
         write_recording(
             written[-1],
@@ -327,8 +230,7 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "worldpose": export_worldpose,
     "positions": export_positions,
     "minimap": export_minimap,
-    "trc": export_markers,
-    "bvh": export_motion,
+    **TOOL_EXPORTS,
     "challenge": export_challenge,
     "challenge-2025": export_challenge_2025,
     "tracks": export_tracks,
@@ -347,12 +249,17 @@ COUNTED = {"joints", *CLASHING}
 def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     """Write a run in several formats into one folder; return the files.
 
-    Formats that `check` and `statistics` read also get frame_rates.json.
+    Formats that `check` and `statistics` read also get frame_rates.json, and filled joints get
+    origins/<clip>.npz, which flags them.
 
     Raises:
         UsageError: an unknown format, or two with the same file names.
     """
     written = _export(origin, forms, out)
+    for clip in origin.clips if origin.filled else ():
+        tracks = origin.tracks(clip)
+        written.append(out / "origins" / f"{clip}.npz")
+        write_origins(written[-1], tracks, origins_of(tracks))
     if not COUNTED & set(forms):
         return written
     rates = dict.fromkeys(origin.clips, origin.spec.fps)
@@ -404,6 +311,7 @@ def release(
         UsageError: the folder holds another release.
         InputError: another run of the match was released under this name.
     """
+    origin = replace(origin, licence=licence)
     record, spec = origin.run.record, origin.spec
     frozen = read_manifest(out)
     ours = {
@@ -427,7 +335,7 @@ def release(
     written = _export(origin, forms, out)
     clips = {}
     for clip in origin.clips:
-        tracks = joint_tracks(origin.run, clip, origin.stage)
+        tracks = origin.tracks(clip)
         origins = origins_of(tracks)
         written.append(out / "origins" / f"{clip}.npz")
         write_origins(written[-1], tracks, origins)

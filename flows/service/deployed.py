@@ -265,7 +265,7 @@ def release(
         WorldposeError: the latest run is not complete.
     """
     from flows.reports.report import write_report
-    from flows.results.export import Origin  # imported here, as everything that few runs need
+    from flows.results.best_results import Origin  # imported here, as everything that few runs need
     from flows.results.export import release as write_release
 
     store = Store.open(project)

@@ -17,8 +17,8 @@ from data_contracts.release import EXPORT_FORMATS
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
 from flows.reports.scene_data import describe_frames, describe_scene
-from flows.results.best_results import clips_of
-from flows.results.export import Origin, export
+from flows.results.best_results import Origin, clips_of
+from flows.results.export import export
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from worldpose.errors import WorldposeError

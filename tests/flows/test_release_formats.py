@@ -1,11 +1,14 @@
 """Formats made from what a run would hold, without running anything."""
 
+import dataclasses
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
@@ -13,10 +16,13 @@ from typer.testing import CliRunner
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.release import EXPORT_FORMATS, BaselineSettings
 from flows.cli.app import app
-from flows.results.export import CLASHING, COUNTED, EXPORTS, Origin
+from flows.results import best_results
+from flows.results.best_results import Origin
+from flows.results.export import CLASHING, COUNTED, EXPORTS, export
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.body.keypoints import CHALLENGE15
-from worldpose.errors import InputError, WorldposeError
+from worldpose.dataset.manifest import ORIGINS, read_origins
+from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.formats import read_camera
 from worldpose.formats.challenge import read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
@@ -109,6 +115,7 @@ def origin(folder, **results):
 
 def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
     help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
+    help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
     page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
     assert tuple(EXPORTS) == EXPORT_FORMATS
     assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
@@ -207,3 +214,89 @@ def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_pa
     assert (fx * x / z + cx, fy * y / z + cy) == pytest.approx(
         (960 + 4000 * 3 / 75, 540 + 4000 * 0.2 / 75), abs=1e-9
     )
+
+
+def tracked():
+    """What the tools' formats need: kinds of people, triangulated joints, fitted joints."""
+    joints = np.random.default_rng(0).uniform(-20.0, 20.0, (4, 2, 17, 3))
+    joints[2, 1] = np.nan  # lost in one frame
+    covariance = np.zeros((4, 2, 17, 3, 3)) + 1e-4 * np.eye(3)
+    views = np.full((4, 2, 17), 3)
+    views[2, 1] = 0
+    coordinates = {"frame": FRAMES, "person": [3, 8]}
+    placed = {
+        "joints": (("frame", "person", "joint", "coordinate"), joints),
+        "covariance": (("frame", "person", "joint", "coordinate", "coordinate_"), covariance),
+        "views": (("frame", "person", "joint"), views),
+    }
+    tracks = [
+        {"person": 3, "first_frame": 0, "last_frame": 3, "frames_seen": 4, "views": 3.0},
+        {"person": 8, "first_frame": 0, "last_frame": 3, "frames_seen": 3, "views": 3.0}
+        | {"kind": "mixed", "plane_frames": 1},
+    ]
+    fits = bodies()
+    for name in ("joints", "covariance"):
+        fits[name] = placed[name]
+    return {
+        "tracking__A_1": xr.Dataset(coords={"person": [3, 8]}, attrs={"tracks": tracks}),
+        "triangulation__A_1": xr.Dataset(placed, coords=coordinates),
+        "body_fitting__A_1": fits,
+        "broadcast_calibration__A_1": broadcast(),
+    }
+
+
+def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
+    run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
+    files = {form: EXPORTS[form](run, tmp_path) for form in ("c3d", "csv", "mot", "gltf")}
+    names = {path.relative_to(tmp_path).as_posix() for found in files.values() for path in found}
+    assert names == {
+        *(f"markers/A_1/person_00{person}.c3d" for person in (3, 8)),
+        *(f"tables/A_1.{table}.csv" for table in ("joints", "people", "strides")),
+        *(f"tables/A_1.{table}.csv-metadata.json" for table in ("joints", "people", "strides")),
+        "opensim/A_1/person_003_frame_000100.mot",
+        "opensim/A_1/person_008_frame_000100.mot",
+        "opensim/A_1/person_008_frame_000103.mot",
+        "scenes/A_1.glb",
+    }
+    texts = [
+        (tmp_path / "markers/A_1/person_008.c3d").read_bytes(),
+        (tmp_path / "tables/A_1.joints.csv-metadata.json").read_bytes(),
+        (tmp_path / "opensim/A_1/person_008_frame_000103.mot").read_bytes(),
+        (tmp_path / "scenes/A_1.glb").read_bytes(),
+    ]
+    for text in texts:
+        assert b"For tests alone." in text
+        assert b"open-neutral/2 (CC0 1.0)" in text
+    assert b"mixed" in texts[0] and b"mixed" in texts[2] and b'"kind":"mixed"' in texts[3]
+    assert b"COCO-17 keypoints of the fitted body open-neutral/2" in texts[1]
+    unstated = replace(run, licence=None)
+    EXPORTS["c3d"](unstated, tmp_path / "unstated")
+    assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
+
+
+def test_filled_joints_are_flagged(match_folder, tmp_path):
+    run = origin(match_folder, **tracked())
+    assert not [path for path in export(run, ["csv"], tmp_path / "a") if "origins" in path.parts]
+    export(replace(run, filled=True), ["csv", "trc"], tmp_path / "b")
+    flags = read_origins(tmp_path / "b" / "origins" / "A_1.npz")
+    assert (flags[2, 1] == ORIGINS.index("filled")).all()
+    assert (np.delete(flags, 2, axis=0) == ORIGINS.index("automatic")).all()
+    table = pd.read_csv(tmp_path / "b" / "tables" / "A_1.joints.csv")
+    assert set(table[table.filled].frame) == {102} and set(table[table.filled].person) == {8}
+    lines = (tmp_path / "b" / "markers" / "A_1" / "person_008.trc").read_text().split("\n")[6:-1]
+    assert len(lines) == 4 and all("" not in line.split("\t") for line in lines)
+
+
+def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
+    match_folder, tmp_path, monkeypatch
+):
+    other = dataclasses.replace(load_open_body(), name="smpl-neutral")
+    monkeypatch.setattr(best_results, "find_body", lambda name: other)
+    run = origin(match_folder, **tracked())
+    (path,) = EXPORTS["gltf"](run, tmp_path / "joints")
+    assert b'"skins"' not in path.read_bytes() and b"person_003_left_hip" in path.read_bytes()
+    with pytest.raises(UsageError, match="--licence FILE with the terms of body model smpl-neu"):
+        EXPORTS["gltf"](replace(run, surface=True), tmp_path / "refused")
+    asked = replace(run, surface=True, licence="Terms of the model.")
+    (path,) = EXPORTS["gltf"](asked, tmp_path / "asked")
+    assert b'"skins"' in path.read_bytes() and b"Terms of the model." in path.read_bytes()

@@ -87,6 +87,18 @@ def test_the_example_in_the_docs_gives_labelled_joints_with_units(tiny_run, tmp_
     assert capsys.readouterr().out == "('frame', 'joint', 'coordinate') m\n"
 
 
+def test_the_notebook_in_the_docs_runs(tiny_run, capsys):
+    page = (Path(__file__).parents[2] / "docs/how-to/notebook.md").read_text()
+    cells = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    found = {}
+    exec(cells.replace("worldpose-data", str(tiny_run)).replace('"lab"', f'"{TINY}"'), found)
+    assert float(found["part"].time[0]) >= 0.2 and float(found["part"].time[-1]) <= 0.8
+    assert found["knee"].attrs["units"] == "rad"
+    nose = found["bodies"].joints.values[0, 0, 0]
+    np.testing.assert_array_equal(found["table"].loc[(0, 0, "nose"), ["x", "y", "z"]], nose)
+    assert "nose" in capsys.readouterr().out
+
+
 class Outside(HTMLParser):
     """Collects the links and sources of a page that point to other files."""
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters
@@ -92,6 +93,45 @@ class JointTracks:
             f"{getattr(self, name)[frame, person, joint]}",
             "Correct it.",
         )
+
+
+def fill_gaps(tracks: JointTracks) -> JointTracks:
+    """Return tracks in which joints that are missing for a while are interpolated.
+
+    Each joint of each person is interpolated between its first and its last frame by monotone
+    cubic pieces, which do not overshoot; nothing is extrapolated. `views` is 0 at an interpolated
+    joint, as at every joint that no camera contributes to, and its covariance is NaN: how far a
+    person goes astray in a gap is unknown. Frames that all people lack are added.
+    """
+    if not len(tracks.frames):
+        return tracks
+    frames = np.arange(tracks.frames[0], tracks.frames[-1] + 1)
+    rows = tracks.frames - tracks.frames[0]
+    shape = (len(frames), *tracks.joints.shape[1:3])
+    joints = np.full((*shape, 3), np.nan)
+    covariance = np.full((*shape, 3, 3), np.nan)
+    views = np.zeros(shape, np.int64)
+    joints[rows] = tracks.joints
+    if tracks.covariance is not None:
+        covariance[rows] = tracks.covariance
+    there = np.isfinite(joints[..., 0])
+    covariance[~there] = np.nan
+    views[there] = 1 if tracks.views is None else tracks.views[there[rows]]
+    for person, joint in np.ndindex(shape[1:]):
+        known = np.flatnonzero(there[:, person, joint])
+        if len(known) < 2:
+            continue
+        gaps = np.setdiff1d(np.arange(known[0], known[-1]), known)
+        if len(gaps):
+            path = PchipInterpolator(known, joints[known, person, joint])
+            joints[gaps, person, joint] = path(gaps)
+    return JointTracks(
+        frames,
+        tracks.person_ids,
+        joints,
+        covariance=None if tracks.covariance is None else covariance,
+        views=views,
+    )
 
 
 def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:

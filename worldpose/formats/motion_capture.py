@@ -204,7 +204,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     turns = Rigid.from_rotvec(angles.reshape(len(angles), -1, 3), np.zeros(3)).rotation.copy()
     turns[:, 0] = Y_UP @ turns[:, 0]
     roots = (rest[0] + poses.transl) @ Y_UP.T * CENTIMETRES
-    channels = np.unwrap(np.degrees(_zxy(turns)), axis=0, period=360.0)
+    channels = np.unwrap(np.degrees(zxy_angles(turns)), axis=0, period=360.0)
     # Depth first, the joint order of the file.
     order = list(_depth_first(model.parents, 0))
     rows = np.concatenate([roots, channels[:, order].reshape(len(roots), -1)], axis=1)
@@ -253,7 +253,7 @@ def _numbers(vector: Floats) -> str:
     return " ".join(f"{value:.{BVH_DECIMALS}f}" for value in vector)
 
 
-def _zxy(rotation: Floats) -> Floats:
+def zxy_angles(rotation: Floats) -> Floats:
     """Return angles (..., 3) [rad] with rotation = Rz(first) Rx(second) Ry(third)."""
     cosine = np.hypot(rotation[..., 2, 0], rotation[..., 2, 2])
     locked = cosine < _LOCKED

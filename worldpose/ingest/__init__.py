@@ -9,6 +9,7 @@ from worldpose.formats.calibration_files import read_calibration, write_calibrat
 from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.clicks import ImportedClicks, import_clicks
 from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
+from worldpose.ingest.importing import import_lenses, import_match, import_pose2sim, import_videos
 from worldpose.ingest.match_folder import (
     MatchFolder,
     read_match,
@@ -16,13 +17,7 @@ from worldpose.ingest.match_folder import (
     unclicked_clips,
 )
 from worldpose.ingest.registration import register_match
-from worldpose.ingest.writing import (
-    MatchAnnotations,
-    import_lenses,
-    import_match,
-    import_videos,
-    write_match,
-)
+from worldpose.ingest.writing import MatchAnnotations, write_match
 
 __all__ = [
     "ImportedClicks",
@@ -32,6 +27,7 @@ __all__ = [
     "import_clicks",
     "import_lenses",
     "import_match",
+    "import_pose2sim",
     "import_videos",
     "read_calibration",
     "read_match",

@@ -10,7 +10,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.pitch import PitchSpec
-from worldpose.formats.positions_file import Positions
+from worldpose.formats.tables import Positions
 from worldpose.reports.drawing import GRASS, INK, LINE, markings, person_color
 
 PIXELS_PER_M: Final = 10.0

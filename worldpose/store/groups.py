@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import warnings
 from collections.abc import AsyncIterator, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from zarr.abc.store import (
 )
 from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.errors import ZarrUserWarning
 from zarr.storage import LocalStore
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
@@ -328,6 +331,12 @@ def write_group(
         for part in array_parts(array, values.shape):
             stored[part] = normalize_nans(values[part])
         files += 1 + stored.nchunks
+    # Files that somebody removed meanwhile are found by their number.
+    with suppress(FileNotFoundError), warnings.catch_warnings():
+        # Zarr warns that other readers may ignore it, as the format allows.
+        warnings.simplefilter("ignore", ZarrUserWarning)
+        # For readers that open the folder themselves: they list it otherwise, and warn.
+        zarr.consolidate_metadata(group.store)
     return files
 
 

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_contracts.match import Registration
-from data_contracts.run import Project, Reservation, ResultManifest, RunRecord
+from data_contracts.run import (
+    BODY_STAGES,
+    JOINT_STAGES,
+    Project,
+    Reservation,
+    ResultManifest,
+    RunRecord,
+)
 from data_contracts.work import Work
 from worldpose.errors import (
     CorruptionError,
@@ -315,9 +322,10 @@ def open_blobs(url: str) -> Blobs:
 
 
 class Run(Mapping[str, "xr.Dataset"]):
-    """Results of one run: `run["triangulation/clip"].joints`.
+    """Results of one run: `run["triangulation/clip"].joints`, `run.bodies("clip").transl`.
 
-    Each is opened on first access, and its values are read on access.
+    Each is opened on first access, and its values are read on access. Dimensions are labelled, and
+    `time` is the time of each frame in seconds.
     """
 
     def __init__(self, store: Store, record: RunRecord, *, complete: bool = False) -> None:
@@ -344,8 +352,64 @@ class Run(Mapping[str, "xr.Dataset"]):
             )
             if self._complete:
                 self._require_all_arrays(name, stage, result)
-            self._opened[name] = result
+            self._opened[name] = self._label(result)
         return self._opened[name]
+
+    def bodies(self, clip: str) -> xr.Dataset:
+        """Return the best bodies of a clip: refitted ones where the run has them.
+
+        `run.bodies(clip).joints` are their keypoints; `.to_dataframe()` of any array gives pandas.
+
+        Raises:
+            InputError: the run has no bodies of the clip.
+        """
+        return self._best(clip, BODY_STAGES)
+
+    def joints(self, clip: str) -> xr.Dataset:
+        """Return the best result with `joints` and `covariance` of a clip: bodies, if it has any.
+
+        Raises:
+            InputError: the run has no joints of the clip.
+        """
+        return self._best(clip, JOINT_STAGES)
+
+    def _best(self, clip: str, stages: Sequence[str]) -> xr.Dataset:
+        for stage in reversed(stages):
+            if f"{stage}/{clip}" in self:
+                return self[f"{stage}/{clip}"]
+        clips = {name.partition("/")[2] for name in self if name.partition("/")[0] in stages}
+        raise InputError(
+            f"run {self.record.run_id} of match {self.record.match_id}: clip {clip}",
+            expected=f"a result of {' or '.join(stages)}",
+            found=f"results of {', '.join(sorted(clips))}" if clips else "none of any clip",
+            todo=f"Name one of these clips, or run: worldpose run {self.record.match_id}",
+        )
+
+    def _label(self, result: xr.Dataset) -> xr.Dataset:
+        """Add the time of every frame [s], and names of rotations and shape components."""
+        from worldpose.body.keypoints import JOINT_NAMES  # late: status needs no body
+
+        axes = ("x", "y", "z")
+        shapes = list(range(result.sizes.get("shape_component", 0)))
+        names: dict[str, Sequence[object]] = {
+            "rotation": axes,
+            "rotation_23": [f"{joint}_{axis}" for joint in JOINT_NAMES[1:] for axis in axes],
+            "shape_component": shapes,
+            "shape_component_": shapes,
+        }
+        labelled = result.assign_coords(
+            {
+                dim: list(values)
+                for dim, values in names.items()
+                if dim not in result.coords and result.sizes.get(dim) == len(values)
+            }
+        )
+        registration = self._store.registration(self.record.match_id)
+        if "frame" in result.coords and registration is not None:
+            about = {"units": "s", "about": "time of the match frame: frame / frames per second"}
+            seconds = result["frame"].values / registration.spec.fps
+            labelled = labelled.assign_coords(time=("frame", seconds, about))
+        return labelled
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(self.record.results))

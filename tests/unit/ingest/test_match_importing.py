@@ -8,8 +8,8 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.keypoint_files import write_keypoint_arrays
 from worldpose.ingest.footage import read_unit
+from worldpose.ingest.importing import import_match
 from worldpose.ingest.match_folder import read_match, require_calibrated
-from worldpose.ingest.writing import import_match
 
 
 def results(*frames):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_contracts.pitch import PitchSpec
-from worldpose.formats.positions_file import Positions
+from worldpose.formats.tables import Positions
 from worldpose.reports.minimap import MARGIN_M, PIXELS_PER_M, minimap_frames
 
 

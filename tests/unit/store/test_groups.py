@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -203,3 +205,12 @@ def test_any_array_of_any_shape_comes_back(dtype: Any, data: st.DataObject) -> N
         write_group(Path(folder), layout, {"x": values}, {}, {})
         stored = zarr.open_group(folder, mode="r")["x"]
         np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]
+
+
+def test_xarray_opens_the_folder_itself_without_a_warning(tmp_path: Path) -> None:
+    write(tmp_path / "group")
+    (tmp_path / "group" / "manifest.json").write_text("{}")  # as in the store
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened = xr.open_zarr(tmp_path / "group")
+        np.testing.assert_array_equal(opened["joints"].values, all_sample_arrays()["joints"])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from store_samples import (
     ATTRIBUTES,
     LAYOUT,
@@ -417,6 +418,48 @@ def test_run_gives_its_results_by_unit(store: Store) -> None:
     assert run["tracking/clip"] is run["tracking/clip"]
     assert "Run 0001 of match final: complete" in repr(run)
     assert "tracking/late" in repr(run)
+
+
+def test_frames_of_a_run_have_times(folder_store: Store) -> None:
+    run_once(folder_store)
+    assert "time" not in worldpose.open_run(folder_store.url, "final")["tracking/clip"].coords
+    folder_store.register(sample_registration())
+    result = worldpose.open_run(folder_store.url, "final")["tracking/clip"]
+    np.testing.assert_allclose(result.time, result.frame / 50.0)
+    assert result.time.attrs["units"] == "s"
+
+
+def test_the_best_bodies_are_labelled_and_become_a_table(
+    folder_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_once(folder_store)
+    run = worldpose.open_run(folder_store.url, "final")
+    with pytest.raises(InputError, match=r"body_fitting or refitting, found none of any clip"):
+        run.bodies("clip")
+    stored = xr.Dataset(
+        {
+            "betas": (("person", "shape_component"), np.zeros((2, 10))),
+            "body_pose": (("frame", "person", "rotation_23"), np.arange(414.0).reshape(3, 2, 69)),
+            "transl": (("frame", "person", "coordinate"), np.arange(18.0).reshape(3, 2, 3)),
+        },
+        coords={"frame": [5, 6, 7], "person": [3, 8], "coordinate": ["x", "y", "z"]},
+    )
+    names = ("body_fitting/clip", "refitting/clip", "triangulation/other")
+    results = {"results": dict.fromkeys(names, "k")}
+    monkeypatch.setattr(run, "record", run.record.model_copy(update=results))
+    monkeypatch.setattr(
+        Store, "open_result", lambda _, match, stage, *__: stored.assign_attrs(stage=stage)
+    )
+    bodies = run.bodies("clip")
+    assert bodies.stage == "refitting"
+    assert run.joints("other").stage == "triangulation"
+    knee = bodies.body_pose.sel(rotation_23="left_knee_x", person=8, frame=6)
+    assert knee.item() == stored.body_pose.values[1, 1, 9]  # the fourth joint below the pelvis
+    assert bodies.shape_component.values.tolist() == list(range(10))
+    table = bodies.transl.to_dataframe()
+    assert table.loc[(7, 8, "z"), "transl"] == 17.0
+    with pytest.raises(InputError, match=r"found results of clip\. Name one"):
+        run.bodies("second")
 
 
 def test_older_run_stays_open_to_readers(folder_store: Store) -> None:

@@ -1,0 +1,253 @@
+"""Export formats for biomechanics, animation and tables, with notes inside every file that can."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data_contracts.run import BODY_STAGES, JOINT_STAGES
+from data_contracts.tracking import Track
+from flows.results.best_results import (
+    PLANE,
+    Origin,
+    bodies_unit,
+    broadcast_camera,
+    clip_positions,
+    fitted_bodies,
+    static_cameras,
+)
+from worldpose.errors import UsageError
+from worldpose.formats.c3d_file import write_c3d
+from worldpose.formats.gltf_file import AnimatedBody, write_gltf
+from worldpose.formats.motion_capture import stretches, write_markers, write_motion
+from worldpose.formats.opensim_file import (
+    CONVENTION,
+    opensim_coordinates,
+    write_opensim_motion,
+)
+from worldpose.formats.tables import (
+    joints_table,
+    people_table,
+    strides_table,
+    write_csv,
+    write_parquet,
+)
+from worldpose.ingest import read_match
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+OPEN_BODY = "open-neutral"
+"""Names of the body model that ships begin so."""
+
+
+def person_kinds(origin: Origin, clip: str) -> dict[int, str]:
+    """Return the kind of every person of a clip, by id: triangulated, mixed or plane."""
+    plane = f"{PLANE}/{clip}"
+    tracking = origin.run[plane if plane in origin.run else f"tracking/{clip}"]
+    tracks = map(Track.model_validate, tracking.attrs["tracks"])
+    return {track.person: track.kind for track in tracks}
+
+
+def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
+    """Return what the files of a clip say about themselves, by a short name."""
+    stages = [stage for stage in reversed(JOINT_STAGES) if f"{stage}/{clip}" in origin.run]
+    stage = origin.stage or (stages[0] if stages else PLANE)
+    notes = {
+        "software": f"worldpose {version('worldpose')}",
+        "match": origin.spec.match_id,
+        "run": origin.run.record.run_id,
+        "clip": clip,
+        "frames_per_second": f"{origin.spec.fps:g}",
+        "world": "origin at the centre spot, x along the touch line, y across, z up, right-handed"
+        if origin.spec.pitch != "none"
+        else "the world of the given calibration, right-handed",
+        "joints": _joint_definition(origin, clip, stage),
+        "filled": "gaps interpolated on request; joints without a contributing camera are flagged"
+        if origin.filled
+        else "joints without a contributing camera come from the motion or the rest of the body",
+        "licence": origin.licence or "not stated: ask the owner of the recording",
+    }
+    unit = bodies_unit(origin.run, clip)
+    if unit in origin.run:
+        model = str(origin.run[unit].attrs["body_model"])
+        terms = "CC0 1.0" if model.startswith(OPEN_BODY) else "the terms of its publisher apply"
+        notes["body_model"] = f"{model} ({terms})"
+    return notes
+
+
+def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
+    if stage in BODY_STAGES:
+        model = origin.run[f"{stage}/{clip}"].attrs["body_model"]
+        return f"COCO-17 keypoints of the fitted body {model}, as the detector places them"
+    return "COCO-17 keypoints of the detector, triangulated"
+
+
+def export_markers(origin: Origin, out: Path) -> list[Path]:
+    """Write `markers/<clip>/person_<id>.trc` for every person with a joint."""
+    written = []
+    for clip in origin.clips:
+        tracks = origin.tracks(clip)
+        for person, person_id in enumerate(tracks.person_ids):
+            if np.isfinite(tracks.joints[:, person]).any():
+                written.append(out / "markers" / clip / f"person_{person_id:03d}.trc")
+                write_markers(written[-1], tracks, person, origin.spec.fps)
+    return written
+
+
+def export_c3d(origin: Origin, out: Path) -> list[Path]:
+    """Write `markers/<clip>/person_<id>.c3d` for every person with a joint."""
+    written = []
+    for clip in origin.clips:
+        tracks, kinds = origin.tracks(clip), person_kinds(origin, clip)
+        notes = describe_clip(origin, clip)
+        for person, person_id in enumerate(tracks.person_ids.tolist()):
+            if np.isfinite(tracks.joints[:, person]).any():
+                written.append(out / "markers" / clip / f"person_{person_id:03d}.c3d")
+                about = {
+                    **notes,
+                    "kind": kinds[person_id],
+                    "first_match_frame": f"{tracks.frames[0]}",
+                }
+                write_c3d(written[-1], tracks, person, origin.spec.fps, about)
+    return written
+
+
+def export_motion(origin: Origin, out: Path) -> list[Path]:
+    """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        for person, person_id in enumerate(persons):
+            for part in stretches(poses[person]):
+                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.bvh"
+                written.append(out / "motion" / clip / name)
+                write_motion(written[-1], model, poses[person, part], origin.spec.fps)
+    return written
+
+
+def export_opensim(origin: Origin, out: Path) -> list[Path]:
+    """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        kinds = person_kinds(origin, clip)
+        notes = describe_clip(origin, clip) | {
+            "world": "x as in the world of the match, y up, z = minus its y",
+            "joints": CONVENTION,
+            "units": "degrees, metres, seconds; time is match frame / frames per second",
+        }
+        for person, person_id in enumerate(persons.tolist()):
+            for part in stretches(poses[person]):
+                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.mot"
+                written.append(out / "opensim" / clip / name)
+                write_opensim_motion(
+                    written[-1],
+                    opensim_coordinates(model, poses[person, part]),
+                    frames[part] / origin.spec.fps,
+                    notes | {"kind": kinds[person_id]},
+                )
+    return written
+
+
+def export_gltf(origin: Origin, out: Path) -> list[Path]:
+    """Write `scenes/<clip>.glb`: bodies, cameras and the pitch.
+
+    Raises:
+        UsageError: the surface of a body model with terms of its own was asked for without them.
+    """
+    # Imported here: it loads matplotlib's colours, which takes 0.5 s.
+    from worldpose.reports.drawing import markings
+
+    pitch = read_match(Path(origin.registration.folder)).pitch
+    written = []
+    for clip in origin.clips:
+        model, poses, persons = fitted_bodies(origin.run, clip)
+        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+        free = model.name.startswith(OPEN_BODY)
+        if origin.surface and not free and origin.licence is None:
+            raise UsageError(
+                "--surface",
+                expected=f"--licence FILE with the terms of body model {model.name}",
+                found="none",
+                todo="Give their text, which goes into the file, or export without --surface.",
+            )
+        cameras = static_cameras(origin.run, origin.spec, origin.stage)
+        if f"broadcast_calibration/{clip}" in origin.run:
+            cameras["broadcast"] = broadcast_camera(origin.run, clip)
+        kinds = person_kinds(origin, clip)
+        people = [
+            AnimatedBody(
+                f"person_{person_id:03d}",
+                poses[person],
+                {"person": person_id, "kind": kinds[person_id], "body_model": model.name},
+            )
+            for person, person_id in enumerate(persons.tolist())
+        ]
+        notes = describe_clip(origin, clip)
+        notes["joints"] = f"the 24 joints of body model {model.name}, named as SMPL's"
+        notes |= {"units": "metres, seconds", "first_match_frame": f"{frames[0]}"}
+        written.append(out / "scenes" / f"{clip}.glb")
+        write_gltf(
+            written[-1],
+            model,
+            people,
+            origin.spec.fps,
+            cameras=cameras,
+            markings=[] if pitch is None else markings(pitch),
+            notes=notes,
+            surface=free or origin.surface,
+        )
+    return written
+
+
+def export_csv(origin: Origin, out: Path) -> list[Path]:
+    """Write `tables/<clip>.<table>.csv` with its description, for the tables of `_tables`."""
+    return _write_tables(origin, out, "csv", write_csv)
+
+
+def export_parquet(origin: Origin, out: Path) -> list[Path]:
+    """Write `tables/<clip>.<table>.parquet` for the tables of `_tables`."""
+    return _write_tables(origin, out, "parquet", write_parquet)
+
+
+def _write_tables(
+    origin: Origin,
+    out: Path,
+    suffix: str,
+    write: Callable[[Path, pd.DataFrame, Mapping[str, str]], list[Path]],
+) -> list[Path]:
+    written = []
+    for clip in origin.clips:
+        notes = {**describe_clip(origin, clip), "units": "in the name of each column"}
+        for name, table in _tables(origin, clip).items():
+            written += write(out / "tables" / f"{clip}.{name}.{suffix}", table, notes)
+    return written
+
+
+def _tables(origin: Origin, clip: str) -> dict[str, pd.DataFrame]:
+    """Return joints, people and strides of a clip."""
+    tracks, fps = origin.tracks(clip), origin.spec.fps
+    return {
+        "joints": joints_table(tracks, fps, person_kinds(origin, clip)),
+        "people": people_table(clip_positions(origin.run, clip), fps),
+        "strides": strides_table(tracks, fps),
+    }
+
+
+TOOL_EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
+    "trc": export_markers,
+    "c3d": export_c3d,
+    "bvh": export_motion,
+    "mot": export_opensim,
+    "gltf": export_gltf,
+    "csv": export_csv,
+    "parquet": export_parquet,
+}
+"""Part of `EXPORTS`."""

@@ -1,0 +1,100 @@
+"""C3D files hold the joints as other programs' readers find them."""
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import COCO17
+from worldpose.errors import InputError
+from worldpose.evaluation.marker_reference import map_marker_names, marker_joints, read_markers
+from worldpose.formats import JointTracks
+from worldpose.formats.c3d_file import write_c3d
+
+NOTES = {"licence": "For tests alone.\n" + "A long line. " * 40, "kind": "mixed"}
+FRAMES = np.array([100, 101, 102, 103, 105])
+
+
+@pytest.fixture
+def tracks():
+    """Two people over five frames and a frame that both lack; the second has gaps."""
+    joints = np.random.default_rng(0).uniform(-60.0, 60.0, (5, 2, 17, 3))
+    joints[0, 1] = np.nan
+    joints[2, 1, 5] = np.nan
+    covariance = np.zeros((5, 2, 17, 3, 3)) + np.diag([1e-4, 4e-4, 4e-4])  # 17.3 mm in the mean
+    views = np.full((5, 2, 17), 3)
+    views[3, 1, 7] = 0  # filled
+    return JointTracks(FRAMES, np.array([4, 9]), joints, covariance, views)
+
+
+def expected(tracks, person):
+    joints = np.full((6, 17, 3), np.nan)
+    joints[FRAMES - 100] = tracks.joints[:, person]
+    return joints
+
+
+def test_ezc3d_finds_the_joints_within_a_tenth_of_a_millimetre(tracks, tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    write_c3d(tmp_path / "p.c3d", tracks, 1, 50.0, NOTES)
+    file = ezc3d.c3d(str(tmp_path / "p.c3d"))
+    point, event = file["parameters"]["POINT"], file["parameters"]["EVENT"]
+    assert point["LABELS"]["value"] == list(COCO17)
+    assert point["UNITS"]["value"] == ["mm"]
+    assert (point["RATE"]["value"], file["header"]["points"]["frame_rate"]) == ([50.0], 50.0)
+    points = file["data"]["points"][:3].transpose(2, 1, 0) / 1000.0
+    np.testing.assert_allclose(points, expected(tracks, 1), atol=1e-4)
+    residuals = file["data"]["meta_points"]["residuals"][0].T
+    assert residuals[0].tolist() == residuals[4].tolist() == [-1.0] * 17
+    assert (residuals[2, 5], residuals[3, 7]) == (-1.0, 0.0)
+    assert event["LABELS"]["value"] == ["Clip begin", "Clip end"]
+    np.testing.assert_allclose(event["TIMES"]["value"], [[0.0, 0.0], [0.0, 0.1]], atol=1e-6)
+    about = file["parameters"]["WORLDPOSE"]
+    assert about["KIND"]["value"] == ["mixed"]
+    assert " ".join(about["LICENCE"]["value"]).split() == NOTES["licence"].split()
+
+
+@pytest.mark.filterwarnings("ignore:No analog data")
+def test_the_reader_of_markers_finds_them_too(tracks, tmp_path):
+    pytest.importorskip("c3d")
+    write_c3d(tmp_path / "p.c3d", tracks, 1, 50.0, NOTES)
+    markers = read_markers(tmp_path / "p.c3d")
+    assert (markers.rate, markers.names) == (50.0, COCO17)
+    joints = marker_joints(markers, map_marker_names(markers.names))[:, 0]
+    np.testing.assert_allclose(joints, expected(tracks, 1), atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:No analog data")
+def test_residuals_are_standard_deviations_or_flags(tracks, tmp_path):
+    # By c3d: ezc3d takes the two halves of the fourth number apart, also in files of floats.
+    c3d = pytest.importorskip("c3d")
+
+    def residuals(written):
+        write_c3d(tmp_path / "p.c3d", written, 1, 50.0, {})
+        with (tmp_path / "p.c3d").open("rb") as file:
+            return np.array([row[:, 3].copy() for _, row, _ in c3d.Reader(file).read_frames()])
+
+    found = residuals(tracks)
+    assert (found[2, 5], found[3, 7], found[3, 8]) == (-1.0, 0.0, 17.0)
+    found = residuals(JointTracks(tracks.frames, tracks.person_ids, tracks.joints))
+    assert (found[2, 5], found[3, 7]) == (-1.0, 1.0), "unknown covariance and views"
+
+
+def test_what_the_format_cannot_hold_is_refused(tracks, tmp_path):
+    path = tmp_path / "p.c3d"
+    with pytest.raises(InputError, match=r"WORLDPOSE:LICENCE: expected a text of at most 255"):
+        write_c3d(path, tracks, 0, 50.0, {"licence": "word " * 5000})
+    long = JointTracks(np.array([0, 65535]), np.array([4]), np.zeros((2, 1, 17, 3)))
+    with pytest.raises(InputError, match=r"expected 1 to 65535 frames.*found 65536"):
+        write_c3d(path, long, 0, 50.0, {})
+    none = JointTracks(np.zeros(0, np.int64), np.array([4]), np.zeros((0, 1, 17, 3)))
+    with pytest.raises(InputError, match="found 0"):
+        write_c3d(path, none, 0, 50.0, {})
+    assert not path.exists()
+
+
+def test_a_long_clip_keeps_its_number_of_frames(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    joints = np.zeros((2, 1, 17, 3)) + [1.0, 2.0, 3.0]
+    long = JointTracks(np.array([0, 39999]), np.array([4]), joints)
+    write_c3d(tmp_path / "p.c3d", long, 0, 50.0, {})
+    points = ezc3d.c3d(str(tmp_path / "p.c3d"))["data"]["points"]
+    assert points.shape[2] == 40000
+    np.testing.assert_allclose(points[:3, 0, -1], [1000.0, 2000.0, 3000.0])

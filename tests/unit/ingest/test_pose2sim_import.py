@@ -1,0 +1,213 @@
+"""A trial of Pose2Sim becomes a match folder, or is refused with a message that can be followed."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.conventions import COCO17
+from worldpose.body.keypoints import BODY25
+from worldpose.errors import InputError
+from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.ingest import import_pose2sim, read_calibration, read_match, write_calibration_toml
+from worldpose.ingest.footage import read_unit
+
+CAMERAS = ("cam01", "cam02")
+KINDS = {"COCO-17": 17, "BODY_25": 25, "HALPE-26": 26, "COCO-WholeBody": 133}
+
+
+def camera(name, x=0.0):
+    return CameraCalibration(
+        id=name,
+        image_size=(1088, 1920),
+        focal_px=(1500.0, 1500.0),
+        principal_point_px=(540.0, 960.0),
+        distortion=(0.0,) * 5,
+        rotation=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+        translation=(x, 1.0, 5.0),
+    )
+
+
+def person(size, seed):
+    """x, y, confidence of each keypoint, and the same in COCO-17's order."""
+    rng = np.random.default_rng(seed)
+    values = np.column_stack([rng.uniform(0, 1000, (size, 2)), rng.uniform(0.1, 1.0, size)])
+    order = [BODY25.index(name) for name in COCO17] if size == 25 else range(17)
+    return values, values[list(order)]
+
+
+def write_frame(folder, number, people):
+    folder.mkdir(parents=True, exist_ok=True)
+    found = [{"person_id": [-1], "pose_keypoints_2d": values.ravel().tolist()} for values in people]
+    file = folder / f"{folder.name.removesuffix('_json')}_{number:06d}.json"
+    file.write_text(json.dumps({"version": 1.3, "people": found}))
+    return file
+
+
+@pytest.fixture
+def trial(tmp_path):
+    """Two cameras; frame 10 has two people, 11 one, 12 nobody, 13 one."""
+    folder = tmp_path / "trial"
+    (folder / "calibration").mkdir(parents=True)
+    cameras = {name: camera(name, x) for x, name in enumerate(CAMERAS)}
+    write_calibration_toml(folder / "calibration" / "Calib.toml", cameras)
+    for c, name in enumerate(CAMERAS):
+        for number, count in ((10, 2), (11, 1), (12, 0), (13, 1)):
+            people = [person(26, 100 * c + 10 * number + n)[0] for n in range(count)]
+            write_frame(folder / "pose" / f"{name}_json", number, people)
+    (folder / "Config.toml").write_text("[project]\nframe_rate = 60\nframe_range = 'auto'\n")
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "size"), KINDS.items())
+def test_each_set_of_keypoints_keeps_those_of_coco(tmp_path, kind, size):
+    values, expected = person(size, 3)
+    values[1 if size != 25 else 16] = 0.0  # the left eye, missing
+    write_frame(tmp_path / "a_json", 7, [values])
+    found = read_openpose_folder(tmp_path / "a_json")
+    assert (found.kind, found.people.frame.tolist()) == (kind, [7])
+    seen = np.arange(17) != 1
+    np.testing.assert_allclose(found.people.keypoints[0, 0, seen], expected[seen, :2], rtol=1e-6)
+    np.testing.assert_allclose(found.people.confidence[0, 0, seen], expected[seen, 2], rtol=1e-6)
+    assert np.isnan(found.people.keypoints[0, 0, 1]).all()
+    assert found.people.score[0, 0] == pytest.approx(expected[seen, 2].mean(), rel=1e-5)
+
+
+def test_a_trial_becomes_a_match(trial, tmp_path):
+    spec, notes = import_pose2sim(trial, tmp_path / "m")
+    clip = spec.clips[0]
+    assert (spec.fps, clip.first_frame, clip.frame_count) == (60.0, 10, 4)
+    assert any("HALPE-26; kept are the 17 keypoints of COCO, those of feet" in n for n in notes)
+    match = read_match(tmp_path / "m")
+    people, given = read_unit(match, "cam02")
+    expected = person(26, 100 + 100 + 1)[1]
+    np.testing.assert_allclose(people.keypoints[0, 1], expected[:, :2], rtol=1e-6)
+    assert np.isfinite(people.keypoints[:, :, 0, 0]).sum(axis=1).tolist() == [2, 1, 0, 1]
+    assert given.translation == (1.0, 1.0, 5.0)
+
+
+def test_synchronised_poses_and_the_frame_range_have_precedence(trial, tmp_path):
+    for name in CAMERAS:
+        shutil.copytree(trial / "pose" / f"{name}_json", trial / "pose-sync" / f"{name}_json")
+    shutil.rmtree(trial / "pose")
+    (trial / "Config.toml").write_text("[project]\nframe_range = [11, 13]\nframe_rate = 50\n")
+    spec, _ = import_pose2sim(trial, tmp_path / "m", fps=25.0)
+    assert (spec.fps, spec.clips[0].first_frame, spec.clips[0].frame_count) == (25.0, 11, 2)
+
+
+def test_a_trial_of_a_batch_uses_the_files_above_it(trial, tmp_path):
+    batch = tmp_path / "batch"
+    shutil.copytree(trial / "pose", batch / "Trial_1" / "pose")
+    shutil.copytree(trial / "calibration", batch / "calibration")
+    (batch / "Config.toml").write_text("[project]\nframe_rate = 120\n")
+    (batch / "Trial_1" / "Config.toml").write_text("[project]\nframe_range = [10, 12]\n")
+    spec, _ = import_pose2sim(batch / "Trial_1", tmp_path / "m")
+    assert (spec.fps, spec.clips[0].frame_count) == (120.0, 2)
+
+
+def test_other_names_belong_to_the_cameras_in_order_and_it_says_so(trial, tmp_path):
+    cameras = {name: camera(name, x) for x, name in enumerate(("int_a", "int_b"))}
+    write_calibration_toml(trial / "calibration" / "Calib.toml", cameras)
+    spec, notes = import_pose2sim(trial, tmp_path / "m")
+    assert [one.id for one in spec.static_cameras] == ["int_a", "int_b"]
+    assert "pose: in alphabetical order, cam01_json is int_a, cam02_json is int_b" in notes
+
+
+def spoil(trial, what):
+    poses, config = trial / "pose" / "cam01_json", trial / "Config.toml"
+    calibration = trial / "calibration" / "Calib.toml"
+    frame = poses / "cam01_000010.json"
+    match what:
+        case "no folder":
+            shutil.rmtree(trial)
+        case "no calibration":
+            calibration.unlink()
+        case "two calibrations":
+            shutil.copy(calibration, calibration.with_name("Calib_old.toml"))
+        case "no poses":
+            shutil.rmtree(trial / "pose")
+        case "a camera too few":
+            shutil.rmtree(poses)
+        case "no frames":
+            [file.unlink() for file in poses.iterdir()]
+        case "not JSON":
+            frame.write_text("{")
+        case "no people":
+            frame.write_text('{"persons": []}')
+        case "other keypoints":
+            frame.write_text('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}')
+        case "text":
+            numbers = ["x"] * 78
+            frame.write_text(json.dumps({"people": [{"pose_keypoints_2d": numbers}]}))
+        case "infinite":
+            frame.write_text(json.dumps({"people": [{"pose_keypoints_2d": [np.inf] * 78}]}))
+        case "mixed keypoints":
+            write_frame(poses, 11, [person(25, 0)[0]])
+        case "no number":
+            frame.rename(poses / "first.json")
+        case "two estimators":
+            shutil.copy(frame, poses / "again_10.json")
+        case "rate":
+            config.write_text("[project]\nframe_rate = 'fast'\n")
+        case "no rate":
+            config.unlink()
+        case "range":
+            config.write_text("[project]\nframe_rate = 60\nframe_range = [30, 10]\n")
+        case "not TOML":
+            config.write_text("[project\n")
+        case "a list":
+            config.write_text("project = [1]\n")
+        case "nobody":
+            for file in trial.rglob("*.json"):
+                file.write_text('{"people": []}')
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("no folder", r"trial: expected the folder of a Pose2Sim trial, found nothing"),
+        ("no calibration", r"expected calibration/Calib.toml .*Run Pose2Sim.calibration"),
+        ("two calibrations", r"calibration: expected one calibration \*.toml, found Calib.toml, C"),
+        ("no poses", r"trial: expected pose/<camera>_json .* or videos.*found neither"),
+        ("a camera too few", r"pose: expected one for each camera in Calib.toml: cam01, cam02, fo"),
+        ("no frames", r"cam01_json: expected a .json file for each frame, found none"),
+        ("not JSON", r"cam01_000010.json: expected JSON"),
+        ("no people", r"cam01_000010.json: people: expected a list of at most 1000 people"),
+        ("other keypoints", r"people\[0\].pose_keypoints_2d: expected x, y .*78 \(HALPE-26\).*fo"),
+        ("text", r"cam01_000010.json: people\[0\].pose_keypoints_2d: expected .* found 78 entries"),
+        ("infinite", r"people\[0\].pose_keypoints_2d: expected finite numbers .*found inf"),
+        ("mixed keypoints", r"cam01_json: expected the same keypoints in all frames, found 26 in"),
+        ("no number", r"first.json: expected a frame number .* Name it as cam01_000012.json"),
+        ("two estimators", r"expected one file per frame, found again_10.json with the same"),
+        ("rate", r"Config.toml: project.frame_rate: expected frames per second or 'auto', found"),
+        ("no rate", r"Config.toml: project.frame_rate: expected frames per second, as there are n"),
+        ("range", r"Config.toml: project.frame_range: expected .* found \[30, 10\]"),
+        ("not TOML", r"Config.toml: expected TOML"),
+        ("a list", r"Config.toml: project: expected a table, found \[1\]"),
+        ("nobody", r"pose: expected people, found none in any frame"),
+    ],
+)
+def test_a_bad_trial_is_refused_with_one_error(trial, tmp_path, what, message):
+    spoil(trial, what)
+    with pytest.raises(InputError, match=message) as caught:
+        import_pose2sim(trial, tmp_path / "m")
+    assert caught.value.todo
+    assert not (tmp_path / "m").exists()
+
+
+DEMO = Path(os.environ.get("WORLDPOSE_POSE2SIM_DEMO", "nowhere"))
+
+
+@pytest.mark.skipif(not DEMO.is_dir(), reason="WORLDPOSE_POSE2SIM_DEMO names no demo of Pose2Sim")
+def test_the_demo_of_pose2sim_is_imported(tmp_path):
+    spec, notes = import_pose2sim(DEMO, tmp_path / "m")
+    assert [one.id for one in spec.static_cameras] == ["cam01", "cam02", "cam03", "cam04"]
+    assert (spec.fps, spec.clips[0].frame_count) == (60.0, 100)
+    assert any("the run detects people in the videos" in note for note in notes)
+    assert set(read_calibration(tmp_path / "m" / "calibration.toml")) == {
+        one.id for one in spec.static_cameras
+    }

@@ -1,0 +1,155 @@
+"""2D poses in OpenPose's JSON, one file per frame, as OpenPose and Pose2Sim write them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.records import FRAME_LIMIT
+from worldpose.body.keypoints import BODY25
+from worldpose.errors import InputError
+from worldpose.formats.files import read_json
+from worldpose.formats.keypoint_files import COORDINATE_LIMIT, PEOPLE_LIMIT
+
+KEYPOINTS_KEY: Final = "pose_keypoints_2d"
+PLACES: Final = {
+    17: ("COCO-17", tuple(range(17))),
+    25: ("BODY_25", tuple(BODY25.index(name) for name in COCO17)),
+    26: ("HALPE-26", tuple(range(17))),
+    133: ("COCO-WholeBody", tuple(range(17))),
+    136: ("HALPE-136", tuple(range(17))),
+}
+"""Name of a set of keypoints and the places of COCO-17's in it, by its size."""
+_NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
+
+
+class OpenPoseFolder(NamedTuple):
+    """Content of a folder of frames."""
+
+    people: KeypointDetections
+    """The keypoints of COCO-17; those of feet, hands and face are left out."""
+    kind: str | None
+    """Name of the set of keypoints in the files; None without people."""
+
+
+def read_openpose_folder(folder: Path) -> OpenPoseFolder:
+    """Return the people of one camera.
+
+    The last number in a file's name is its frame. A keypoint with confidence 0 is missing; a
+    confidence above 1, which some estimators give, counts as 1. Boxes surround the keypoints, and
+    a person's score is the mean confidence.
+
+    Raises:
+        InputError: with file and key: no frames, two files of a frame, no JSON of OpenPose, or an
+            unknown or a changing number of keypoints.
+    """
+    files = _frame_files(folder)
+    frames = sorted(files)
+    people = [_read_frame(files[frame]) for frame in frames]
+    sizes = {
+        len(person): files[frame]
+        for frame, found in zip(frames, people, strict=True)
+        for person in found
+    }
+    if len(sizes) > 1:
+        (one, file), (two, other) = list(sizes.items())[:2]
+        raise InputError(
+            str(folder),
+            expected="the same keypoints in all frames",
+            found=f"{one} in {file.name}, {two} in {other.name}",
+            todo="Use the files of one estimator, and remove older ones.",
+        )
+    kind, places = PLACES[next(iter(sizes))] if sizes else (None, tuple(range(17)))
+    most = max(map(len, people), default=0)
+    values = np.full((len(frames), most, len(COCO17), 3), np.nan, np.float32)
+    for row, found in enumerate(people):
+        for column, person in enumerate(found):
+            values[row, column] = person[list(places)]
+    keypoints, confidence = values[..., :2], np.minimum(values[..., 2], 1.0)
+    missing = ~(confidence > 0.0)
+    keypoints = np.where(missing[..., None], np.nan, keypoints)
+    confidence = np.where(missing, np.nan, confidence).astype(np.float32)
+    # Somebody without any keypoint is nobody.
+    there = ~missing.all(axis=-1)
+    boxes = np.full((*there.shape, 4), np.nan, np.float32)
+    score = np.full(there.shape, np.nan, np.float32)
+    boxes[there] = np.concatenate(
+        [np.nanmin(keypoints[there], axis=-2), np.nanmax(keypoints[there], axis=-2)], axis=-1
+    )
+    score[there] = np.nanmean(confidence[there], axis=-1)
+    detected = KeypointDetections(keypoints, confidence, boxes, score, np.array(frames, np.int64))
+    return OpenPoseFolder(detected, kind)
+
+
+def _frame_files(folder: Path) -> dict[int, Path]:
+    files: dict[int, Path] = {}
+    for file in sorted(folder.glob("*.json")):
+        number = _NUMBER.search(file.name)
+        if number is None or int(number[1]) > FRAME_LIMIT:
+            raise InputError(
+                str(file),
+                expected=f"a frame number up to {FRAME_LIMIT} at the end of the name",
+                found=file.name,
+                todo="Name it as cam01_000012.json, or move it elsewhere.",
+            )
+        if int(number[1]) in files:
+            raise InputError(
+                str(file),
+                expected="one file per frame",
+                found=f"{files[int(number[1])].name} with the same frame number",
+                todo="Keep the poses of one camera and one estimator in a folder.",
+            )
+        files[int(number[1])] = file
+    if not files:
+        raise InputError(
+            str(folder),
+            expected="a .json file for each frame",
+            found="none",
+            todo="Run pose estimation for this camera first.",
+        )
+    return files
+
+
+def _read_frame(file: Path) -> list[NDArray[np.float64]]:
+    """Return the keypoints (n, 3) x, y, confidence of each person of a frame."""
+    content = read_json(file)
+    people = content.get("people") if isinstance(content, dict) else None
+    if not isinstance(people, list) or len(people) > PEOPLE_LIMIT:
+        raise InputError(
+            f"{file}: people",
+            expected=f"a list of at most {PEOPLE_LIMIT} people, as OpenPose writes it",
+            found=f"{len(people)}" if isinstance(people, list) else type(content).__name__,
+            todo="Write the poses in OpenPose's form (Pose2Sim: output_format = 'openpose').",
+        )
+    return [_read_person(f"{file}: people[{n}].{KEYPOINTS_KEY}", p) for n, p in enumerate(people)]
+
+
+def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
+    numbers = person.get(KEYPOINTS_KEY) if isinstance(person, dict) else None
+    known = ", ".join(f"{3 * size} ({name})" for size, (name, _) in PLACES.items())
+    if (
+        not isinstance(numbers, list)
+        or len(numbers) not in {3 * size for size in PLACES}
+        or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers)
+    ):
+        raise InputError(
+            where,
+            expected=f"x, y and confidence of each keypoint: {known} numbers",
+            found=f"{len(numbers)} entries" if isinstance(numbers, list) else f"{numbers!r:.40}",
+            todo="Estimate poses with one of these sets (Pose2Sim: pose_model = 'Body_with_feet').",
+        )
+    values = np.array(numbers, dtype=np.float64).reshape(-1, 3)
+    if not (np.abs(values) <= COORDINATE_LIMIT).all():  # also NaN
+        raise InputError(
+            where,
+            expected=f"finite numbers up to {COORDINATE_LIMIT:g}",
+            found=f"{values[~(np.abs(values) <= COORDINATE_LIMIT)][0]}",
+            todo="Estimate the poses of this frame again.",
+        )
+    return values

@@ -1,0 +1,309 @@
+"""Tables of people as CSV and Parquet: positions, joints, strides.
+
+`write_positions` writes the positions alone, with the standard library. The other tables are pandas
+data frames with one row per observation and the unit in the name of every column.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import find_peaks
+
+from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17
+from worldpose.errors import UsageError
+from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS: Final = (
+    "frame",
+    "time_s",
+    "person",
+    "name",
+    "kind",
+    "x_m",
+    "y_m",
+    "x_std_m",
+    "y_std_m",
+    "xy_correlation",
+    "speed_m_s",
+    "height_m",
+)
+SPEED_WINDOW_S: Final = 0.4
+"""Time between the two positions that give a speed [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Where the people of a clip are on the pitch.
+
+    Attributes:
+        frames: (frames,) match frames.
+        person: (persons,) ids.
+        names: (persons,) roster id; empty where not known.
+        on_plane: (frames, persons), whether the place is that of the feet alone, else the mid-hip
+            of triangulated joints.
+        xy: (frames, persons, 2) [m], world; NaN where missing.
+        covariance: (frames, persons, 2, 2) [m^2].
+        height: (persons,) [m]; NaN where not known.
+    """
+
+    frames: NDArray[np.integer]
+    person: NDArray[np.integer]
+    names: Sequence[str]
+    on_plane: NDArray[np.bool_]
+    xy: Floats
+    covariance: Floats
+    height: Floats
+
+
+def write_positions(path: Path, positions: Positions, fps: float) -> None:
+    """Write a line per person and frame, frame by frame; missing people have none.
+
+    Columns: frame, time_s (frame / fps), person, name, kind in this frame (triangulated or plane),
+    x_m and y_m (world), x_std_m, y_std_m and xy_correlation of their covariance, speed_m_s over
+    `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed by their feet.
+    """
+    speed = _speeds(positions.xy, fps)
+    variance = np.diagonal(positions.covariance, axis1=-2, axis2=-1)
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(variance)
+        correlation = positions.covariance[..., 0, 1] / std.prod(axis=-1)
+    with whole_file(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for row, frame in enumerate(positions.frames.tolist()):
+            for p in np.flatnonzero(np.isfinite(positions.xy[row, :, 0])).tolist():
+                numbers = (*positions.xy[row, p], *std[row, p])
+                table.writerow(
+                    [
+                        frame,
+                        f"{frame / fps:.4f}",
+                        int(positions.person[p]),
+                        positions.names[p],
+                        "plane" if positions.on_plane[row, p] else "triangulated",
+                        *(f"{number:.3f}" for number in numbers),
+                        f"{correlation[row, p]:.3f}",
+                        f"{speed[row, p]:.2f}" if np.isfinite(speed[row, p]) else "",
+                        f"{positions.height[p]:.2f}" if np.isfinite(positions.height[p]) else "",
+                    ]
+                )
+
+
+def _speeds(xy: Floats, fps: float) -> Floats:
+    """Return speeds (frames, persons) [m/s]; NaN near the ends of a track."""
+    half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
+    speed = np.full(xy.shape[:2], np.nan)
+    if len(xy) > 2 * half:
+        steps = np.linalg.norm(xy[2 * half :] - xy[: -2 * half], axis=-1)
+        speed[half:-half] = steps * fps / (2 * half)
+    return speed
+
+
+def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> pd.DataFrame:
+    """Return one row per frame, person and joint; missing joints have none.
+
+    Columns: frame, time_s (frame / fps), person, kind (of the person), joint, x_m, y_m, z_m
+    (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does).
+
+    Args:
+        tracks: the joints.
+        fps: frames per second.
+        people: the kind of each person, by id.
+    """
+    import pandas as pd  # late: it takes half a second
+
+    row, person, joint = np.nonzero(np.isfinite(tracks.joints[..., 0]))
+    there = (row, person, joint)
+    kinds = np.array([people[int(one)] for one in tracks.person_ids], dtype=object)
+    std = np.full((len(row), 3), np.nan)
+    if tracks.covariance is not None:
+        std = np.sqrt(np.diagonal(tracks.covariance[there], axis1=-2, axis2=-1))
+    columns = {
+        "frame": tracks.frames[row],
+        "time_s": tracks.frames[row] / fps,
+        "person": tracks.person_ids[person],
+        "kind": pd.Categorical(kinds[person]),
+        "joint": pd.Categorical.from_codes(joint, categories=list(COCO17)),
+        **{f"{axis}_m": tracks.joints[there][:, n] for n, axis in enumerate("xyz")},
+        **{f"{axis}_std_m": std[:, n] for n, axis in enumerate("xyz")},
+    }
+    if tracks.views is not None:
+        columns |= {"views": tracks.views[there], "filled": tracks.views[there] == 0}
+    return pd.DataFrame(columns)
+
+
+def people_table(positions: Positions, fps: float) -> pd.DataFrame:
+    """Return one row per frame and person; missing people have none.
+
+    The columns are those of `write_positions`, with distance_m after speed_m_s: the way over the
+    ground since the person's first frame, from frame to frame; a gap adds nothing.
+    """
+    import pandas as pd  # late: it takes half a second
+
+    row, person = np.nonzero(np.isfinite(positions.xy[..., 0]))
+    there = (row, person)
+    steps = np.linalg.norm(np.diff(positions.xy, axis=0, prepend=np.nan), axis=-1)
+    steps[1:][np.diff(positions.frames) != 1] = np.nan
+    std = np.sqrt(np.diagonal(positions.covariance[there], axis1=-2, axis2=-1))
+    return pd.DataFrame(
+        {
+            "frame": positions.frames[row],
+            "time_s": positions.frames[row] / fps,
+            "person": positions.person[person],
+            "name": np.array(positions.names, dtype=object)[person],
+            "kind": np.where(positions.on_plane[there], "plane", "triangulated"),
+            "x_m": positions.xy[there][:, 0],
+            "y_m": positions.xy[there][:, 1],
+            "x_std_m": std[:, 0],
+            "y_std_m": std[:, 1],
+            "xy_correlation": positions.covariance[there][:, 0, 1] / std.prod(axis=-1),
+            "speed_m_s": _speeds(positions.xy, fps)[there],
+            "distance_m": np.nancumsum(steps, axis=0)[there],
+            "height_m": positions.height[person],
+        }
+    )
+
+
+MIN_STRIDE_S: Final = 0.4
+"""Shortest time between two contacts of one foot [s]: sprinters take 2.3 strides per second."""
+MAX_STRIDE_S: Final = 2.0
+"""Longest stride [s]: in a longer one the person stood."""
+MIN_STRIDE_SPEED_M_S: Final = 0.5
+"""Lowest mean speed of a stride [m/s]: slower people stand, turn or shuffle."""
+MIN_SWING_M: Final = 0.15
+"""Least travel of the ankle relative to the hips in a stride [m]."""
+_SIDES: Final = {"left": 15, "right": 16}
+
+
+def strides_table(tracks: JointTracks, fps: float) -> pd.DataFrame:
+    """Return one row per stride: from one contact of a foot to the next of the same foot.
+
+    A contact is where the ankle is farthest ahead of the mid-hip along the direction of motion
+    (Zeni, Richards and Higginson, 2008). Columns: person, side, start_frame, start_time_s,
+    stride_time_s, stride_length_m (of the ankle, over the ground), speed_m_s, filled (a frame of
+    the stride has an ankle to which no camera contributes).
+    """
+    import pandas as pd  # late: it takes half a second
+
+    rows = []
+    for index, person in enumerate(tracks.person_ids.tolist()):
+        hips = tracks.joints[:, index, 11:13, :2].mean(axis=1)
+        for side, joint in _SIDES.items():
+            ankle = tracks.joints[:, index, joint, :2]
+            unseen = np.zeros(len(ankle), np.bool_)
+            if tracks.views is not None:
+                unseen = tracks.views[:, index, joint] == 0
+            for first, last in _strides(tracks.frames, hips, ankle, fps):
+                duration = float(tracks.frames[last] - tracks.frames[first]) / fps
+                length = float(np.linalg.norm(ankle[last] - ankle[first]))
+                rows.append(
+                    {
+                        "person": person,
+                        "side": side,
+                        "start_frame": int(tracks.frames[first]),
+                        "start_time_s": float(tracks.frames[first]) / fps,
+                        "stride_time_s": duration,
+                        "stride_length_m": length,
+                        "speed_m_s": length / duration,
+                        "filled": bool(unseen[first : last + 1].any()),
+                    }
+                )
+    columns = ("person", "side", "start_frame", "start_time_s")
+    measures = ("stride_time_s", "stride_length_m", "speed_m_s", "filled")
+    return pd.DataFrame(rows, columns=[*columns, *measures])
+
+
+def _strides(
+    frames: NDArray[np.integer], hips: Floats, ankle: Floats, fps: float
+) -> list[tuple[int, int]]:
+    """Return rows of the first and last frame of the strides of one foot."""
+    half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
+    ahead = np.full(len(frames), np.nan)
+    if len(frames) > 2 * half:
+        step = hips[2 * half :] - hips[: -2 * half]
+        whole = frames[2 * half :] - frames[: -2 * half] == 2 * half
+        with np.errstate(invalid="ignore", divide="ignore"):
+            direction = step / np.linalg.norm(step, axis=-1, keepdims=True)
+        middle = slice(half, -half)
+        along = np.sum((ankle - hips)[middle] * direction, axis=-1)
+        ahead[middle] = np.where(whole, along, np.nan)
+    there = np.isfinite(ahead)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]])))
+    strides = []
+    for first, last in edges.reshape(-1, 2):
+        contacts, _ = find_peaks(
+            ahead[first:last],
+            distance=max(1, round(MIN_STRIDE_S * fps)),
+            prominence=MIN_SWING_M,
+        )
+        for a, b in pairwise((contacts + first).tolist()):
+            if _is_stride(float(frames[b] - frames[a]) / fps, ankle[b] - ankle[a]):
+                strides.append((a, b))
+    return strides
+
+
+def _is_stride(duration: float, way: Floats) -> bool:
+    speed = float(np.linalg.norm(way)) / duration
+    return duration <= MAX_STRIDE_S and speed >= MIN_STRIDE_SPEED_M_S
+
+
+def write_csv(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list[Path]:
+    """Write a table as CSV, and its description next to it; return both files.
+
+    CSV has no place for metadata: `<file>-metadata.json` holds the notes and the columns, in the
+    form and under the name that the W3C's "CSV on the Web" gives.
+    """
+    about = path.with_name(f"{path.name}-metadata.json")
+    kinds = {"i": "integer", "f": "number", "b": "boolean"}
+    columns = [
+        {"name": name, "titles": name, "datatype": kinds.get(dtype.kind, "string")}
+        for name, dtype in table.dtypes.items()
+    ]
+    description = {
+        "@context": "http://www.w3.org/ns/csvw",
+        "url": path.name,
+        "dc:license": notes["licence"],
+        "tableSchema": {"columns": columns},
+        "notes": [dict(notes)],
+    }
+    with whole_file(path) as draft:
+        table.to_csv(draft, index=False, float_format="%.5f", lineterminator="\n")
+    with whole_file(about) as draft:
+        draft.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+    return [path, about]
+
+
+def write_parquet(path: Path, table: pd.DataFrame, notes: Mapping[str, str]) -> list[Path]:
+    """Write a table as Parquet, with the notes as metadata of its schema; return the file.
+
+    Raises:
+        UsageError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise UsageError(
+            "--format parquet",
+            expected="the package pyarrow, which writes it",
+            found="none installed",
+            todo="Install the extra: pip install 'worldpose[tables]', or choose --format csv.",
+        ) from None
+    content = pa.Table.from_pandas(table, preserve_index=False)
+    content = content.replace_schema_metadata({**content.schema.metadata, **notes})
+    with whole_file(path) as draft:
+        parquet.write_table(content, draft, compression="zstd")
+    return [path]

@@ -1,0 +1,415 @@
+"""Import of other tools' calibration with 2D poses or videos, or of a project of Pose2Sim."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from data_contracts.cameras import CameraCalibration, LensCalibration
+from data_contracts.match import MatchSpec
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.files import read_toml, whole_file
+from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
+from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
+from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
+from worldpose.ingest.validation import validate_record
+from worldpose.ingest.writing import write_match
+from worldpose.video import FrameIndex, index_frames
+
+
+def import_match(
+    calibration: Path,
+    detections: Path,
+    fps: float,
+    out: Path,
+    match_id: str | None = None,
+    pitch: Literal["none"] | None = "none",
+) -> MatchSpec:
+    """Write a match folder with the cameras of a calibration and their detections.
+
+    The only clip, `clip`, spans the first to the last frame with a person; frames keep their
+    numbers from the files. The function validates all 2D poses and stores them as npz.
+
+    Args:
+        calibration: a file that `read_calibration` reads.
+        detections: folder with `<camera>.json` or `.npz` for each camera of the calibration.
+        fps: frame rate of all cameras [1/s].
+        out: the match folder, absent or empty.
+        match_id: id of the match; None = the name of `out`.
+        pitch: "none", or None for the standard pitch, if the calibration's world is the pitch's.
+
+    Returns:
+        Content of match.yaml.
+
+    Raises:
+        InputError: a file is invalid, names do not match, there are no people, or `out` is not
+            empty; nothing is written then.
+    """
+    cameras = read_calibration(calibration)
+    files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
+    people = {name: read_observations(file) for name, file in files.items()}
+    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
+    if not seen:
+        raise InputError(
+            str(detections), expected="people", found="none in any file", todo="Check the detector."
+        )
+    first, last = min(frame for frame, _ in seen), max(frame for _, frame in seen)
+    content = {
+        "match_id": match_id if match_id is not None else name_of(out),
+        "fps": fps,
+        "cameras": [
+            {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
+            for name, camera in cameras.items()
+        ],
+        "clips": [{"id": "clip", "first_frame": first, "frame_count": last - first + 1}],
+        "pitch": pitch,
+    }
+    spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
+    for name, file in files.items():
+        people[name] = on_frames(file, people[name], [(first, last - first + 1)])
+    write_match(out, spec, calibrations=cameras, observations=people)
+    return spec
+
+
+def import_lenses(
+    files: Sequence[Path], folder: Path, camera: str | None = None
+) -> dict[str, LensCalibration]:
+    """Write lenses without a pose into a match folder's lenses.toml, and return them.
+
+    Static calibration takes them as prior of focal length, principal point and distortion; the
+    pose comes from clicks.
+
+    Args:
+        files: what `read_lenses` reads.
+        folder: the match folder, with match.yaml.
+        camera: the static camera of a file that names none.
+
+    Raises:
+        InputError: a file is invalid, its camera is unknown or has a lens already, or calibration
+            .toml gives it with its pose.
+    """
+    spec = read_spec(folder)
+    sizes = image_sizes(spec)
+    target = folder / LENS_FILE
+    known = read_lens_toml(target, sizes) if target.exists() else {}
+    lenses = read_lenses(files, camera, sizes)
+    given = folder / "calibration.toml"
+    posed = read_calibration(given) if given.exists() else {}
+    for name in lenses:
+        if name in known or name in posed:
+            place = LENS_FILE if name in known else given.name
+            raise InputError(
+                f"{folder / place}: {name}",
+                expected="no lens of this camera yet",
+                found="one",
+                todo="Remove it there first.",
+            )
+    with whole_file(target) as draft:
+        write_lens_toml(draft, {**known, **lenses})
+    return lenses
+
+
+def files_by_camera(
+    folder: Path, cameras: list[str], calibration: Path, suffixes: tuple[str, ...]
+) -> dict[str, Path]:
+    """Return the file of each camera in a folder, by the camera's name.
+
+    Raises:
+        InputError: a camera lacks its file, or a file its camera.
+    """
+    files = [
+        file
+        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
+        if file.suffix in suffixes and not file.name.startswith(".")
+    ]
+    if sorted(file.stem for file in files) != sorted(cameras):
+        raise InputError(
+            str(folder),
+            expected=f"one {' or '.join(suffixes)} file for each camera in {calibration.name}: "
+            + ", ".join(cameras),
+            found=", ".join(file.name for file in files) or "no such file",
+            todo="Rename the files as the cameras, and leave neither over.",
+        )
+    by_name = {file.stem: file for file in files}
+    return {name: by_name[name] for name in cameras}
+
+
+def name_of(folder: Path) -> str:
+    """Return the folder's name without characters that ids do not allow."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
+    return name or "match"
+
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
+
+
+def import_videos(
+    calibration: Path,
+    videos: Path,
+    out: Path,
+    fps: float | None = None,
+    match_id: str | None = None,
+) -> MatchSpec:
+    """Write a match folder with the cameras of a calibration and copies of their videos.
+
+    The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
+    in match.yaml can shift them afterwards.
+
+    Args:
+        calibration: a file that `read_calibration` reads.
+        videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
+        out: the match folder, absent or empty.
+        fps: frame rate of all videos [1/s]; None = from the videos.
+        match_id: id of the match; None = the name of `out`.
+
+    Returns:
+        Content of match.yaml.
+
+    Raises:
+        InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
+            is written then.
+    """
+    cameras = read_calibration(calibration)
+    files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES)
+    indices = {name: _index_video(file, cameras[name]) for name, file in files.items()}
+    rate = round(next(iter(indices.values())).fps, 3) if fps is None else fps
+    counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
+    content = {
+        "match_id": match_id if match_id is not None else name_of(out),
+        "fps": rate,
+        "cameras": [
+            {
+                "id": name,
+                "width": camera.image_size[0],
+                "height": camera.image_size[1],
+                "video": f"videos/{files[name].name}",
+            }
+            for name, camera in cameras.items()
+        ],
+        "clips": [{"id": "clip", "frame_count": min(counts.values())}],
+        "pitch": "none",
+    }
+    spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
+
+    def copy(folder: Path) -> None:
+        (folder / "videos").mkdir()
+        for file in files.values():
+            shutil.copyfile(file, folder / "videos" / file.name)
+
+    write_match(out, spec, calibrations=cameras, observations={}, further=copy)
+    return spec
+
+
+def _index_video(file: Path, camera: CameraCalibration) -> FrameIndex:
+    """Return the frames of a camera's video, which has the size in the calibration."""
+    index = index_frames(file)
+    if index.size != camera.image_size:
+        raise InputError(
+            str(file),
+            expected="{} x {} px, the size in the calibration".format(*camera.image_size),
+            found=f"{index.size[0]} x {index.size[1]}",
+            todo="Give the video that was calibrated, in its size.",
+        )
+    return index
+
+
+def import_pose2sim(
+    project: Path, out: Path, fps: float | None = None, match_id: str | None = None
+) -> tuple[MatchSpec, list[str]]:
+    """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
+
+    The calibration is the one file `Calib*.toml` or `*.qca.txt` in `calibration/`, of the trial or
+    of the folder above it, as in Pose2Sim's batches. 2D poses are in `pose-sync/`, or else `pose/`,
+    in a folder `<camera>_json` for each camera; without them people are detected in the videos of
+    `videos/`. Poses and videos belong to the cameras of their names, or, as in Pose2Sim, in
+    alphabetical order to the cameras in the calibration's order. `frame_rate` and `frame_range`
+    of Config.toml hold.
+
+    Args:
+        project: folder of a trial.
+        out: the match folder, absent or empty.
+        fps: frame rate of all cameras [1/s]; None = from Config.toml or the videos.
+        match_id: id of the match; None = the name of `out`.
+
+    Returns:
+        Content of match.yaml, and sentences about what was found and what was left out.
+
+    Raises:
+        InputError: with file and key: something is absent, invalid or contradicts the rest; nothing
+            is written then.
+    """
+    settings, config = _read_pose2sim_settings(project)
+    calibration = _find_pose2sim_calibration(project)
+    cameras = read_calibration(calibration)
+    folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
+    places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
+    films = [
+        file
+        for file in sorted((project / "videos").glob("*"))
+        if file.suffix.lower() in VIDEO_SUFFIXES
+    ]
+    if not places and not films:
+        raise InputError(
+            str(project),
+            expected=f"{folder.name}/<camera>_json folders of 2D poses, or videos/<camera>.mp4",
+            found="neither",
+            todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
+        )
+    notes = [f"cameras: {calibration}"]
+    poses = _assign(places, list(cameras), calibration, notes) if places else {}
+    videos = _assign(films, list(cameras), calibration, notes) if films else {}
+    indices = {name: _index_video(file, cameras[name]) for name, file in videos.items()}
+    rate = fps if fps is not None else settings.get("frame_rate")
+    if rate is None and not indices:
+        raise InputError(
+            f"{config}: project.frame_rate",
+            expected="frames per second, as there are no videos to take them from",
+            found="'auto'",
+            todo="Write for example frame_rate = 60, or give --fps.",
+        )
+    if rate is None:
+        rate = round(next(iter(indices.values())).fps, 3)
+    counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
+    read = {name: read_openpose_folder(place) for name, place in poses.items()}
+    people = {name: found.people for name, found in read.items()}
+    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
+    if people and not seen:
+        raise InputError(
+            str(folder), expected="people", found="none in any frame", todo="Check the estimator."
+        )
+    first = min((a for a, _ in seen), default=0)
+    stop = max((b + 1 for _, b in seen), default=min(counts, default=0))
+    first, stop = settings.get("frame_range", (first, stop))
+    content = {
+        "match_id": match_id if match_id is not None else name_of(out),
+        "fps": rate,
+        "cameras": [
+            {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
+            | ({"video": f"videos/{videos[name].name}"} if name in videos else {})
+            for name, camera in cameras.items()
+        ],
+        "clips": [{"id": "clip", "first_frame": first, "frame_count": stop - first}],
+        "pitch": "none",
+    }
+    spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
+    for name, place in poses.items():
+        people[name] = on_frames(place, people[name], [(first, stop - first)])
+
+    def copy(building: Path) -> None:
+        if videos:
+            (building / "videos").mkdir()
+        for file in videos.values():
+            shutil.copyfile(file, building / "videos" / file.name)
+
+    write_match(out, spec, calibrations=cameras, observations=people, further=copy)
+    kinds = sorted({found.kind for found in read.values() if found.kind})
+    notes += [
+        f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
+        + ("" if kind == "COCO-17" else ", those of feet, hands and face are left out")
+        for kind in kinds
+    ]
+    if not poses:
+        notes.append(
+            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
+            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
+        )
+    return spec, notes
+
+
+def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
+    """Return `frame_rate` and `frame_range` where Config.toml sets them, and that file.
+
+    As in Pose2Sim, what the trial's file lacks is taken from the file of the folder above.
+    """
+    if not project.is_dir():
+        raise InputError(
+            str(project),
+            expected="the folder of a Pose2Sim trial",
+            found="a file" if project.exists() else "nothing",
+            todo="Give the folder that has videos/ or pose/, and Config.toml.",
+        )
+    files = [place / "Config.toml" for place in (project, project.resolve().parent)]
+    given: dict[str, Any] = {}
+    for file in reversed(files):
+        table = read_toml(file).get("project", {}) if file.is_file() else {}
+        if not isinstance(table, dict):
+            raise InputError(
+                f"{file}: project", expected="a table", found=f"{table!r:.40}", todo="Correct it."
+            )
+        given |= {key: (table[key], file) for key in ("frame_rate", "frame_range") if key in table}
+    settings: dict[str, Any] = {}
+    rate, place = given.get("frame_rate", ("auto", files[0]))
+    if rate != "auto":
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not rate > 0:
+            raise InputError(
+                f"{place}: project.frame_rate",
+                expected="frames per second or 'auto'",
+                found=f"{rate!r:.40}",
+                todo="Write for example frame_rate = 60.",
+            )
+        settings["frame_rate"] = float(rate)
+    span, place = given.get("frame_range", ("auto", files[0]))
+    if span not in ("auto", "all", []):
+        whole = isinstance(span, list) and [type(one) for one in span] == [int, int]
+        if not whole or not 0 <= span[0] < span[1]:
+            raise InputError(
+                f"{place}: project.frame_range",
+                expected="'auto', 'all', or the first frame and the one after the last",
+                found=f"{span!r:.40}",
+                todo="Write for example frame_range = [10, 300].",
+            )
+        settings["frame_range"] = tuple(span)
+    return settings, files[0]
+
+
+def _find_pose2sim_calibration(project: Path) -> Path:
+    """Return the calibration of a trial, or else of the folder above it."""
+    folders = [
+        folder
+        for place in (project, project.resolve().parent)
+        for folder in sorted(place.glob("*"))
+        if folder.is_dir() and "calib" in folder.name.lower()
+    ]
+    for folder in folders:
+        for pattern in ("*.toml", "*.qca.txt"):
+            files = [file for file in sorted(folder.glob(pattern)) if file.is_file()]
+            if len(files) > 1:
+                raise InputError(
+                    str(folder),
+                    expected=f"one calibration {pattern}",
+                    found=", ".join(file.name for file in files),
+                    todo="Move the others elsewhere.",
+                )
+            if files:
+                return files[0]
+    raise InputError(
+        str(project),
+        expected="calibration/Calib.toml or calibration/Calib.qca.txt",
+        found=", ".join(map(str, folders)) or "no folder called calibration",
+        todo="Run Pose2Sim.calibration() first.",
+    )
+
+
+def _assign(
+    places: list[Path], cameras: list[str], calibration: Path, notes: list[str]
+) -> dict[str, Path]:
+    """Return the folder or file of each camera: by name, or else by alphabetical order."""
+    if len(places) != len(cameras):
+        raise InputError(
+            str(places[0].parent),
+            expected=f"one for each camera in {calibration.name}: {', '.join(cameras)}",
+            found=", ".join(place.name for place in places),
+            todo="Add the missing ones, or take the camera out of the calibration.",
+        )
+    named = {place.stem.removesuffix("_json"): place for place in places}
+    if set(named) == set(cameras):
+        return {camera: named[camera] for camera in cameras}
+    pairs = dict(zip(cameras, places, strict=True))
+    listed = ", ".join(f"{place.name} is {camera}" for camera, place in pairs.items())
+    notes.append(f"{places[0].parent.name}: in alphabetical order, {listed}")
+    return pairs
