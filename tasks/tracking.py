@@ -182,7 +182,7 @@ def _locate_feet(
     store: Store, work: Work, clip: ClipInputs, pitch: PitchTemplate
 ) -> GroundPositions:
     """Return people's foot positions by camera."""
-    boxes = open_boxes(store, work)
+    boxes, pitch = open_boxes(store, work), clip.raise_pitch(pitch)
     parts = [slice(start, start + BLOCK) for start in range(0, len(clip.frame), BLOCK)]
     return GroundPositions.concatenate(
         [
