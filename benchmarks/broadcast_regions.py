@@ -41,6 +41,7 @@ from worldpose.static_calibration.line_samples import (
     sample_markings,
     thin_samples,
 )
+from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 NOISE = 0.15
 """Noise of a line's sample [px]."""
@@ -58,7 +59,7 @@ def lines_of(
     parts = []
     for frame in range(len(true)):
         camera = true.camera[frame]
-        seen = project_lines(camera, samples, 0.12, 0.0, 0.0)
+        seen = project_lines(camera, samples, 0.12, EXACT_PAINT)
         index = thin_samples(seen, samples, 4.0, settings.line_samples)
         world, ends = samples.points_world[index], samples.ends[index]
         shares = settings.survey_error_m * samples.shares[index]

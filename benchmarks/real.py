@@ -15,11 +15,12 @@ DATA is a folder with any of these; what is absent is skipped:
 - `mvor`: see mvor.py.
 
 Left out: each click in turn, predicted by the camera of the others, with the names of the places
-that were clicked. Wrong names found and right clicks rejected: with the names as given. Feet: each
-camera alone tracks people on the pitch; per frame, mutual nearest neighbours within 2 m are
-compared, after the clock offset that makes them agree best. Errors count from 8 pairs per frame on:
-fewer people are easier. Recall and precision: boxes of the detector from its high score threshold
-on, at an IoU of 0.5. PCK: visible joints within a fifth of the torso, in the labelled boxes.
+that were clicked. Wrong names found and right clicks rejected: with the names as given. Feet: both
+cameras are calibrated on one pitch, and each alone tracks people on it; per frame, mutual nearest
+neighbours within 2 m are compared, after the clock offset that makes them agree best. Errors count
+from 8 pairs per frame on: fewer people are easier. Recall and precision: boxes of the detector from
+its high score threshold on, at an IoU of 0.5. PCK: visible joints within a fifth of the torso, in
+the labelled boxes.
 `--frames N` takes N frames, stills, moments or left-out clicks of each part: a quick look, not a
 result.
 """
@@ -62,8 +63,9 @@ from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import StaticCalibration, calibrate_camera
+from worldpose.static_calibration.venue import join_cameras
 from worldpose.store import Store
-from worldpose.tracking import TrackingSettings
+from worldpose.tracking import TrackingSettings, locate_feet, track_on_plane
 from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import score_keypoints
 from worldpose.video import index_video, open_video
@@ -75,6 +77,8 @@ WANTED_PAIRS = 8.0
 """Least number of pairs per frame from which distances of feet are comparable."""
 MAX_OFFSET_FRAMES = 3.0
 """Largest clock offset between the cameras of the static pair, beyond the stated one [frame]."""
+FPS = 25.0
+"""Of the static pair."""
 TRUE_IOU = 0.5
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi")
 
@@ -93,10 +97,12 @@ def calibrate_pair(
 def score_clicks(folder: Path, side: str, count: int | None) -> Metrics:
     """Return the error of left-out clicks (the first `count`), and judged wrong names."""
     places, pixels = static_pair.read_clicks(folder, side)
+    height = PitchTemplate.from_spec(PitchSpec(crown=static_pair.CROWN)).height
     off = []
     for name, pixel in list(pixels.items())[:count]:
         camera = calibrate_pair(places, {n: p for n, p in pixels.items() if n != name})
-        projected = camera.estimate.camera.project(places[name][None])[0]
+        x, y = places[name]
+        projected = camera.estimate.camera.project([[x, y, float(height(x, y))]])[0]
         off.append(np.linalg.norm(projected - pixel))
     said, as_given = static_pair.read_clicks(folder, side, correct_labels=False)
     true = {tuple(pixel): places[name] for name, pixel in pixels.items()}
@@ -114,16 +120,40 @@ def score_clicks(folder: Path, side: str, count: int | None) -> Metrics:
     }
 
 
-def track_side(folder: Path, side: str, frames: int, work: Path) -> NDArray[np.float64]:
-    """Return where one camera alone places people (frames, persons, 2) [m]; NaN where missing."""
-    match, project = work / side, work / f"{side}-project"
-    static_pair.write_static_pair(folder, match, sides=(side,), first_frame=0, frame_count=frames)
-    store = Store.create(project)
-    name, (keys,) = run_in_process(store, match, "tracking", 1, {})
-    tracks = store.open_result(name, "tracking", "clip", keys["tracking/clip"])
-    if "ground" not in tracks:
-        return np.full((frames, 0, 2), np.nan)
-    return tracks["ground"].values.astype(np.float64)
+def track_sides(folder: Path, frames: int, work: Path) -> tuple[Metrics, list[NDArray[np.float64]]]:
+    """Return metrics of the calibrations, and where each camera alone places people.
+
+    Places are (frames, persons, 2) [m] of each side; NaN where missing.
+    """
+    match = work / "match"
+    static_pair.write_static_pair(folder, match, first_frame=0, frame_count=frames)
+    store = Store.create(work / "project")
+    name, (keys,) = run_in_process(store, match, "detection", 1, {})
+
+    def result(stage: str, unit: str) -> Any:
+        return store.open_result(name, stage, unit, keys[f"{stage}/{unit}"])
+
+    known = [result("static_calibration", side) for side in static_pair.SIDES]
+    venue = join_cameras([each.data_vars for each in known])
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=static_pair.CROWN))
+    metrics: Metrics = {"with_lines": sum(each.attrs["origin"] == "lines" for each in known)}
+    if venue.surface is not None:
+        pitch = pitch.with_surface(venue.surface.shape)
+        metrics["crown_m"], metrics["end_fall_m"] = venue.surface.shape.tolist()
+    places = []
+    for index, side in enumerate(static_pair.SIDES):
+        seen = result("detection", f"{side}.clip")
+        feet = locate_feet(
+            venue.cameras[index : index + 1],
+            seen["keypoints"].values[:, None],
+            seen["confidence"].values[:, None],
+            pitch,
+            boxes=seen["boxes"].values[:, None],
+            camera_covariance=venue.covariance[index : index + 1],
+        )
+        tracks = track_on_plane(feet, FPS, pitch_size=(pitch.length, pitch.width))
+        places.append(tracks.xy)
+    return metrics, places
 
 
 def pair_feet(
@@ -162,9 +192,8 @@ def score_static_pair(folder: Path, frames: int | None) -> Metrics:
     count = whole if frames is None else min(frames, whole)
     metrics: Metrics = {side: score_clicks(folder, side, frames) for side in static_pair.SIDES}
     with tempfile.TemporaryDirectory() as temporary:
-        left, right = (
-            track_side(folder, side, count, Path(temporary)) for side in static_pair.SIDES
-        )
+        calibrated, (left, right) = track_sides(folder, count, Path(temporary))
+    metrics |= calibrated
     offsets = np.arange(-MAX_OFFSET_FRAMES, MAX_OFFSET_FRAMES + 0.05, 0.1)
     by_offset = [pair_feet(left, right, float(offset)) for offset in offsets]
     by_offset = [frames for frames in by_offset if frames]

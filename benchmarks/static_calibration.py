@@ -32,10 +32,10 @@ from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_by_search, refine_on_lines
-from worldpose.static_calibration.line_samples import LineSamples, ProjectedLines
-from worldpose.static_calibration.line_search import LineFit, LineSearch, MeasuredBars
+from worldpose.static_calibration.line_search import LineFit, LineSearch, MeasuredLines
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
+    CameraOnPitch,
     project_with_jacobian,
     step_camera,
 )
@@ -206,17 +206,10 @@ class TimedSearch(LineSearch):
 
     seconds = 0.0
 
-    def converge(
-        self,
-        camera: Camera,
-        samples: LineSamples,
-        seen: ProjectedLines,
-        measured: MeasuredBars,
-        fine: bool,
-    ) -> LineFit:
+    def converge(self, at: MeasuredLines, fine: bool) -> LineFit:
         """Return the converged fit to bars at fixed pixels."""
         begin = time.perf_counter()
-        found = super().converge(camera, samples, seen, measured, fine)
+        found = super().converge(at, fine)
         self.seconds += time.perf_counter() - begin
         return found
 
@@ -238,7 +231,7 @@ def measure_sides(
 
 
 def methods(
-    prior: CameraEstimate, spread: Floats, picture: Image, world: Floats, clicked: Floats
+    prior: CameraOnPitch, spread: Floats, picture: Image, world: Floats, clicked: Floats
 ) -> dict[str, Callable[[], Camera | None]]:
     """Return all methods that start at one camera, by name."""
     start, size = prior.camera, (picture.shape[1], picture.shape[0])
@@ -275,7 +268,9 @@ def main() -> None:
         true = place_camera(scenario.rig, index, np.zeros(3), scenario.pitch, rng)
         picture = render_pitch(true, PITCH, None, index)
         start, spread = some_pixels_off(true, rng)
-        prior = CameraEstimate(start, np.diag(spread**2))
+        prior = CameraOnPitch.on_known_surface(
+            CameraEstimate(start, np.diag(spread**2)), (PITCH.crown, PITCH.end_fall)
+        )
         places = PITCH.positions(list(PITCH.points))
         seen = true.project(places)
         inside = ((seen > 4.0) & (seen < true.image_size - 5.0)).all(axis=-1)

@@ -151,6 +151,8 @@ BUNDLE_ADJUSTMENT = GroupLayout(
     },
     attributes={
         "camera": "camera ids in the order of the camera dimension",
+        "surface": "crown and end fall of the pitch that the static cameras show together [m]; "
+        "null if no lines of it were found: those of pitch.json hold",
         "reasons": "why each camera's change was accepted or refused",
         "held_out_gain": "relative decrease of the loss of held-out people",
         "held_out_significance": "the same in standard errors",

@@ -69,6 +69,8 @@ class PitchSpec(Record):
     are not checked."""
     crown: float = Field(default=0.2, ge=0, le=1)
     """Height of the long axis above the touch lines [m]."""
+    end_fall: float = Field(default=0.0, ge=-1, le=1)
+    """Height of the halfway line above the goal lines [m]: a pitch that falls to its ends."""
     points: dict[Name, Point] = {}
     """Surveyed positions that replace the nominal ones, by name; world [m]."""
     lines: dict[Name, LineSpec] = {}

@@ -144,6 +144,39 @@ _EVIDENCE = (
         "true pixel; missing outside of the camera's view",
     ),
 )
+_VENUE = (
+    ArrayLayout(
+        name="venue_number",
+        dims=("unknown",),
+        dtype="int64",
+        unit="1",
+        missing="none",
+        about="unknowns of the pitch that all cameras share: 3 p + axis = error of the template's "
+        "point p; from -1000000 down, uneven paint; the last two, crown and end fall",
+    ),
+    *(
+        ArrayLayout(
+            name=f"venue_{name}", dims=dims, dtype="float64", unit=unit, missing="none", about=about
+        )
+        for name, dims, unit, about in (
+            ("prior_mean", ("unknown",), "m", "the unknowns before the image"),
+            ("prior", ("unknown", "unknown_"), "1/m^2", "information of `venue_prior_mean`"),
+            ("mean", ("unknown",), "m", "the unknowns at this camera"),
+            (
+                "information",
+                ("unknown", "unknown_"),
+                "1/m^2",
+                "what the evidence of this camera alone tells about the unknowns",
+            ),
+            (
+                "response",
+                ("parameter", "unknown"),
+                "1/m",
+                "step of the camera per change of the unknowns, in the units of its parameters",
+            ),
+        )
+    ),
+)
 _ABOUT = {
     "point": "names of the clicked points, the largest Mahalanobis distance first",
     "point_problem": "why a clicked point is an outlier; otherwise empty",
@@ -158,10 +191,11 @@ _ABOUT = {
 
 STATIC_CALIBRATION = GroupLayout(
     stage="static_calibration",
-    about="One static camera, with covariance and evidence unless it was given. A camera that "
-    "cannot be calibrated has no arrays; its `reasons` say why it is left out.",
+    about="One static camera on its own, with covariance and evidence unless it was given. Later "
+    "stages join cameras that were refined on lines by `venue_*`. A camera that cannot be "
+    "calibrated has no arrays; its `reasons` say why it is left out.",
     coordinates=_GROUND,
-    arrays=(*CAMERA_ARRAYS, *_EVIDENCE),
+    arrays=(*CAMERA_ARRAYS, *_EVIDENCE, *_VENUE),
     labels={**CAMERA_LABELS, "parameter": CAMERA_STEP, "parameter_": CAMERA_STEP},
     attributes={
         "camera_id": "camera of the match",
@@ -169,5 +203,5 @@ STATIC_CALIBRATION = GroupLayout(
         "left out",
         **_ABOUT,
     },
-    optional=tuple(array.name for array in (*_GROUND, *CAMERA_ARRAYS, *_EVIDENCE)),
+    optional=tuple(array.name for array in (*_GROUND, *CAMERA_ARRAYS, *_EVIDENCE, *_VENUE)),
 )

@@ -104,7 +104,8 @@ def fit_people(
     pitch = sources["pitch"]
     ground = None
     if pitch is not None:
-        ground = PitchTemplate.from_spec(PitchSpec.model_validate(pitch)).height
+        template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+        ground = people.clip.raise_pitch(template).height
     settings = BodyFittingSettings.model_validate(recipe.settings)
     model = _body(settings.body_model, sources["body_model_sha256"])
     alone = find_ray_constraints(people.clip.cameras, people.detections, people.joints)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
+from tasks.clip_inputs import ADJUSTED
 from tasks.static_calibration import clicked_markings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import (
@@ -45,7 +46,7 @@ def broadcast_calibration(work: Work) -> str:
     people, boxes = _people(store, work)
     with store.publish(work) as result:
         calibration = calibrate_broadcast(
-            PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"])),
+            _open_pitch(store, work),
             BroadcastClip(
                 [
                     KeyFrame(frame=int(frame), markings=clicked_markings(markings))
@@ -70,6 +71,15 @@ def broadcast_calibration(work: Work) -> str:
         )
         result.figures.update(_figures(calibration.report))
     return work.key
+
+
+def _open_pitch(store: Store, work: Work) -> PitchTemplate:
+    """Return the pitch, on the surface that static cameras show, if any."""
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(work.recipe.sources["pitch"]))
+    if ADJUSTED not in work.recipe.inputs:
+        return pitch
+    surface = open_input(store, work, ADJUSTED).attrs["surface"]
+    return pitch if surface is None else pitch.with_surface(surface)
 
 
 def _people(store: Store, work: Work) -> tuple[People | None, NDArray[np.float64] | None]:

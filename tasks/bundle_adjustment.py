@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
-from tasks.clip_inputs import open_frames
+from tasks.clip_inputs import ClipInputs, open_frames, open_venue
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.bundle_adjustment import (
@@ -25,7 +25,6 @@ from worldpose.bundle_adjustment import (
 )
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import select_triangulated
-from worldpose.static_calibration import PARAMETERS
 from worldpose.store import Store
 
 
@@ -36,9 +35,11 @@ def bundle_adjustment(work: Work) -> str:
     settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
     with store.publish(work) as result:
         people = _open_people(store, work, settings)
-        adjusted = adjust_cameras(_open_clip(store, work, people), settings)
+        clip = open_frames(store, work, people.clip_frames)
+        adjusted = adjust_cameras(_open_clip(store, work, people, clip), settings)
         arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
         attributes |= {"camera": work.recipe.sources["cameras"]}
+        attributes["surface"] = None if clip.surface is None else clip.surface.tolist()
         result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
         result.figures.update(_figures(adjusted, attributes["camera"]))
     return work.key
@@ -108,18 +109,20 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
     return people
 
 
-def _open_clip(store: Store, work: Work, people: _People) -> Clip:
+def _open_clip(store: Store, work: Work, people: _People, opened: ClipInputs) -> Clip:
     """Return the calibrated cameras, their clicks, and their detections of `people`."""
     sources: dict[str, Any] = work.recipe.sources
-    opened = open_frames(store, work, people.clip_frames)
     pitch = sources["pitch"]
-    template = None if pitch is None else PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+    template = None
+    if pitch is not None:
+        template = opened.raise_pitch(PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
+    covariance = open_venue(store, work, opened.camera_ids).covariance
     known = [
         open_input(store, work, f"static_calibration/{camera}") for camera in opened.camera_ids
     ]
     return Clip(
         cameras=opened.cameras,
-        covariance=np.stack([_covariance(camera) for camera in known]),
+        covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
         clicks=tuple(_clicks(camera, template) for camera in known),
         fps=people.fps,
         detections=opened.detections[:].assign_people(people.detection_index),
@@ -130,13 +133,6 @@ def _open_clip(store: Store, work: Work, people: _People) -> Clip:
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
         names=tuple(opened.camera_ids),
     )
-
-
-def _covariance(known: xr.Dataset) -> NDArray[np.float64]:
-    """Return the covariance of a calibrated camera; zero for a given one."""
-    if "covariance" not in known:
-        return np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    return np.asarray(known["covariance"].values)
 
 
 def _clicks(known: xr.Dataset, pitch: PitchTemplate | None) -> Clicks:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.camera_consistency import CAMERA_CONSISTENCY
 from data_contracts.work import Work
-from tasks.clip_inputs import open_clip
-from tasks.unit import open_input, unit_task
+from tasks.clip_inputs import open_clip, open_venue
+from tasks.unit import unit_task
 from worldpose.camera_consistency import (
     ConsistencySettings,
     check_consistency,
@@ -32,7 +30,7 @@ def camera_consistency(work: Work) -> str:
         names = clip.camera_ids
         found = check_consistency(
             clip.cameras,
-            _covariance(store, work, names),
+            open_venue(store, work, names).covariance,
             clip.detections.keypoints,
             clip.detections.confidence,
             clip.fps,
@@ -65,10 +63,3 @@ def camera_consistency(work: Work) -> str:
             cameras_unconfirmed=float(len(found.unconfirmed)),
         )
     return work.key
-
-
-def _covariance(store: Store, work: Work, cameras: Sequence[str]) -> NDArray[np.float64]:
-    """Return each camera's parameter covariance (cameras, 12, 12); NaN for given cameras."""
-    unknown = np.full((12, 12), np.nan)
-    each = [open_input(store, work, f"static_calibration/{camera}") for camera in cameras]
-    return np.stack([c["covariance"].values if "covariance" in c else unknown for c in each])

@@ -18,6 +18,8 @@ from data_contracts.work import Work
 from tasks.unit import open_input
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store import Store
 
 PAGE = 256
@@ -132,6 +134,8 @@ class ClipInputs:
         camera_covariance: (cameras, 12, 12) of the parameters; None unless known for all.
         detections: (frames, cameras, detections) of all cameras, with match frames.
         fps: frames per second of match time.
+        surface: (2,) crown and end fall of the pitch that the cameras show [m]; None = as in
+            pitch.json.
     """
 
     camera_ids: tuple[str, ...]
@@ -139,6 +143,11 @@ class ClipInputs:
     camera_covariance: NDArray[np.float64] | None
     detections: KeypointDetections[ClipArray]
     fps: float
+    surface: NDArray[np.float64] | None = None
+
+    def raise_pitch(self, pitch: PitchTemplate) -> PitchTemplate:
+        """Return a pitch with the surface that the cameras show."""
+        return pitch if self.surface is None else pitch.with_surface(self.surface)
 
     def assign_people(self, detection_index: NDArray[np.integer]) -> ClipInputs:
         """Return the clip with tracked people (frames, cameras, persons)."""
@@ -279,7 +288,7 @@ def _make_inputs(
     """
     sources: dict[str, Any] = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
-    cameras, covariance = _load_cameras(store, work, camera_ids)
+    cameras, covariance, surface = _load_cameras(store, work, camera_ids)
     return ClipInputs(
         camera_ids=camera_ids,
         cameras=cameras,
@@ -291,21 +300,32 @@ def _make_inputs(
             score=StoredArray(seen, "score", redetected=redetected),
             frame=frame,
         ),
+        surface=surface,
         fps=float(sources["fps"]),
     )
 
 
+def open_venue(store: Store, work: Work, camera_ids: Sequence[str]) -> Venue:
+    """Return calibrated or given static cameras on the pitch that they show together."""
+    each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
+    return join_cameras([camera.data_vars for camera in each])
+
+
 def _load_cameras(
     store: Store, work: Work, camera_ids: tuple[str, ...]
-) -> tuple[Camera, NDArray[np.float64] | None]:
-    """Return the cameras in order, and their covariances if known for all."""
+) -> tuple[Camera, NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """Return the cameras in order, their covariances if known for all, and the pitch's surface."""
     if ADJUSTED in work.recipe.inputs:
         adjusted = open_input(store, work, ADJUSTED)
         stated = adjusted["camera_covariance"].values
-        known = stated.any(axis=(1, 2)).all()  # an unchanged given camera has none
-        return camera_from_arrays(adjusted.data_vars), stated if known else None
-    each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
-    cameras = Camera.stack([camera_from_arrays(camera.data_vars) for camera in each])
-    if all("covariance" in camera for camera in each):
-        return cameras, np.stack([camera["covariance"].values for camera in each])
-    return cameras, None  # a given camera has no covariance
+        known = bool(stated.any(axis=(1, 2)).all())  # an unchanged given camera has none
+        surface = adjusted.attrs["surface"]
+        return (
+            camera_from_arrays(adjusted.data_vars),
+            stated if known else None,
+            None if surface is None else np.array(surface),
+        )
+    venue = open_venue(store, work, camera_ids)
+    known = bool(np.isfinite(venue.covariance).all())  # a given camera has no covariance
+    shape = None if venue.surface is None else venue.surface.shape
+    return venue.cameras, venue.covariance if known else None, shape

@@ -28,10 +28,10 @@ from worldpose.detection import (
     weights_of,
 )
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
+from worldpose.static_calibration.venue import join_cameras
 from worldpose.store import Store
 from worldpose.video import FrameIndex, open_video
 
@@ -166,7 +166,10 @@ def _open_place(store: Store, work: Work) -> Place | None:
         return None
     known = open_input(store, work, f"static_calibration/{sources['camera']}")
     pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
-    return Place(camera_from_arrays(known.data_vars), pitch)
+    venue = join_cameras([known.data_vars])
+    if venue.surface is not None:
+        pitch = pitch.with_surface(venue.surface.shape)
+    return Place(venue.cameras[0], pitch)
 
 
 def require_weights(settings: DetectionSettings, planned: dict[str, str | None]) -> None:

@@ -92,6 +92,7 @@ class _Case:
 
     Attributes:
         camera: after adjustment to people.
+        surface: crown and end fall of the pitch that the cameras show [m]; None = as in pitch.json.
         detection: recipe of the detection.
         detected: the people of `detection` (frames, detections).
         person: (persons,) ids.
@@ -103,6 +104,7 @@ class _Case:
     """
 
     camera: Camera
+    surface: list[float] | None
     detection: Recipe
     detected: KeypointDetections
     person: NDArray[np.integer]
@@ -117,7 +119,10 @@ class _Case:
         pitch = self.detection.sources["pitch"]
         place = None
         if pitch is not None:
-            place = Place(self.camera, PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
+            template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+            if self.surface is not None:
+                template = template.with_surface(self.surface)
+            place = Place(self.camera, template)
         width, height = (int(side) for side in self.camera.image_size)
         return select_missing_people(
             self.expected,
@@ -137,7 +142,8 @@ def _open(store: Store, work: Work) -> _Case:
     manifest = store.manifest(work.recipe.match_id, "detection", unit, inputs[f"detection/{unit}"])
     tracks = select_triangulated(open_input(store, work, f"tracking/{clip}"))
     place = tracks["camera"].values.tolist().index(name)
-    camera = camera_from_arrays(open_input(store, work, ADJUSTED).data_vars)[place]
+    adjusted = open_input(store, work, ADJUSTED)
+    camera = camera_from_arrays(adjusted.data_vars)[place]
     one = Camera.stack([camera])
     (bodies,) = (
         open_input(store, work, f"{stage}/{clip}")
@@ -177,6 +183,7 @@ def _open(store: Store, work: Work) -> _Case:
     )
     return _Case(
         camera=camera,
+        surface=adjusted.attrs["surface"],
         detection=manifest.recipe,
         detected=detected,
         person=tracks["person"].values,

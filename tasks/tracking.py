@@ -180,6 +180,7 @@ def _pitch(work: Work) -> PitchTemplate | None:
 
 def _locate_feet(clip: ClipInputs, pitch: PitchTemplate) -> GroundPositions:
     """Return people's foot positions by camera."""
+    pitch = clip.raise_pitch(pitch)
     frames = len(clip.detections.frame)
     parts = [clip.detections[start : start + BLOCK] for start in range(0, frames, BLOCK)]
     return GroundPositions.concatenate(

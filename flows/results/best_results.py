@@ -18,6 +18,7 @@ from worldpose.formats.joints_file import fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.static_calibration.venue import join_cameras
 from worldpose.store import Run
 
 if TYPE_CHECKING:
@@ -256,11 +257,11 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
         for camera in spec.static_cameras
         if camera.id not in run.record.left_out
     }
-    return {
-        camera_id: camera_from_arrays(run[unit].data_vars)
-        for camera_id, unit in units.items()
-        if unit in run
-    }
+    found = {camera_id: run[unit].data_vars for camera_id, unit in units.items() if unit in run}
+    if not found:
+        return {}
+    cameras = join_cameras(list(found.values())).cameras
+    return {camera_id: cameras[index] for index, camera_id in enumerate(found)}
 
 
 def broadcast_cameras(run: Run) -> dict[str, Camera]:

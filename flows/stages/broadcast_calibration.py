@@ -20,8 +20,13 @@ def units(match: Match) -> tuple[str, ...]:
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the broadcast camera's detections, and people fitted to static cameras, if any."""
-    fitted = (f"body_fitting/{unit}",) if match.has_static_cameras else ()
+    """Return the broadcast camera's detections.
+
+    With static cameras also the people fitted to them, and the pitch's surface that they show.
+    """
+    fitted: tuple[str, ...] = ()
+    if match.has_static_cameras:
+        fitted = (f"body_fitting/{unit}", "bundle_adjustment/cameras")
     return (*detection.seen_in_broadcast(match, unit), *fitted)
 
 

@@ -62,7 +62,9 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     return {
         **({"identities": said} if said else {}),
         **clip_sources(match, unit),
-        "pitch": None if pitch is None else pitch.model_dump(include={"length", "width", "crown"}),
+        "pitch": None
+        if pitch is None
+        else pitch.model_dump(include={"length", "width", "crown", "end_fall"}),
         "people": roster_limit(match.folder.spec.roster),
     }
 

@@ -24,7 +24,7 @@ TRUE_CORNER = {14.84: 13.84, 53.16: 54.16}
 
 
 def read_clicks(data, side, *, correct_labels=True):
-    """Return name to place (3,) [m, world] and name to pixel (2,) of one camera.
+    """Return name to place (2,) [m, world] and name to pixel (2,) of one camera.
 
     Args:
         data: folder of the pair.
@@ -43,9 +43,9 @@ def read_clicks(data, side, *, correct_labels=True):
         if correct_labels:
             y = TRUE_CORNER.get(y, y)
         x, y = x - 0.5 * LENGTH, 0.5 * WIDTH - y
-        place = np.array([x, y, -CROWN * (2.0 * y / WIDTH) ** 2])
+        place = np.array([x, y])
         on_ground = {name: law for name, law in laws.items() if law[2] == 0.0}
-        near = [name for name, law in on_ground.items() if np.hypot(*(place - law)[:2]) < 0.1]
+        near = [name for name, law in on_ground.items() if np.hypot(*(place - law[:2])) < 0.1]
         name = near[0] if near else f"stripe.{label.strip('()').replace(',', '.')}"
         name = f"{name}.again" if name in pixels else name
         places[name], pixels[name] = place, pixel

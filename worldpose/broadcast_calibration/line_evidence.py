@@ -32,6 +32,7 @@ from worldpose.static_calibration.line_samples import (
     thin_samples,
     white_structures,
 )
+from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 _SPACING: Final = 0.25
 """Spacing of samples in the world [m]."""
@@ -104,7 +105,7 @@ def _look(
 ) -> PointEvidence:
     """Return bars of paint within reach of one frame's projected lines."""
     lines = _near(camera, samples.lines)
-    seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, 0.0, 0.0)
+    seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, EXACT_PAINT)
     index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
         index = index[~_find_hidden(seen.places[index], people, reach)]

@@ -20,6 +20,7 @@ from worldpose.bundle_adjustment.clip import Clip
 from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
+from worldpose.static_calibration.paint_noise import EXACT_PAINT
 from worldpose.static_calibration.settings import LineRefinementSettings
 
 SIMILARITY: Final = 7
@@ -184,15 +185,16 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
     if clip.pitch is None or clip.on_lines is None or not clip.on_lines.any():
         return np.zeros((count, clip.covariance.shape[1], 0))
     samples = sample_markings(clip.pitch, _SPACING)
+    noise = replace(EXACT_PAINT, points_m=survey_error, shift_px=_SHIFT)
     response = np.zeros((count, clip.covariance.shape[1], 3 * len(clip.pitch.points)))
     for c in np.flatnonzero(clip.on_lines).tolist():
-        seen = project_lines(clip.cameras[c], samples, _LINE_WIDTH, survey_error, _SHIFT)
+        seen = project_lines(clip.cameras[c], samples, _LINE_WIDTH, noise)
         seen = seen[thin_samples(seen, samples, _APART, _MOST)]
         unknowns, column = np.unique(seen.unknowns, return_inverse=True)
         by_paint = np.zeros((len(seen.places), len(unknowns)))
         np.add.at(by_paint, (np.arange(len(by_paint))[:, None], column), seen.by_paint / _NOISE)
         known = by_paint.T @ by_paint + np.eye(len(unknowns))
-        met = by_paint.T @ seen.by_camera / _NOISE
+        met = by_paint.T @ seen.by_camera[:, :-2] / _NOISE
         moved = clip.covariance[c] @ np.linalg.solve(known, met).T
         response[c][:, unknowns[unknowns >= 0]] = moved[:, unknowns >= 0]
         response[c] /= max(1.0, _explained_share(clip.covariance[c], response[c]))

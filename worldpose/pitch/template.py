@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -140,8 +140,9 @@ class PitchTemplate:
     """One stadium's pitch in the world frame: Law 1 of the Game, surveyed points, a crown.
 
     Note:
-        C1. The surface is a parabolic ridge along x through the origin, so heights are negative
-        off the long axis; the paper states the crown's size, about 0.2 m, and not its profile.
+        C1. The surface falls from the origin by one parabola across and another along, so that
+        heights are negative elsewhere; the paper states the crown's size, about 0.2 m, and not its
+        profile. Pitches of real cameras also fall towards their goal lines.
     """
 
     length: float
@@ -150,6 +151,8 @@ class PitchTemplate:
     """Between the centres of the touch lines [m]."""
     crown: float
     """Height of the long axis above the touch lines [m]."""
+    end_fall: float
+    """Height of the halfway line above the goal lines [m]."""
     points: dict[str, NDArray[np.float64]]
     """(3,) [m], world, by name. Law 1 gives, for side in left (negative x), right and end in near
     (negative y), far: `center_mark`, `halfway_{end}`, `center_circle_{end}` (its crossings with
@@ -169,6 +172,8 @@ class PitchTemplate:
     """Lines on the surface without paint, such as edges of mowing stripes: `stripe_{side}_{n}`."""
     surveyed: frozenset[str] = frozenset()
     """Names of the points with a surveyed position; the others have that of the Laws."""
+    leveled: frozenset[str] = frozenset()
+    """Names of those with a surveyed height; the others lie on the surface."""
     assumed: frozenset[str] = frozenset()
     """Those of `length`, `width`, `crown` without a measurement: there is no surveyed point, and
     they have the values of the standard pitch."""
@@ -187,22 +192,18 @@ class PitchTemplate:
                 does not run forward by at most a full circle.
         """
         _check_size(spec)
+        size, shape = (spec.length, spec.width), (spec.crown, spec.end_fall)
         points = {
-            name: np.array([x, y, above + _ridge(y, spec.width, spec.crown)])
+            name: np.array([x, y, above + float(surface_shape(x, y, size) @ shape)])
             for name, (x, y, above) in law_points(spec.length, spec.width).items()
         }
         stripes = _stripe_edges(spec)
         given = {**stripes, **spec.points}
-        points.update(
-            {
-                name: np.array(
-                    [*place[:2], *(place[2:] or (_ridge(place[1], spec.width, spec.crown),))]
-                )
-                for name, place in given.items()
-            }
-        )
-        for place in points.values():
-            place.setflags(write=False)
+        for name, place in given.items():
+            on_surface = float(surface_shape(*place[:2], size) @ shape)
+            points[name] = np.array([*place[:2], *(place[2:] or (on_surface,))])
+        for point in points.values():
+            point.setflags(write=False)
         edges = {
             near.removesuffix("_near"): LineSpec(start=near, end=far, painted=False)
             for near, far in zip(list(stripes)[::2], list(stripes)[1::2], strict=True)
@@ -219,12 +220,14 @@ class PitchTemplate:
             spec.length,
             spec.width,
             spec.crown,
+            spec.end_fall,
             points,
             lines,
             arcs,
             law_goals(),
             unpainted,
             surveyed=frozenset(spec.points),
+            leveled=frozenset(name for name, place in spec.points.items() if len(place) == 3),
             assumed=frozenset(() if spec.points else assumed),
         )
 
@@ -238,8 +241,36 @@ class PitchTemplate:
         along, across = np.broadcast_arrays(
             np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         )
-        # The term 0 x propagates NaN in x.
-        return np.asarray(_ridge(across, self.width, self.crown) + 0.0 * along)
+        shape = surface_shape(along, across, (self.length, self.width))
+        return np.asarray(shape @ (self.crown, self.end_fall))
+
+    @property
+    def surface(self) -> NDArray[np.float64]:
+        """(2,) crown and end fall [m]."""
+        return np.array([self.crown, self.end_fall])
+
+    def with_surface(self, surface: ArrayLike) -> PitchTemplate:
+        """Return the pitch with another surface; points of surveyed height keep theirs.
+
+        Args:
+            surface: (2,) crown and end fall [m].
+        """
+        crown, end_fall = np.asarray(surface, dtype=np.float64).tolist()
+        change = (crown - self.crown, end_fall - self.end_fall)
+        points = {}
+        for name, place in self.points.items():
+            points[name] = place.copy()
+            if name not in self.leveled:
+                rise = surface_shape(place[0], place[1], (self.length, self.width)) @ change
+                points[name][2] += float(rise)
+            points[name].setflags(write=False)
+        return replace(
+            self,
+            points=points,
+            crown=crown,
+            end_fall=end_fall,
+            assumed=self.assumed - {"crown"},
+        )
 
     def positions(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return named points (n, 3) [m], world.
@@ -251,6 +282,33 @@ class PitchTemplate:
             if name not in self.points:
                 raise _unknown_point("PitchTemplate.positions", name, self.points)
         return np.array([self.points[name] for name in names], dtype=np.float64).reshape(-1, 3)
+
+    def by_surface(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return derivatives (n, 2) of points' heights by crown and end fall [m/m].
+
+        Raises:
+            InputError: a name is unknown.
+        """
+        at = self.positions(names)
+        shape = surface_shape(at[:, 0], at[:, 1], (self.length, self.width))
+        free = np.array([name not in self.leveled for name in names], dtype=np.bool_)
+        return np.asarray(shape * free[:, None])
+
+    def marking_by_surface(self, name: str, spacing: float) -> NDArray[np.float64]:
+        """Return derivatives (n, 2) of the heights of `marking_points`, as `by_surface`."""
+        return self._difference(lambda pitch: pitch.marking_points(name, spacing))
+
+    def samples_by_surface(self, spacing: float) -> NDArray[np.float64]:
+        """Return derivatives (n, 2) of the heights of `sample_lines`, as `by_surface`."""
+        return self._difference(lambda pitch: pitch.sample_lines(spacing).points_world)
+
+    def _difference(
+        self, places: Callable[[PitchTemplate], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return derivatives (n, 2) of heights; they are linear in the surface."""
+        here = places(self)[:, 2]
+        others = [self.with_surface(self.surface + axis) for axis in np.eye(2)]
+        return np.stack([places(other)[:, 2] - here for other in others], axis=-1)
 
     @property
     def marking_names(self) -> tuple[str, ...]:
@@ -346,11 +404,18 @@ class PitchTemplate:
         return np.array([x, y, z - float(self.height(x, y))])
 
 
-def _ridge(
-    y: float | NDArray[np.float64], width: float, crown: float
-) -> float | NDArray[np.float64]:
-    """Return the height of the surface at y [m]; 0 - keeps the long axis free of negative zero."""
-    return 0.0 - crown * (y / (0.5 * width)) ** 2
+def surface_shape(x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> NDArray[np.float64]:
+    """Return the derivatives (..., 2) of the surface's height by crown and end fall [m/m].
+
+    Args:
+        x: (...) [m], world.
+        y: (...) [m], world, of the same shape.
+        size: length, width of the pitch [m].
+    """
+    along = np.asarray(x, dtype=np.float64) / (0.5 * size[0])
+    across = np.asarray(y, dtype=np.float64) / (0.5 * size[1])
+    # 0 - keeps the long axis free of negative zero.
+    return 0.0 - np.stack([across**2, along**2], axis=-1)
 
 
 def _steps(extent: float, spacing: float) -> int:

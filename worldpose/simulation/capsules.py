@@ -104,7 +104,7 @@ def goal_capsules(pitch: PitchTemplate) -> tuple[Floats, Floats]:
 
 
 def draw_shadows(
-    shade: Singles, ground: Singles, camera: Camera, limbs: Floats, light: Floats, bend: float
+    shade: Singles, ground: Singles, camera: Camera, limbs: Floats, light: Floats, bend: Floats
 ) -> None:
     """Darken the ground where limbs block a light.
 
@@ -115,16 +115,16 @@ def draw_shadows(
         limbs: (things, limbs, 8) [m], world.
         light: (4,) direction down from the light, (x, y, z) with z = -1, and the share of all
             light that it gives.
-        bend: the surface is z = -bend y^2.
+        bend: (2,) of the surface, whose height is -bend[0] x^2 - bend[1] y^2.
     """
     for thing in limbs:
         known = thing[np.isfinite(thing).all(-1)]
         if not len(known):
             continue
         ends = known[:, :6].reshape(-1, 2, 3)
-        up = ends[..., 2] + bend * ends[..., 1] ** 2
+        up = ends[..., 2] + ends[..., :2] ** 2 @ bend
         fallen = ends[..., :2] + np.maximum(up, 0.0)[..., None] * light[:2]
-        flat = np.concatenate([fallen, -bend * fallen[..., 1:] ** 2], axis=-1)
+        flat = np.concatenate([fallen, -(fallen**2 @ bend)[..., None]], axis=-1)
         pixels = camera.project(flat.reshape(-1, 3))
         box = _box(pixels, 0.35 * _scale(camera, flat.reshape(-1, 3)), shade.shape)
         if box is not None:

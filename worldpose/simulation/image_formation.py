@@ -45,7 +45,7 @@ def outline_shadows(venue: Venue, camera: Camera, vertices: Singles, light: Floa
     straight_down = not light[:2].any()
     edge = venue.edge if venue.shade > 0.0 and not straight_down else np.inf
     fallen = np.empty_like(vertices)
-    ground = np.array([venue.bend, *venue.half, venue.side, edge])
+    ground = np.array([*venue.bend, *venue.half, venue.side, edge])
     _throw(vertices, light, ground, fallen)
     return outline_surfaces(camera, fallen)
 
@@ -57,20 +57,20 @@ def _throw(vertices: Singles, light: Floats, ground: Floats, fallen: Singles) ->
     Args:
         vertices: (persons, vertices, 3) [m], world.
         light: (4,), its direction down first.
-        ground: the bend of the surface, half the distances between the boards along x and y, the
+        ground: both bends of the surface, half the distances between the boards along x and y, the
             side of the stand that casts a shadow, and the start of that shadow.
         fallen: (persons, vertices, 3), written.
     """
     for p in range(vertices.shape[0]):
         for v in range(vertices.shape[1]):
             x, y, z = vertices[p, v, 0], vertices[p, v, 1], vertices[p, v, 2]
-            up = max(z + ground[0] * y * y, 0.0)
+            up = max(z + ground[0] * x * x + ground[1] * y * y, 0.0)
             gx, gy = x + up * light[0], y + up * light[1]
-            if not (abs(gx) < ground[1] and abs(gy) < ground[2] and ground[3] * gy < ground[4]):
+            if not (abs(gx) < ground[2] and abs(gy) < ground[3] and ground[4] * gy < ground[5]):
                 fallen[p, v] = np.nan
                 continue
             fallen[p, v, 0], fallen[p, v, 1] = gx, gy
-            fallen[p, v, 2] = -ground[0] * gy * gy
+            fallen[p, v, 2] = -ground[0] * gx * gx - ground[1] * gy * gy
 
 
 Faces = NDArray[np.int32]
@@ -289,7 +289,7 @@ def _shade_surfaces(venue: Venue, surfaces: Surfaces) -> Singles:
         direct = np.float32(DIRECT * way[3]) * np.maximum(normals @ toward, np.float32(0.0))
         if venue.shade > 0.0:
             y = vertices[..., 1]
-            height = vertices[..., 2] + np.float32(venue.bend) * y * y
+            height = vertices[..., 2] + vertices[..., :2] ** 2 @ venue.bend.astype(np.float32)
             fallen = np.asarray(y + height * np.float32(way[1]), dtype=np.float32)
             direct *= np.float32(1.0) - venue.in_shadow(fallen)
         light = light + direct

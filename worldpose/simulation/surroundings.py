@@ -59,11 +59,14 @@ def _arc_row(arc: ArcSpec, center: tuple[float, float, float]) -> tuple[float, .
 
 
 @compile_kernel
-def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: float) -> float:
-    """Return the steps (dx, dy, dz) from `o` to the surface z = -bend y^2; inf if none."""
-    a = bend * dy * dy
-    b = dz + 2.0 * bend * o[1] * dy
-    c = o[2] + bend * o[1] * o[1]
+def surface_hit(o: Floats, dx: float, dy: float, dz: float, bend: Floats) -> float:
+    """Return the steps (dx, dy, dz) from `o` to the surface; inf if none.
+
+    Its height is -bend[0] x^2 - bend[1] y^2.
+    """
+    a = bend[0] * dx * dx + bend[1] * dy * dy
+    b = dz + 2.0 * (bend[0] * o[0] * dx + bend[1] * o[1] * dy)
+    c = o[2] + bend[0] * o[0] * o[0] + bend[1] * o[1] * o[1]
     root = b * b - 4.0 * a * c
     if root < 0.0:
         return np.inf
@@ -289,7 +292,7 @@ def _crowd(along: float, z: float, side: int, look: int) -> tuple[float, float, 
 
 @compile_kernel
 def scenery(
-    o: Floats, dx: float, dy: float, dz: float, half: Floats, bend: float, look: int
+    o: Floats, dx: float, dy: float, dz: float, half: Floats, bend: Floats, look: int
 ) -> tuple[float, float, float, float]:
     """Return the colour at a ray's end, and the distance in steps; grass gives (-1, 0, 0).
 
@@ -299,7 +302,7 @@ def scenery(
         dy: direction along y.
         dz: direction upwards.
         half: (2,) half the distances between the boards along x and y [m].
-        bend: the surface is z = -bend y^2.
+        bend: (2,) of the surface, see `surface_hit`.
         look: seed of the stadium's look.
     """
     nearest = surface_hit(o, dx, dy, dz, bend)
@@ -320,8 +323,8 @@ def scenery(
         steps = (toward * half[axis] - start) / step
         if 0.0 < steps < nearest:
             along = o[1] + steps * dy if axis == 0 else o[0] + steps * dx
-            across = o[1] + steps * dy
-            up = o[2] + steps * dz + bend * across * across
+            ahead, across = o[0] + steps * dx, o[1] + steps * dy
+            up = o[2] + steps * dz + bend[0] * ahead * ahead + bend[1] * across * across
             if abs(along) < half[1 - axis] and up < BOARD_HEIGHT:
                 nearest = steps
                 if toward * step > 0.0:

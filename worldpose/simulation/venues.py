@@ -64,7 +64,7 @@ class SceneRows(NamedTuple):
     Attributes:
         paint: of `paint_rows`.
         table: (64, 64) random numbers of the grass.
-        scene: length and width of the pitch, its bend, contrast of stripes, paint.
+        scene: length and width of the pitch, two bends of its surface, contrast of stripes, paint.
         half: (2,) half the distances between the boards [m].
         look: seed of the stadium's look.
     """
@@ -99,7 +99,7 @@ def paint_scene(
     """
     paint, table, scene, half, look = stadium
     place = np.empty(8)
-    bend = scene[2]
+    bend = scene[2:4]
     for v in range(color.shape[0]):
         for u in range(color.shape[1]):
             x, y, xu, yu, xv, yv = _interpolate_plane(grid, u, v)
@@ -108,15 +108,15 @@ def paint_scene(
             dz = r[2, 0] * x + r[2, 1] * y + r[2, 2]
             s = surface_hit(o, dx, dy, dz, bend)
             place[0], place[1] = o[0] + s * dx, o[1] + s * dy
-            slope = 2.0 * bend * place[1]
-            sink = slope * dy + dz
+            slope_x, slope_y = 2.0 * bend[0] * place[0], 2.0 * bend[1] * place[1]
+            sink = slope_x * dx + slope_y * dy + dz
             step = np.sqrt(dx * dx + dy * dy + dz * dz)
             distance[v, u] = s * step
             for k in range(2):
                 a, b = (xu, yu) if k == 0 else (xv, yv)
                 ex, ey = r[0, 0] * a + r[0, 1] * b, r[1, 0] * a + r[1, 1] * b
                 ez = r[2, 0] * a + r[2, 1] * b
-                ds = -s * (slope * ey + ez) / sink
+                ds = -s * (slope_x * ex + slope_y * ey + ez) / sink
                 place[2 + 2 * k] = s * ex + ds * dx
                 place[3 + 2 * k] = s * ey + ds * dy
             place[6], place[7] = dx / sink, dy / sink
@@ -163,11 +163,11 @@ def paint_scene(
 @compile_kernel
 def _paint_turf(paint: Floats, table: Floats, place: Floats, scene: Floats, color: Singles) -> None:
     """Write the colour (3,) of grass and paint at a place."""
-    bright, yellow = grass(table, place, scene[0], scene[1], scene[3])
+    bright, yellow = grass(table, place, scene[0], scene[1], scene[4])
     color[0] = bright * (0.315 + 0.014 * yellow)
     color[1] = bright * 0.475
     color[2] = bright * (0.205 - 0.006 * yellow)
-    cover = scene[4] * paint_cover(paint, place)
+    cover = scene[5] * paint_cover(paint, place)
     if cover > 0.0:
         # Grass shows through worn paint.
         cover *= min(0.88 + 0.06 * wear(table, place), 0.97)
@@ -202,9 +202,11 @@ class Venue:
     """(4,) each: direction down from the light, z = -1, and its share of all light."""
 
     @property
-    def bend(self) -> float:
-        """Return the surface's coefficient in z = -bend y^2 [1/m]."""
-        return self.pitch.crown / (0.5 * self.pitch.width) ** 2
+    def bend(self) -> Floats:
+        """Return the coefficients (2,) of the surface, whose height is -bend @ (x^2, y^2) [1/m]."""
+        pitch = self.pitch
+        half = 0.5 * np.array([pitch.length, pitch.width])
+        return np.array([pitch.end_fall, pitch.crown]) / half**2
 
     @property
     def half(self) -> Floats:
@@ -294,7 +296,7 @@ def paint_venue(
             paint=paint_rows(pitch),
             table=venue.table,
             scene=np.array(
-                [pitch.length, pitch.width, venue.bend, settings.stripes, settings.paint]
+                [pitch.length, pitch.width, *venue.bend, settings.stripes, settings.paint]
             ),
             half=venue.half,
             look=venue.look,

@@ -133,8 +133,10 @@ def calibrate_camera(
     found = _try_k3(found)
     estimate, lines = found.estimate, None
     if picture is not None and stated.lines:
-        fit, lines = refine_and_judge(found, pitch, picture)
-        found, estimate = replace(found, fit=fit), lines.estimate
+        found, lines = refine_and_judge(found, pitch, picture)
+        if lines.venue is not None:
+            estimate = lines.estimate.estimate
+            pitch = pitch.with_surface(lines.estimate.surface)
     report = build_report(estimate, found, lines, pitch, stated.click_noise_px)
     return StaticCalibration(estimate, report)
 

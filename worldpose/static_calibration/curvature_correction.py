@@ -9,19 +9,20 @@ and the tangent is no approximation over that length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
+from worldpose.pitch.surface import Surface
 from worldpose.static_calibration.adjustment import Problem, camera_from_row, camera_row
 from worldpose.static_calibration.descent import step_row
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import (
-    CameraEstimate,
-    step_between,
+    CameraOnPitch,
     step_camera,
     step_jacobian,
 )
@@ -76,8 +77,8 @@ def add_curvature(problem: Problem, row: Floats, covariance: Floats, scale: floa
     return np.asarray(covariance + added + np.outer(mean, mean))
 
 
-def linearize_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
-    """Return the Gaussian of clicks and prior, linearized at a given camera.
+def linearize_at(problem: Problem, row: Floats, scale: float, surface: Surface) -> CameraOnPitch:
+    """Return the Gaussian of clicks and priors, linearized at a given camera and surface.
 
     A Gaussian about the clicks' own best camera is wrong at a distant camera along an
     ill-conditioned direction, such as one from the painted lines; this Gaussian is correct there.
@@ -86,35 +87,59 @@ def linearize_at(problem: Problem, row: Floats, scale: float) -> CameraEstimate:
         problem: clicks, noise and prior.
         row: (22,) camera near the truth.
         scale: factor on the stated noise of the evidence.
+        surface: prior of the pitch's surface.
     """
-    residuals, rows = weight_residuals(problem, row, scale)
-    free = problem.free
-    rows = np.concatenate([rows, np.diag(1.0 / _POSE_SPREAD)])[:, free]
-    residuals = np.concatenate([residuals, np.zeros(SIZE)])
+    residuals, rows = weight_residuals(problem, row, scale, surface)
+    free = free_on_pitch(problem)
+    kept = np.concatenate([1.0 / _POSE_SPREAD, np.zeros(2)])
+    rows = np.concatenate([rows, np.diag(kept)])[:, free]
+    residuals = np.concatenate([residuals, np.zeros(len(kept))])
     size = np.linalg.norm(rows, axis=0)
     shape: Floats = np.linalg.inv((rows / size).T @ (rows / size)) / np.outer(size, size)
-    step, covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
+    step, covariance = np.zeros(len(free)), np.zeros((len(free), len(free)))
     step[free] = -shape @ (rows.T @ residuals)
     covariance[np.ix_(free, free)] = shape
     camera = camera_from_row(row, problem.image_size)
-    start = step_camera(camera, step)
-    turn = step_jacobian(step_between(start, camera))
-    return CameraEstimate(start, turn @ covariance @ turn.T)
+    here = problem.evidence.surface
+    start = CameraOnPitch(step_camera(camera, step[:SIZE]), here + step[SIZE:], covariance)
+    turn = step_jacobian(start.step_to(camera, here))
+    return replace(start, covariance=turn @ covariance @ turn.T)
 
 
-def weight_residuals(problem: Problem, row: Floats, scale: float) -> tuple[Floats, Floats]:
-    """Return residuals (m,) at a camera and derivatives (m, 12), times the roots of their weights.
+def free_on_pitch(problem: Problem) -> NDArray[np.bool_]:
+    """Return the (14,) mask of free parameters of the camera, and of the surface."""
+    return np.concatenate([problem.free, [True, True]])
+
+
+def weight_residuals(
+    problem: Problem, row: Floats, scale: float, surface: Surface
+) -> tuple[Floats, Floats]:
+    """Return residuals (m,) at a camera and derivatives (m, 14), times the roots of their weights.
+
+    The last two residuals are those of the surface's prior.
 
     Args:
         problem: clicks, noise and prior.
         row: (22,) camera.
         scale: factor on the stated noise of the evidence.
+        surface: prior of the pitch's surface.
     """
-    residuals, rows = whiten_residuals(problem, row, np.zeros(SIZE), scale)
+    residuals, by_camera = whiten_residuals(problem, row, np.zeros(SIZE), scale)
+    columns = []
+    for change in _NUDGE_M * np.eye(2):
+        there = problem.evidence.on_surface(problem.evidence.surface + change)
+        other = replace(problem, evidence=there)
+        columns.append(whiten_residuals(other, row, np.zeros(SIZE), scale)[0] - residuals)
+    rows = np.column_stack([by_camera, np.stack(columns, axis=-1) / _NUDGE_M])
     drawn = slice(2 * len(problem.evidence.points), len(residuals) - PRIORS)
     root = np.ones(len(residuals))
     root[drawn] = 1.0 / np.hypot(1.0, scale * residuals[drawn] / problem.drawn_loss)
-    return root * residuals, root[:, None] * rows
+    prior, by_surface = surface.whiten(problem.evidence.surface)
+    own = np.concatenate([np.zeros((2, SIZE)), by_surface], axis=1)
+    return (
+        np.concatenate([root * residuals, prior]),
+        np.concatenate([root[:, None] * rows, own]),
+    )
 
 
 def whiten_residuals(
@@ -151,6 +176,8 @@ def whiten_residuals(
     return np.concatenate(residuals), np.concatenate(rows) * problem.free
 
 
+_NUDGE_M: Final = 0.01
+"""Change of crown and end fall for finite differences [m]."""
 _MAX_STEPS: Final = 20
 """Gauss-Newton steps at most [1]."""
 _SETTLED: Final = 0.01
@@ -167,74 +194,78 @@ _STRAIGHT: Final = 0.3
 
 @dataclass(frozen=True, eq=False)
 class ClicksAndBars:
-    """Evidence of a camera after line refinement: clicks, prior and bars.
+    """Evidence of a camera after line refinement: clicks, priors and bars.
 
     Attributes:
-        problem: the clicks and the prior.
+        problem: the clicks and the prior of the camera.
         scale: factor on the stated noise of the clicks.
         bars: found on the lines.
+        surface: prior of the pitch's surface.
     """
 
     problem: Problem
     scale: float
     bars: Bars
+    surface: Surface
 
-    def residuals(self, camera: Camera) -> tuple[Floats, Floats]:
+    def residuals(self, camera: Camera, surface: Floats) -> tuple[Floats, Floats]:
         """Return whitened residuals (m,) and derivatives (m, f) by the free parameters."""
-        clicks, by_clicks = weight_residuals(self.problem, camera_row(camera), self.scale)
-        lines, by_lines = self.bars.whiten_residuals(camera)
-        rows = np.concatenate([by_clicks, by_lines])[:, self.problem.free]
+        there = replace(self.problem, evidence=self.problem.evidence.on_surface(surface))
+        clicks, by_clicks = weight_residuals(there, camera_row(camera), self.scale, self.surface)
+        lines, by_lines = self.bars.whiten_residuals(camera, surface)
+        rows = np.concatenate([by_clicks, by_lines])[:, free_on_pitch(self.problem)]
         return np.concatenate([clicks, lines]), rows
 
-    def fit(self, camera: Camera, noise: Floats | None = None) -> Camera:
-        """Return the camera of least cost.
+    def fit(
+        self, camera: Camera, surface: Floats, noise: Floats | None = None
+    ) -> tuple[Camera, Floats]:
+        """Return the camera and the surface of least cost.
 
         Args:
             camera: near the answer.
+            surface: (2,) near the answer [m].
             noise: (m,) to add to the residuals; None = none.
         """
-        residuals, rows = self.residuals(camera)
+        residuals, rows = self.residuals(camera, surface)
+        free = free_on_pitch(self.problem)
         noise = np.zeros(len(residuals)) if noise is None else noise
         for _ in range(_MAX_STEPS):
             size = np.linalg.norm(rows, axis=0)
-            step = np.zeros(SIZE)
+            step = np.zeros(len(free))
             free_step = -np.linalg.lstsq(rows / size, residuals + noise)[0] / size
             before = float(((residuals + noise) ** 2).sum())
             for _ in range(_MAX_HALVINGS):
-                step[self.problem.free] = free_step
-                trial = step_camera(camera, step)
-                ahead, by_ahead = self.residuals(trial)
+                step[free] = free_step
+                trial, higher = step_camera(camera, step[:SIZE]), surface + step[SIZE:]
+                ahead, by_ahead = self.residuals(trial, higher)
                 # Points that a camera does not see are NaN, which compares false.
                 if ((ahead + noise) ** 2).sum() < before:
                     break
                 free_step = 0.5 * free_step
             else:
-                return camera
+                return camera, surface
             length = float(np.linalg.norm(rows @ free_step))
-            camera, residuals, rows = trial, ahead, by_ahead
+            camera, surface, residuals, rows = trial, higher, ahead, by_ahead
             if length < _SETTLED:
                 break
-        return camera
+        return camera, surface
 
 
-def fit_with_curvature(
-    problem: Problem, camera: Camera, bars: Bars, scale: float
-) -> CameraEstimate:
-    """Return the camera fitted to clicks and lines, with a covariance to second order.
+def fit_with_curvature(evidence: ClicksAndBars, camera: Camera) -> CameraOnPitch:
+    """Return camera and surface fitted to clicks and lines, with a covariance to second order.
 
     The function samples noise of clicks, prior and bars, and fits a camera to each sample. To first
     order these cameras have the inverse information as covariance; the function adds the mean
     square of their deviations from the tangent.
 
     Args:
-        problem: the inlying clicks.
+        evidence: the inlying clicks, the bars on the lines, and the priors.
         camera: near the answer.
-        bars: bars on the lines.
-        scale: factor on the stated noise of the clicks.
     """
-    evidence = ClicksAndBars(problem, scale, bars)
-    camera = evidence.fit(camera)
-    rows = evidence.residuals(camera)[1]
+    camera, surface = evidence.fit(camera, evidence.bars.surface)
+    rows = evidence.residuals(camera, surface)[1]
+    best = CameraOnPitch(camera, surface, np.empty(0))
+    free = free_on_pitch(evidence.problem)
     size = 1.0 / np.linalg.norm(rows, axis=0)
     answer = np.linalg.pinv(rows * size)
     covariance = answer @ answer.T
@@ -245,15 +276,13 @@ def fit_with_curvature(
         noise = rng.standard_normal(len(rows))
         for sign in (1.0, -1.0):
             tangent = -sign * size * (answer @ noise)
-            there = evidence.fit(camera, sign * noise)
-            beside.append((step_between(camera, there)[problem.free] - tangent) / size)
+            there = best.step_to(*evidence.fit(camera, surface, sign * noise))
+            beside.append((there[free] - tangent) / size)
         if len(beside) == _FIRST:
             off = np.array(beside)
             if (off * np.linalg.solve(covariance, off.T).T).sum() < _FIRST * _STRAIGHT**2:
                 break
     off = np.array(beside)
-    whole = np.zeros((SIZE, SIZE))
-    whole[np.ix_(problem.free, problem.free)] = (covariance + off.T @ off / len(off)) * np.outer(
-        size, size
-    )
-    return CameraEstimate(camera, whole)
+    whole = np.zeros((len(free), len(free)))
+    whole[np.ix_(free, free)] = (covariance + off.T @ off / len(off)) * np.outer(size, size)
+    return replace(best, covariance=whole)

@@ -37,22 +37,28 @@ class Evidence:
         points: names of the clicked points.
         points_world: (n, 3) [m], world.
         points_image: (n, 2) [px].
+        points_by_surface: (n, 2) derivatives of heights by the pitch's crown and end fall [m/m].
         markings: names of the drawn markings, each once.
         samples_world: (s, 3) [m], world, along the drawn markings one after another.
+        samples_by_surface: (s, 2) as `points_by_surface`.
         bounds: (m + 1,) first sample of each marking, and the end.
         drawn_image: (d, 2) [px].
         drawn_marking: (d,) indices into `markings`.
+        surface: (2,) crown and end fall at these places [m].
         straight: (m,) whether the marking is a straight line on the pitch surface.
     """
 
     points: tuple[str, ...]
     points_world: NDArray[np.float64]
     points_image: NDArray[np.float64]
+    points_by_surface: NDArray[np.float64]
     markings: tuple[str, ...]
     samples_world: NDArray[np.float64]
+    samples_by_surface: NDArray[np.float64]
     bounds: NDArray[np.int64]
     drawn_image: NDArray[np.float64]
     drawn_marking: NDArray[np.int64]
+    surface: NDArray[np.float64]
     straight: NDArray[np.bool_]
 
     def select(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
@@ -63,8 +69,26 @@ class Evidence:
             points=tuple(name for name, kept in zip(self.points, keep, strict=True) if kept),
             points_world=self.points_world[keep],
             points_image=self.points_image[keep],
+            points_by_surface=self.points_by_surface[keep],
             drawn_image=self.drawn_image[on],
             drawn_marking=self.drawn_marking[on],
+        )
+
+    def on_surface(self, surface: NDArray[np.float64]) -> Evidence:
+        """Return the evidence at its places on another surface.
+
+        Args:
+            surface: (2,) crown and end fall [m].
+        """
+        change = surface - self.surface
+        points, samples = self.points_world.copy(), self.samples_world.copy()
+        points[:, 2] += self.points_by_surface @ change
+        samples[:, 2] += self.samples_by_surface @ change
+        return replace(
+            self,
+            points_world=points,
+            samples_world=samples,
+            surface=surface,
         )
 
 
@@ -119,16 +143,20 @@ def gather_evidence(
         pixels.setdefault(marking.name, []).extend(marking.xy)
     pixels = {name: _thin(drawn) for name, drawn in pixels.items()}
     samples = [pitch.marking_points(name, spacing) for name in pixels]
+    shapes = [pitch.marking_by_surface(name, spacing) for name in pixels]
     counts = [len(drawn) for drawn in pixels.values()]
     return Evidence(
         points=tuple(names),
         points_world=pitch.positions(names),
         points_image=np.array([point.xy for point in clicked.points]).reshape(-1, 2),
+        points_by_surface=pitch.by_surface(names),
         markings=tuple(pixels),
         samples_world=np.concatenate([np.empty((0, 3)), *samples]),
+        samples_by_surface=np.concatenate([np.empty((0, 2)), *shapes]),
         bounds=np.cumsum([0, *(len(part) for part in samples)]),
         drawn_image=np.array([xy for drawn in pixels.values() for xy in drawn]).reshape(-1, 2),
         drawn_marking=np.repeat(np.arange(len(pixels)), counts),
+        surface=pitch.surface,
         straight=np.array(
             [name in pitch.lines or name in pitch.unpainted for name in pixels], dtype=np.bool_
         ),

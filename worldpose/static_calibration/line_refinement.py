@@ -23,7 +23,8 @@ from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.adjustment import camera_row
+from worldpose.pitch.surface import Surface
+from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import (
     Explanation,
     InlierFit,
@@ -33,19 +34,25 @@ from worldpose.static_calibration.click_outliers import (
     noise_ratio,
     scale_noise,
 )
-from worldpose.static_calibration.curvature_correction import fit_with_curvature, linearize_at
+from worldpose.static_calibration.curvature_correction import (
+    ClicksAndBars,
+    fit_with_curvature,
+    linearize_at,
+)
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_samples import (
     sample_markings,
     thin_samples,
 )
 from worldpose.static_calibration.line_search import Bars, LineFit, LineSearch
-from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.paint_noise import PaintNoise
+from worldpose.static_calibration.parameters import CameraOnPitch
 from worldpose.static_calibration.settings import (
     SURVEY_ERROR,
     LineRefinementSettings,
     StaticCalibrationSettings,
 )
+from worldpose.static_calibration.venue import VenueEvidence, gather_venue_evidence
 
 
 @dataclass(frozen=True)
@@ -78,9 +85,11 @@ class LineRefinement:
         correlation: of neighbouring residuals along a marking, mean over the samples [1].
         effective_samples: equivalent number of independent inliers [1].
         bars: bars of the fit; None if refinement failed.
+        noise: of paint and detection, learned from the residuals; None if refinement failed.
+        venue: what the camera tells about the pitch; None before the final fit.
     """
 
-    estimate: CameraEstimate
+    estimate: CameraOnPitch
     refined: bool
     reason: str
     markings: tuple[MarkingFit, ...]
@@ -88,18 +97,20 @@ class LineRefinement:
     correlation: float
     effective_samples: float
     bars: Bars | None
+    noise: PaintNoise | None
+    venue: VenueEvidence | None = None
 
 
 def refine_on_lines(
-    start: CameraEstimate,
+    start: CameraOnPitch,
     pitch: PitchTemplate,
     picture: NDArray[np.uint8],
     settings: LineRefinementSettings | None = None,
     *,
     survey_error: float = SURVEY_ERROR,
-    begin: CameraEstimate | None = None,
+    begin: CameraOnPitch | None = None,
 ) -> LineRefinement:
-    """Return the maximum a posteriori camera from the painted lines and a Gaussian prior.
+    """Return the most probable camera and surface from the painted lines and a Gaussian prior.
 
     The start's covariance gives samples and search widths: the search begins with samples of small
     projected uncertainty, which reduce the uncertainty of the others.
@@ -107,7 +118,7 @@ def refine_on_lines(
     Args:
         start: from clicks; its covariance is the Gaussian prior, and parameters without variance
             stay fixed.
-        pitch: the template.
+        pitch: the template; its surface is where to linearize.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.
         survey_error: of the template's points from the painted ones, each axis, standard
@@ -124,7 +135,7 @@ def refine_on_lines(
 
 
 def refine_by_search(
-    search: LineSearch, pitch: PitchTemplate, begin: CameraEstimate | None = None
+    search: LineSearch, pitch: PitchTemplate, begin: CameraOnPitch | None = None
 ) -> LineRefinement:
     """Return the camera that a line search finds, as `refine_on_lines` does.
 
@@ -134,8 +145,9 @@ def refine_by_search(
         begin: camera to begin the search at; the start of the search if None.
     """
     start, settings = search.start, search.settings
-    everywhere = sample_markings(pitch, _WORLD_SPACING)
     begin = begin or start
+    everywhere = sample_markings(pitch, _WORLD_SPACING)
+    everywhere = everywhere.raise_surface(begin.surface - pitch.surface)
     seen = search.look(begin.camera, everywhere)
     index = thin_samples(seen, everywhere, settings.spacing_px, settings.samples)
     index = index[search.clear(begin.camera, everywhere[index], seen[index])]
@@ -144,6 +156,7 @@ def refine_by_search(
     found = search.run(begin, everywhere[index])
     if found is None:
         return _keep_start(start, "too few painted lines were found")
+    found = search.learn_noise(found)
     inliers = found.adjusted.weights > _INLIER
     inliers &= _have_inliers(found, inliers, settings.min_inlier_share)
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
@@ -153,7 +166,7 @@ def refine_by_search(
     independent = (1.0 - correlation) / (1.0 + correlation)
     # Neighbours are correlated: larger variances give them their joint information.
     found = search.reweight(found, inliers, excess / independent)
-    distance = search.distance(found.camera)
+    distance = search.distance(found)
     if chdtrc(search.free.sum(), distance**2) < settings.contradiction:
         return _keep_start(
             start,
@@ -161,7 +174,7 @@ def refine_by_search(
             f"{distance:.1f} standard deviations",
         )
     return LineRefinement(
-        estimate=CameraEstimate(found.camera, search.covariance(found)),
+        estimate=CameraOnPitch(found.camera, found.surface, search.covariance(found)),
         refined=True,
         reason="",
         markings=_marking_fits(found, inliers),
@@ -169,6 +182,7 @@ def refine_by_search(
         correlation=float(correlation[inliers].mean()),
         effective_samples=float(independent[inliers].sum()),
         bars=search.collect_bars(found),
+        noise=search.noise,
     )
 
 
@@ -242,9 +256,9 @@ def _marking_fits(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[MarkingFi
     return tuple(fits)
 
 
-def _keep_start(start: CameraEstimate, reason: str) -> LineRefinement:
+def _keep_start(start: CameraOnPitch, reason: str) -> LineRefinement:
     nan = float("nan")
-    return LineRefinement(start, False, reason, (), nan, nan, 0.0, None)
+    return LineRefinement(start, False, reason, (), nan, nan, 0.0, None, None)
 
 
 _WIDER: Final = (2.0, 4.0)
@@ -257,8 +271,10 @@ clicks exceeds it by chance."""
 
 def refine_and_judge(
     found: Explanation, pitch: PitchTemplate, picture: NDArray[np.uint8]
-) -> tuple[InlierFit, LineRefinement]:
+) -> tuple[Explanation, LineRefinement]:
     """Return stage 2 with inliers chosen by the painted lines, and stage 3 from there.
+
+    Its clicks are then on the surface that the lines show.
 
     A few clicks close together determine neither their own noise nor the outliers among them. The
     lines do: a camera fitted to the lines gives the residual of every click. Where the search finds
@@ -271,55 +287,64 @@ def refine_and_judge(
         picture: image of the camera.
     """
     problem, fit, settings = found.problem, found.fit, found.settings
-    size = problem.image_size
-    first = _refine(fit.estimate(size), pitch, picture, settings)
+
+    def refine(problem: Problem, fit: InlierFit) -> LineRefinement:
+        return _refine(_start_from_clicks(problem, fit, pitch), pitch, picture, settings)
+
+    first = refine(problem, fit)
     tried = [(fit, first)]
     for factor in _WIDER:
         if tried[-1][1].refined:
             break
         wider, rough = scale_noise(problem, factor, settings)
         other = fit_inliers(wider, fit.row, rough)
-        tried.append((other, _refine(other.estimate(size), pitch, picture, settings)))
+        tried.append((other, refine(wider, other)))
     if not tried[-1][1].refined:
+        widest = scale_noise(problem, _WIDER[-1], settings)[0]
         tried += sorted(
-            (
-                (other, _refine(other.estimate(size), pitch, picture, settings))
-                for other in _leave_one_out_fits(found)
-            ),
+            ((other, refine(widest, other)) for other in _leave_one_out_fits(widest, fit)),
             key=lambda one: -one[1].effective_samples,
         )
     for other, lines in tried:
         judged = _judge(replace(found, fit=other), lines, pitch, picture)
         if judged is not None:
             return judged
-    return fit, first
+    return found, first
 
 
-def _leave_one_out_fits(found: Explanation) -> Iterator[InlierFit]:
-    """Yield the leave-one-out fits at the largest noise."""
-    problem, fit = found.problem, found.fit
-    wider, _ = scale_noise(problem, _WIDER[-1], found.settings)
+def _start_from_clicks(problem: Problem, fit: InlierFit, pitch: PitchTemplate) -> CameraOnPitch:
+    """Return camera and surface of a fit to clicks, with their covariance to second order."""
+    kept = problem.select(fit.inliers, fit.markings)
+    start = linearize_at(kept, fit.row, fit.noise_scale, Surface.of(pitch))
+    whole = start.covariance.copy()
+    whole[:-2, :-2] += fit.covariance - fit.tangent_covariance
+    return replace(start, covariance=whole)
+
+
+def _leave_one_out_fits(problem: Problem, fit: InlierFit) -> Iterator[InlierFit]:
+    """Yield the leave-one-out fits of a fit to a problem."""
     for index in range(len(problem.evidence.points)):
         inliers = np.arange(len(problem.evidence.points)) != index
         with suppress(InputError):
-            yield fit_given_inliers(wider, fit.row, inliers, fit.markings)
+            yield fit_given_inliers(problem, fit.row, inliers, fit.markings)
 
 
 def _judge(
     found: Explanation, lines: LineRefinement, pitch: PitchTemplate, picture: NDArray[np.uint8]
-) -> tuple[InlierFit, LineRefinement] | None:
+) -> tuple[Explanation, LineRefinement] | None:
     """Return the fit to the inliers of a camera refined on lines, and stage 3 from there.
 
     None if no such camera exists, or with too few inliers.
     """
     if not lines.refined:
         return None
-    problem, settings = found.problem, found.settings
+    settings, prior = found.settings, Surface.of(pitch)
+    problem = _on_surface(found.problem, lines.estimate)
     row = camera_row(lines.estimate.camera)
     ratio = noise_ratio(problem, row)
     factor = 1.0 if ratio <= _AS_STATED else min(ratio, _WIDER[-1])
     wider = scale_noise(problem, factor, settings)[0]
-    mahalanobis = mahalanobis_distances(wider, lines.estimate)
+    mahalanobis = mahalanobis_distances(wider, lines.estimate.estimate)
     inliers = mahalanobis < settings.wrong_click
     if len(inliers) and 1.0 - inliers.mean() > settings.max_wrong_share:
         return None
@@ -329,21 +354,27 @@ def _judge(
     other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
     rest = wider.select(inliers, fit.markings & other)
     scale = fit.noise_scale
-    known = linearize_at(rest, row, scale)
+    known = linearize_at(rest, row, scale, prior)
     again = _refine(known, pitch, picture, settings, begin=lines.estimate)
     if again.bars is None:
         return None
-    best = fit_with_curvature(rest, again.estimate.camera, again.bars, scale)
+    evidence = ClicksAndBars(rest, scale, again.bars, prior)
+    best = fit_with_curvature(evidence, again.estimate.camera)
     fit = replace(fit, mahalanobis=mahalanobis, noise_scale=factor * scale)
-    return fit, replace(again, estimate=best)
+    found = replace(found, problem=_on_surface(problem, best), fit=fit)
+    return found, replace(again, estimate=best, venue=gather_venue_evidence(evidence, best))
+
+
+def _on_surface(problem: Problem, found: CameraOnPitch) -> Problem:
+    return replace(problem, evidence=problem.evidence.on_surface(found.surface))
 
 
 def _refine(
-    start: CameraEstimate,
+    start: CameraOnPitch,
     pitch: PitchTemplate,
     picture: NDArray[np.uint8],
     settings: StaticCalibrationSettings,
-    begin: CameraEstimate | None = None,
+    begin: CameraOnPitch | None = None,
 ) -> LineRefinement:
     return refine_on_lines(
         start,

@@ -6,7 +6,7 @@ both sides. A crossbar, and the other side of a far circle, are close to a sampl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,10 +17,14 @@ from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CrossSections
+from worldpose.static_calibration.paint_noise import FIRST_KNOT, PaintNoise
 from worldpose.static_calibration.parameters import by_step
 
 _STRIDE: Final = 0.1
 """Step along an arc for finite differences of its curvature [m]."""
+_KNOT_SPACING: Final = 6.0
+"""Spacing of the knots of a marking's unevenness [m]: residuals of real markings keep their sign
+over 3 to 10 m."""
 _MIN_WIDTH: Final = 0.5
 """Minimum projected width of paint to search [px]."""
 
@@ -36,6 +40,9 @@ class LineSamples:
         ends: (n, 2) indices of the template's points that define a sample: the ends of its line,
             or its arc's center twice.
         shares: (n, 2) derivatives of the sample by these points [m/m].
+        knots: (n, 2) numbers of the marking's knots on either side, see `_KNOT_SPACING`.
+        knot_shares: (n, 2) weights of these knots in the unevenness [1].
+        by_surface: (n, 2) derivatives of the height by crown and end fall [m/m].
         marking: (n,) indices into `names`, rising.
         names: the markings.
     """
@@ -45,6 +52,9 @@ class LineSamples:
     bend_world: Floats
     ends: NDArray[np.int64]
     shares: Floats
+    knots: NDArray[np.int64]
+    knot_shares: Floats
+    by_surface: Floats
     marking: NDArray[np.int64]
     names: tuple[str, ...]
 
@@ -58,6 +68,16 @@ class LineSamples:
         """Return places (n, 3) [m], world, at a distance [m] along the marking from samples."""
         return self.points_world + way * self.along_world + 0.5 * way**2 * self.bend_world
 
+    def raise_surface(self, change: Floats) -> LineSamples:
+        """Return the samples at their places on a changed surface.
+
+        Args:
+            change: (2,) of the crown and of the end fall [m].
+        """
+        places = self.points_world.copy()
+        places[:, 2] += self.by_surface @ change
+        return replace(self, points_world=places)
+
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> LineSamples:
         return LineSamples(
             self.points_world[index],
@@ -65,6 +85,9 @@ class LineSamples:
             self.bend_world[index],
             self.ends[index],
             self.shares[index],
+            self.knots[index],
+            self.knot_shares[index],
+            self.by_surface[index],
             self.marking[index],
             self.names,
         )
@@ -79,10 +102,12 @@ class ProjectedLines:
         normals: (n, 2) unit vectors across the projected marking.
         widths: (n,) of the paint across it [px].
         curvatures: (n,) of the projected marking, positive where it turns to its normal [1/px].
-        by_camera: (n, 12) derivatives of a place along its normal by a step of `PARAMETERS`.
-        by_paint: (n, 7) derivatives by the paint's unknowns, per standard deviation: both ends
-            along x, y, z, and a shift of the marking in the image.
-        unknowns: (n, 7) numbers of these; markings that share a point share its error.
+        by_camera: (n, 14) derivatives of a place along its normal by a step of `PARAMETERS`, and by
+            crown and end fall.
+        by_paint: (n, 11) derivatives by the paint's unknowns, per standard deviation: both ends
+            along x, y, z, a shift of the marking in the image, and at two knots its unevenness in
+            height and across the marking.
+        unknowns: (n, 11) numbers of these; markings that share a point share its error.
         visible: (n,) whether the sample is in the image and its paint wide enough.
     """
 
@@ -145,13 +170,34 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
         bend,
         np.array(ends)[marking],
         np.where(curved, [1.0, 0.0], np.stack([1.0 - share, share], axis=-1)),
+        *_place_knots(points, marking, len(samples.names)),
+        pitch.samples_by_surface(spacing),
         marking,
         samples.names,
     )
 
 
+def _place_knots(
+    points: Floats, marking: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.int64], Floats]:
+    """Return the knots (n, 2) on either side of samples, and their linear weights (n, 2)."""
+    knots, weights, first = np.zeros((len(points), 2), np.int64), np.zeros((len(points), 2)), 0
+    for index in range(count):
+        mine = np.flatnonzero(marking == index)
+        steps = np.linalg.norm(np.diff(points[mine, :2], axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        parts = max(1, round(way[-1] / _KNOT_SPACING))
+        place = np.minimum(way / max(way[-1], 1e-9) * parts, parts - 1e-9)
+        before = np.floor(place).astype(np.int64)
+        knots[mine] = first + before[:, None] + [0, 1]
+        weights[mine, 1] = place - before
+        first += parts + 1
+    weights[:, 0] = 1.0 - weights[:, 1]
+    return knots, weights
+
+
 def project_lines(
-    camera: Camera, samples: LineSamples, line_width: float, survey_error: float, shift: float
+    camera: Camera, samples: LineSamples, line_width: float, noise: PaintNoise
 ) -> ProjectedLines:
     """Return samples projected into a camera's image, with derivatives.
 
@@ -159,8 +205,7 @@ def project_lines(
         camera: a single camera.
         samples: of `sample_markings`.
         line_width: of the paint [m].
-        survey_error: of the points that define markings, each axis, standard deviation [m].
-        shift: of a whole marking in the image, standard deviation [px].
+        noise: of the paint.
     """
     points = samples.points_world
     projected = camera.project_with_jacobians(points)
@@ -177,19 +222,31 @@ def project_lines(
         inside = ((image > 0.0) & (image < camera.image_size - 1.0)).all(-1)
         visible = inside & (widths >= _MIN_WIDTH) & np.isfinite(jacobian).all((1, 2))
     curvatures = _curvatures(camera, samples, normals)
-    by_point = survey_error * np.einsum("nij,ni->nj", projected.d_points, normals)
+    by_place = np.einsum("nij,ni->nj", projected.d_points, normals)
+    by_point = noise.points_m * by_place
     moved = (samples.shares[:, :, None] * by_point[:, None]).reshape(len(points), 6)
     axes = (3 * samples.ends[:, :, None] + np.arange(3)).reshape(len(points), 6)
     # Numbers below zero belong to markings, not to points.
     own = -1 - samples.marking[:, None]
+    uneven = noise.unevenness_m * np.stack([by_place[:, 2], side], axis=-1)
+    # Each knot has an unknown in height and one across the marking.
+    knots = FIRST_KNOT - 2 * samples.knots[:, None, :] - np.arange(2)[:, None]
+    by_step_of_camera = np.einsum("ni,nij->nj", normals, jacobian)
     return ProjectedLines(
         image,
         normals,
         widths,
         curvatures,
-        np.einsum("ni,nij->nj", normals, jacobian),
-        np.concatenate([moved, np.full((len(points), 1), shift)], axis=1),
-        np.concatenate([axes, own], axis=1),
+        np.concatenate([by_step_of_camera, by_place[:, 2:] * samples.by_surface], axis=1),
+        np.concatenate(
+            [
+                moved,
+                np.full((len(points), 1), noise.shift_px),
+                (uneven[:, :, None] * samples.knot_shares[:, None]).reshape(len(points), 4),
+            ],
+            axis=1,
+        ),
+        np.concatenate([axes, own, knots.reshape(len(points), 4)], axis=1),
         visible,
     )
 

@@ -7,7 +7,7 @@ their residuals at nearby cameras.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -26,10 +26,10 @@ from worldpose.static_calibration.line_samples import (
     project_lines,
     white_structures,
 )
+from worldpose.static_calibration.paint_noise import PaintNoise, PaintUnknowns, stated_noise
 from worldpose.static_calibration.parameters import (
-    CameraEstimate,
-    project_with_jacobian,
-    step_between,
+    CameraOnPitch,
+    by_step,
     step_camera,
     step_jacobian,
 )
@@ -47,15 +47,19 @@ class Bars:
         samples: (n,) marking samples.
         pixels: (n, 2) positions of the bars [px].
         noise: (n,) across the marking, standard deviation [px].
-        by_paint: (n, 7) derivatives of the marking by the paint's unknowns.
-        unknowns: (n, 7) numbers of these, see `ProjectedLines`.
+        surface: (2,) crown and end fall at the samples [m].
+        by_paint: (n, 11) derivatives of the marking by the paint's unknowns.
+        unknowns: (n, 11) numbers of these, see `ProjectedLines`.
+        paint: noise of the paint.
     """
 
     samples: LineSamples
     pixels: Floats
     noise: Floats
+    surface: Floats
     by_paint: Floats
     unknowns: NDArray[np.int64]
+    paint: PaintNoise
 
     @cached_property
     def _paint(self) -> Floats:
@@ -67,15 +71,31 @@ class Bars:
         columns[count:] = np.eye(len(numbers))
         return np.linalg.qr(columns)[0]
 
-    def whiten_residuals(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return whitened residuals (m,) of markings against bars, and derivatives (m, 12).
+    def whiten_residuals(self, camera: Camera, surface: Floats) -> tuple[Floats, Floats]:
+        """Return whitened residuals (m,) of markings against bars, and derivatives (m, 14).
+
+        Residuals and derivatives are projected off the paint's unknowns and their priors, so that m
+        is larger than the number of bars.
+        """
+        off, moves = self.whiten_raw(camera, surface)
+        both = np.zeros((len(self._paint), 1 + moves.shape[1]))
+        both[: len(off), 0], both[: len(off), 1:] = off, moves
+        both -= self._paint @ (self._paint.T @ both)
+        return both[:, 0], both[:, 1:]
+
+    def whiten_raw(self, camera: Camera, surface: Floats) -> tuple[Floats, Floats]:
+        """Return whitened residuals (n,) against exact paint, and derivatives (n, 14).
 
         Residuals are distances to the nearest point: a marking that slides along itself fits as
-        well as before. Residuals and derivatives are projected off the paint's unknowns and their
-        priors, so that m is larger than the number of bars.
+        well as before.
         """
-        before, after = (camera.project(self.samples.beside(way)) for way in (-_STRIDE, _STRIDE))
-        middle, jacobian = project_with_jacobian(camera, self.samples.points_world)
+        samples = self.samples.raise_surface(surface - self.surface)
+        before, after = (camera.project(samples.beside(way)) for way in (-_STRIDE, _STRIDE))
+        seen = camera.project_with_jacobians(samples.points_world)
+        middle, by_height = seen.points_image, seen.d_points[..., 2:]
+        jacobian = np.concatenate(
+            [by_step(camera, seen), by_height * samples.by_surface[:, None]], axis=-1
+        )
         along, bend = 0.5 * (after - before), after + before - 2.0 * middle
         away = self.pixels - middle
         way = (away * along).sum(-1) / (along**2).sum(-1)
@@ -83,11 +103,7 @@ class Bars:
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         off = ((0.5 * way[:, None] ** 2 * bend - away) * normal).sum(-1)
         moves = np.einsum("ni,nij->nj", normal, jacobian)
-        both = np.zeros((len(self._paint), 1 + moves.shape[1]))
-        both[: len(off), 0], both[: len(off), 1:] = off, moves
-        both[: len(off)] /= self.noise[:, None]
-        both -= self._paint @ (self._paint.T @ both)
-        return both[:, 0], both[:, 1:]
+        return off / self.noise, moves / self.noise[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +116,7 @@ class LineStep:
         residuals: (n,) after subtraction of the paint's unknowns [px].
         weights: (n,) of the robust loss [1].
         spent: degrees of freedom that the fit takes from the samples [1].
+        paint: the paint's unknowns.
     """
 
     step: Floats
@@ -107,6 +124,7 @@ class LineStep:
     residuals: Floats
     weights: Floats
     spent: float
+    paint: PaintUnknowns
 
 
 def adjust(
@@ -159,8 +177,11 @@ def adjust(
         residuals -= (by_paint * solution[free:][index]).sum(axis=1)
     corner = normal[:free, free:]
     information = normal[:free, :free] - corner @ np.linalg.solve(normal[free:, free:], corner.T)
-    spent = float(np.trace(np.linalg.solve(normal, told)))
-    return LineStep(solution[:free], 0.5 * (information + information.T), residuals, weights, spent)
+    spread: Floats = np.linalg.inv(normal)
+    spent = float((spread * told.T).sum())
+    paint = PaintUnknowns(numbers, solution[free:], 1.0 - np.diag(spread)[free:])
+    information = 0.5 * (information + information.T)
+    return LineStep(solution[:free], information, residuals, weights, spent, paint)
 
 
 @compile_kernel
@@ -216,6 +237,17 @@ _NO_WEIGHT: Final = 1e-3
 """Weight up to which a sample is excluded from the result [1]."""
 _READING: Final = 0.05
 """Minimum standard deviation of a fitted bar [px]."""
+_FAINT: Final = 0.5
+"""Strength of a bar below which it is no paint, relative to its marking's median [1]."""
+_SHARP: Final = 1.5
+"""Width of paint from which its middle is as bright as the paint [px]."""
+_BEFORE: Final = PaintNoise(points_m=0.0, unevenness_m=0.02, shift_px=0.0, reading=2.5)
+"""Noise with which the search begins: that of a real pitch on artificial turf."""
+_LITTLE: Final = 1e-3
+"""Weight of the start while the noise is learned [1]."""
+_LEARN_PASSES: Final = 40
+_LEARNED: Final = 0.01
+"""Relative change of the noise at which learning stops [1]."""
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
 _FINE_SCALES: Final = (12.0, 6.0)
 """Decreasing scales of the loss [standard deviations]: outliers lose their influence one by one,
@@ -231,13 +263,20 @@ class MeasuredBars:
 
 
 @dataclass(frozen=True, eq=False)
-class LineFit:
-    """A camera, its samples, their projections, the bars measured there, and the last fit."""
+class MeasuredLines:
+    """A camera, the pitch's surface (2,), samples on it, their projections and the bars there."""
 
     camera: Camera
+    surface: Floats
     samples: LineSamples
     seen: ProjectedLines
     measured: MeasuredBars
+
+
+@dataclass(frozen=True, eq=False)
+class LineFit(MeasuredLines):
+    """The same, and the last step to this camera and surface."""
+
     adjusted: LineStep
 
 
@@ -246,14 +285,17 @@ class LineSearch:
 
     def __init__(
         self,
-        start: CameraEstimate,
+        start: CameraOnPitch,
         pitch: PitchTemplate,
         grey: NDArray[np.uint8],
         survey_error: float,
         settings: LineRefinementSettings,
     ) -> None:
         self.start, self.grey, self.settings = start, grey, settings
-        self.survey_error = survey_error
+        self.least = stated_noise(survey_error, settings.line_shift_px)
+        self.noise = PaintNoise(
+            *(max(pair) for pair in zip(astuple(self.least), astuple(_BEFORE), strict=True))
+        )
         self.whites = white_structures(pitch)
         spread = np.sqrt(np.diag(start.covariance))
         self.free = spread > 0.0
@@ -266,8 +308,7 @@ class LineSearch:
 
     def look(self, camera: Camera, samples: LineSamples) -> ProjectedLines:
         """Return the samples projected into a camera's image."""
-        s = self.settings
-        return project_lines(camera, samples, s.line_width_m, self.survey_error, s.line_shift_px)
+        return project_lines(camera, samples, self.settings.line_width_m, self.noise)
 
     def clear(
         self, camera: Camera, samples: LineSamples, seen: ProjectedLines
@@ -276,9 +317,15 @@ class LineSearch:
         room, half = 0.5 * seen.widths + CLEARANCE, 0.5 * self.settings.line_width_m
         return clear(camera, self.whites, half, seen.places, room, samples.marking)
 
-    def run(self, begin: CameraEstimate, samples: LineSamples) -> LineFit | None:
-        """Return the result of the coarse-to-fine search; None without lines."""
+    def run(self, begin: CameraOnPitch, samples: LineSamples) -> LineFit | None:
+        """Return the result of the coarse-to-fine search; None without lines.
+
+        Args:
+            begin: camera and surface to begin at.
+            samples: of the markings, on that surface.
+        """
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
+        surface = begin.surface
         few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
         found = None
         for left in reversed(range(_MAX_PASSES)):
@@ -286,23 +333,26 @@ class LineSearch:
             seen = self.look(camera, few)
             if seen.visible.sum() < 0.5 * self.settings.min_found:
                 return None
-            reach = self._reach(seen, covariance)
-            fine = left == 0 or bool((reach <= _FINE)[seen.visible].mean() >= _MOSTLY)
+            reach, sure = self._reach(seen, covariance)
+            fine = left == 0 or bool((sure <= _FINE)[seen.visible].mean() >= _MOSTLY)
             if fine:
                 seen = self.look(camera, samples)
                 alone = self.clear(camera, samples, seen)
                 chosen, seen = samples[alone], seen[alone]
-                reach = self._reach(seen, covariance)
+                reach, _ = self._reach(seen, covariance)
             if not seen.visible.any():
                 return None
-            measured = self._measure(seen, reach, fine)
+            measured = self._measure(seen, reach, chosen.marking if fine else None)
             least = self.settings.min_found * len(chosen.marking) / len(samples.marking)
             if np.isfinite(measured.offsets).sum() < max(least, 1.0):
                 return None
-            found = self.converge(camera, chosen, seen, measured, fine)
+            place = MeasuredLines(camera, surface, chosen, seen, measured)
+            found = self.converge(place, fine)
             if fine:
                 break
-            camera = found.camera
+            change = found.surface - surface
+            samples, few = samples.raise_surface(change), few.raise_surface(change)
+            camera, surface = found.camera, found.surface
             covariance = np.asarray(np.linalg.inv(found.adjusted.information))
         return found
 
@@ -312,17 +362,44 @@ class LineSearch:
             np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
         )
         scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)
-        adjusted = self._adjust(found.camera, found.seen, measured, scales)
-        camera = step_camera(found.camera, self._full_step(adjusted.step))
-        return replace(found, camera=camera, measured=measured, adjusted=adjusted)
+        now: MeasuredLines = replace(found, measured=measured)
+        adjusted = self._adjust(now, scales)
+        now = self._step(now, adjusted.step)
+        return LineFit(now.camera, now.surface, now.samples, now.seen, measured, adjusted)
 
-    def distance(self, camera: Camera) -> float:
-        """Return the Mahalanobis distance of a camera from the start."""
-        gone = step_between(self.start.camera, camera)[self.free]
+    def learn_noise(self, found: LineFit) -> LineFit:
+        """Return the fit at the noise that its residuals show; `noise` becomes that noise.
+
+        The camera is free meanwhile: uneven paint must not explain a start that the lines
+        contradict.
+        """
+        own = found.measured.variances / self.noise.reading**2
+        scale = self.settings.loss_scale
+        for _ in range(_LEARN_PASSES):
+            before = self.noise
+            variances = own * before.reading**2
+            now = replace(
+                found,
+                seen=self.look(found.camera, found.samples),
+                measured=replace(found.measured, variances=variances),
+            )
+            adjusted = self._adjust(now, (np.inf, 2.0 * scale, scale), trust=_LITTLE)
+            known = np.isfinite(adjusted.residuals)
+            scaled = (adjusted.residuals / np.sqrt(variances))[known]
+            self.noise = before.update(self.least, adjusted.paint, scaled)
+            if not self.noise.differs_from(before, _LEARNED):
+                break
+        measured = replace(found.measured, variances=own * self.noise.reading**2)
+        seen = self.look(found.camera, found.samples)
+        return self.converge(replace(found, seen=seen, measured=measured), True)
+
+    def distance(self, found: LineFit) -> float:
+        """Return the Mahalanobis distance of a fit from the start."""
+        gone = self.start.step_to(found.camera, found.surface)[self.free]
         return float(np.sqrt(gone @ self.information @ gone))
 
     def covariance(self, found: LineFit) -> Floats:
-        """Return the (12, 12) covariance of a fit."""
+        """Return the (14, 14) covariance of a fit."""
         whole = np.zeros_like(self.start.covariance)
         whole[np.ix_(self.free, self.free)] = np.linalg.inv(found.adjusted.information)
         return np.asarray(0.5 * (whole + whole.T))
@@ -337,46 +414,70 @@ class LineSearch:
             found.samples[used],
             pixels[used],
             np.sqrt(variances),
+            found.surface,
             seen.by_paint[used],
             seen.unknowns[used],
+            self.noise,
         )
 
-    def converge(
-        self,
-        camera: Camera,
-        samples: LineSamples,
-        seen: ProjectedLines,
-        measured: MeasuredBars,
-        fine: bool,
-    ) -> LineFit:
-        """Return the converged fit to bars at fixed pixels."""
-        bars = seen.places + measured.offsets[:, None] * seen.normals
+    def converge(self, at: MeasuredLines, fine: bool) -> LineFit:
+        """Return the converged fit to bars at fixed pixels.
+
+        Args:
+            at: camera, surface, samples and bars to begin at.
+            fine: whether the bars are fitted to a subpixel.
+        """
+        bars = at.seen.places + at.measured.offsets[:, None] * at.seen.normals
         final = (self.settings.loss_scale,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
         for _ in range(_MAX_FITS if fine else 1):
-            adjusted = self._adjust(camera, seen, measured, scales)
+            adjusted = self._adjust(at, scales)
             scales = (
                 2.0 * self.settings.loss_scale,
                 self.settings.loss_scale,
                 self.settings.loss_scale,
             )
-            camera = step_camera(camera, self._full_step(adjusted.step))
-            moved = np.abs(seen.by_camera[:, self.free] @ adjusted.step)[seen.visible]
-            seen = self.look(camera, samples)
-            measured = replace(measured, offsets=((bars - seen.places) * seen.normals).sum(-1))
+            moved = np.abs(at.seen.by_camera[:, self.free] @ adjusted.step)[at.seen.visible]
+            at = self._step(at, adjusted.step)
+            seen = self.look(at.camera, at.samples)
+            offsets = ((bars - seen.places) * seen.normals).sum(-1)
+            at = replace(at, seen=seen, measured=replace(at.measured, offsets=offsets))
             if moved.max(initial=0.0) < _SETTLED:
                 break
-        return LineFit(camera, samples, seen, measured, adjusted)
+        return LineFit(at.camera, at.surface, at.samples, at.seen, at.measured, adjusted)
 
-    def _reach(self, seen: ProjectedLines, covariance: Floats) -> Floats:
-        """Return the search widths (n,) of samples along their normals [px]."""
+    def _step(self, at: MeasuredLines, step: Floats) -> MeasuredLines:
+        """Return camera, surface and samples after a step (f,) of the free parameters."""
+        whole = np.zeros(len(self.free))
+        whole[self.free] = step
+        return replace(
+            at,
+            camera=step_camera(at.camera, whole[:-2]),
+            surface=at.surface + whole[-2:],
+            samples=at.samples.raise_surface(whole[-2:]),
+        )
+
+    def _reach(self, seen: ProjectedLines, covariance: Floats) -> tuple[Floats, Floats]:
+        """Return the search widths (n,) of samples along their normals [px].
+
+        The second ones leave out the paint's own errors, which a search does not reduce.
+        """
         rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
         own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
-        variance = ((rows @ covariance) * rows).sum(-1) + own
-        return np.asarray(3.0 * np.sqrt(variance) + _MIN_REACH)
+        variance = ((rows @ covariance) * rows).sum(-1)
+        whole, camera = 3.0 * np.sqrt(variance + own), 3.0 * np.sqrt(variance)
+        return whole + _MIN_REACH, camera + _MIN_REACH
 
-    def _measure(self, seen: ProjectedLines, reach: Floats, fine: bool) -> MeasuredBars:
-        """Return the bars matched to the samples, to a subpixel (`fine`) or to a pixel."""
+    def _measure(
+        self, seen: ProjectedLines, reach: Floats, marking: Integers | None
+    ) -> MeasuredBars:
+        """Return the bars matched to the samples.
+
+        Args:
+            seen: the samples.
+            reach: (n,) half widths of the search [px].
+            marking: (n,) of the samples, for bars to a subpixel; None = to a pixel.
+        """
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
         limit = max(s.search_px, float(np.quantile(reach[seen.visible], _BEST)))
@@ -384,25 +485,29 @@ class LineSearch:
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
         looked = np.where(usable, reach, -1.0)
         find_bars(self.grey, seen.sections, looked, s.contrast, offsets, strengths)
+        if marking is not None:
+            _drop_faint(offsets, strengths, marking, seen.widths)
         # A candidate's merit grows with its strength and falls with its Mahalanobis distance.
         away = 3.0 * offsets / reach[:, None]
         with np.errstate(divide="ignore"):
             merit = np.where(np.isnan(offsets), -np.inf, np.log(strengths) - 0.5 * away**2)
         best = offsets[np.arange(count), merit.argmax(axis=1)]
-        if not fine:
+        if marking is None:
             return MeasuredBars(best, np.full(count, _COARSE_ERROR**2))
         exact, variances = np.empty(count), np.empty(count)
         fit_bars(self.grey, seen.sections, best, s.contrast, exact, variances)
-        return MeasuredBars(exact, variances + _READING**2)
+        return MeasuredBars(exact, (variances + _READING**2) * self.noise.reading**2)
 
-    def _adjust(
-        self,
-        camera: Camera,
-        seen: ProjectedLines,
-        measured: MeasuredBars,
-        scales: tuple[float, ...],
-    ) -> LineStep:
-        """Return the step from a camera to the best one."""
+    def _adjust(self, at: MeasuredLines, scales: tuple[float, ...], trust: float = 1.0) -> LineStep:
+        """Return the step from a camera to the best one.
+
+        Args:
+            at: camera, surface, samples and bars.
+            scales: of the loss [standard deviations], one per iteration.
+            trust: weight of the start [1].
+        """
+        seen, measured = at.seen, at.measured
+        information, mean = self._prior(at)
         known = np.flatnonzero(seen.visible)
         adjusted = adjust(
             measured.offsets[known],
@@ -410,22 +515,32 @@ class LineSearch:
             np.ascontiguousarray(seen.by_camera[np.ix_(known, np.flatnonzero(self.free))]),
             np.ascontiguousarray(seen.by_paint[known]),
             seen.unknowns[known],
-            self._prior(camera),
+            (trust * information, mean),
             scales,
         )
         residuals, weights = np.full(len(seen.visible), np.nan), np.zeros(len(seen.visible))
         residuals[known], weights[known] = adjusted.residuals, adjusted.weights
         return replace(adjusted, residuals=residuals, weights=weights)
 
-    def _prior(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Return information and mean of the prior on the free parameters' step from `camera`."""
-        gone = step_between(self.start.camera, camera)
+    def _prior(self, at: MeasuredLines) -> tuple[Floats, Floats]:
+        """Return information and mean of the prior on the free parameters' step from a fit."""
+        gone = self.start.step_to(at.camera, at.surface)
         chain = step_jacobian(gone)[np.ix_(self.free, self.free)]
         information: Floats = chain.T @ self.information @ chain
         expected = np.linalg.solve(chain, -gone[self.free])
         return information, np.asarray(expected, dtype=np.float64)
 
-    def _full_step(self, step: Floats) -> Floats:
-        whole = np.zeros(len(self.free))
-        whole[self.free] = step
-        return whole
+
+def _drop_faint(offsets: Floats, strengths: Floats, marking: Integers, widths: Floats) -> None:
+    """Overwrite bars (n, c) with NaN that are far fainter than most of their marking.
+
+    Rough grass has bars as well; paint of one marking is about equally bright along it, and blurred
+    where it is narrower than a pixel.
+    """
+    bright = strengths / np.minimum(widths / _SHARP, 1.0)[:, None]
+    for index in np.unique(marking):
+        mine = marking == index
+        strongest = bright[mine, 0]
+        if (strongest > 0.0).any():
+            faint = bright[mine] < _FAINT * np.median(strongest[strongest > 0.0])
+            offsets[mine] = np.where(faint, np.nan, offsets[mine])

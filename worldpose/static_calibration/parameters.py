@@ -30,6 +30,39 @@ class CameraEstimate:
     covariance: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class CameraOnPitch:
+    """A camera, the surface of the pitch that it sees, and their covariance.
+
+    Attributes:
+        camera: a single camera with square pixels.
+        surface: (2,) crown and end fall of the pitch [m].
+        covariance: (14, 14) of a step of the camera and of the surface; rows and columns of fixed
+            parameters are zero.
+    """
+
+    camera: Camera
+    surface: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @classmethod
+    def on_known_surface(cls, found: CameraEstimate, surface: tuple[float, float]) -> CameraOnPitch:
+        """Return a camera on a pitch whose crown and end fall [m] are known."""
+        size = len(found.covariance)
+        whole = np.zeros((size + 2, size + 2))
+        whole[:size, :size] = found.covariance
+        return cls(found.camera, np.array(surface), whole)
+
+    @property
+    def estimate(self) -> CameraEstimate:
+        """The camera, whose covariance includes the uncertainty of the surface."""
+        return CameraEstimate(self.camera, self.covariance[:-2, :-2])
+
+    def step_to(self, camera: Camera, surface: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (14,) step from here to another camera and surface."""
+        return np.concatenate([step_between(self.camera, camera), surface - self.surface])
+
+
 def step_camera(camera: Camera, step: ArrayLike) -> Camera:
     """Return the camera after a step.
 
@@ -50,7 +83,11 @@ def step_camera(camera: Camera, step: ArrayLike) -> Camera:
 
 
 def step_jacobian(gone: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivative (12, 12) of a step (12,) by a further step after it."""
+    """Return the derivative (n, n) of a step by a further step after it.
+
+    Args:
+        gone: (n,) the step: of a camera, or of a camera and the surface of the pitch.
+    """
     chain = np.eye(len(gone))
     x, y, z = gone[3:6]
     # A further rotation also rotates the translation so far.

@@ -319,7 +319,9 @@ def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]
     """
     report = calibration.report
     mahalanobis = np.array([p.mahalanobis for p in report.points], dtype=np.float64)
+    venue = None if report.lines is None else report.lines.venue
     return {
+        **({} if venue is None else venue.to_arrays()),
         **camera_arrays(calibration.estimate.camera),
         "covariance": calibration.estimate.covariance,
         "point_pixel": np.array([p.pixel for p in report.points]).reshape(-1, 2),

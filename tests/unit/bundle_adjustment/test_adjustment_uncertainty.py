@@ -10,6 +10,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import step_camera
 from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
 from worldpose.static_calibration.line_search import adjust
+from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 SURVEY_ERROR = 0.006
 
@@ -44,13 +45,14 @@ def test_a_survey_that_is_off_as_a_whole_takes_its_cameras_along(lined):
     # Cameras that know nothing but the lines: what all points have in common goes into them whole.
     pitch, free = lined.pitch, np.diag(lined.covariance[0]) > 0.0
     samples = sample_markings(pitch, 0.25)
+    noise = replace(EXACT_PAINT, points_m=SURVEY_ERROR, shift_px=0.05)
     for c in range(3):
-        seen = project_lines(lined.cameras[c], samples, 0.12, SURVEY_ERROR, 0.05)
+        seen = project_lines(lined.cameras[c], samples, 0.12, noise)
         seen = seen[thin_samples(seen, samples, 8.0, 700)]
         fitted = adjust(
             np.zeros(len(seen.places)),
             np.full(len(seen.places), 0.01),
-            np.ascontiguousarray(seen.by_camera[:, free]),
+            np.ascontiguousarray(seen.by_camera[:, :12][:, free]),
             seen.by_paint,
             seen.unknowns,
             (np.zeros((free.sum(), free.sum())), np.zeros(free.sum())),

@@ -317,7 +317,7 @@ BEND = 0.2 / 34.0**2
 def look(start, at):
     """Return colour and distance [m] of the surface seen from `start` in the direction of `at`."""
     way = np.array(at, dtype=float) - start
-    *color, steps = scenery(np.array(start, dtype=float), *way, HALF, BEND, 3)
+    *color, steps = scenery(np.array(start, dtype=float), *way, HALF, np.array([0.0, BEND]), 3)
     return color, steps * np.linalg.norm(way)
 
 

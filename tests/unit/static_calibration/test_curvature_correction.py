@@ -1,22 +1,32 @@
 """Cameras of clicks and lines that leave distance and focal length nearly open."""
 
+from dataclasses import replace
+
 import clicking_people as people
 import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
+from worldpose.pitch.surface import Surface
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
-from worldpose.static_calibration.curvature_correction import ClicksAndBars, fit_with_curvature
+from worldpose.static_calibration.curvature_correction import (
+    ClicksAndBars,
+    fit_with_curvature,
+    free_on_pitch,
+)
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.line_samples import project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
+from worldpose.static_calibration.paint_noise import PaintNoise
 from worldpose.static_calibration.parameters import step_camera
 
 SETTINGS = StaticCalibrationSettings()
+NOISE = PaintNoise(0.006, 0.001, 0.05, 1.0)
+HERE = np.array([people.PITCH.crown, people.PITCH.end_fall])
 
 
 def corner_camera():
@@ -32,27 +42,30 @@ def evidence(camera, noise=0.02):
         gather_evidence(people.PITCH, clicked, people.SIZE, 0.5, "test"), people.SIZE, SETTINGS
     )
     samples = sample_markings(people.PITCH, 0.5)
-    seen = project_lines(camera, samples, 0.12, 0.006, 0.05)
+    seen = project_lines(camera, samples, 0.12, NOISE)
     here = seen.visible
     bars = Bars(
         samples[here],
         seen.places[here],
         np.full(int(here.sum()), noise),
+        HERE,
         seen.by_paint[here],
         seen.unknowns[here],
+        NOISE,
     )
-    return ClicksAndBars(problem, 1.0, bars)
+    return ClicksAndBars(problem, 1.0, bars, Surface.of(people.PITCH))
 
 
 def test_derivatives_are_those_of_the_residuals():
     camera = corner_camera()
     given = evidence(camera)
-    _, rows = given.residuals(camera)
-    for column, parameter in enumerate(np.flatnonzero(given.problem.free)):
-        step = np.zeros(12)
+    _, rows = given.residuals(camera, HERE)
+    for column, parameter in enumerate(np.flatnonzero(free_on_pitch(given.problem))):
+        step = np.zeros(14)
         step[parameter] = 1e-5 if parameter in (0, 1, 2, 6) else 1e-3
         ahead, behind = (
-            given.residuals(step_camera(camera, sign * step))[0] for sign in (1.0, -1.0)
+            given.residuals(step_camera(camera, sign * step[:12]), HERE + sign * step[12:])[0]
+            for sign in (1.0, -1.0)
         )
         slope = (ahead - behind) / (2.0 * step[parameter])
         # Exact bars: residuals are zero, and so is what the turning normals would add.
@@ -64,14 +77,8 @@ def test_bars_slide_along_their_line_for_nothing():
     camera = corner_camera()
     bars = evidence(camera).bars
     arc = bars.samples.bend_world.any(axis=1)
-    moved = Bars(
-        bars.samples,
-        camera.project(bars.samples.beside(0.4)),
-        bars.noise,
-        bars.by_paint,
-        bars.unknowns,
-    )
-    off = np.abs(moved.whiten_residuals(camera)[0][: len(arc)]) * bars.noise
+    moved = replace(bars, pixels=camera.project(bars.samples.beside(0.4)))
+    off = np.abs(moved.whiten_residuals(camera, HERE)[0][: len(arc)]) * bars.noise
     # Forty centimetres are 25 px; lenses bend by a hundredth of a pixel on the way.
     assert off[~arc].max() < 0.02
 
@@ -79,45 +86,39 @@ def test_bars_slide_along_their_line_for_nothing():
 def test_shared_survey_is_taken_off_once():
     camera = corner_camera()
     bars = evidence(camera).bars
-    off, _ = bars.whiten_residuals(camera)
+    off, _ = bars.whiten_residuals(camera, HERE)
     assert np.abs(off).max() < 1e-9
     # A surveyed point that is two deviations off costs four, however many samples show it.
     point = bars.unknowns[0, 1]
     shift = 2.0 * np.where(bars.unknowns == point, bars.by_paint, 0.0).sum(axis=1)
-    seen = project_lines(camera, bars.samples, 0.12, 0.006, 0.05)
-    other = Bars(
-        bars.samples,
-        bars.pixels + shift[:, None] * seen.normals,
-        bars.noise,
-        bars.by_paint,
-        bars.unknowns,
-    )
-    cost = float((other.whiten_residuals(camera)[0] ** 2).sum())
+    seen = project_lines(camera, bars.samples, 0.12, NOISE)
+    other = replace(bars, pixels=bars.pixels + shift[:, None] * seen.normals)
+    cost = float((other.whiten_residuals(camera, HERE)[0] ** 2).sum())
     assert 0.0 < cost <= 4.0 + 1e-6
 
 
 def test_best_camera_is_found_from_metres_away():
     camera = corner_camera()
     given = evidence(camera)
-    best = given.fit(camera)
+    best = given.fit(camera, HERE)
     step = np.zeros(12)
     step[5], step[6] = 0.5, 0.01  # half a metre back, a hundredth longer
-    again = given.fit(step_camera(camera, step))
-    lowest = float((given.residuals(best)[0] ** 2).sum())
+    again = given.fit(step_camera(camera, step), HERE)
+    lowest = float((given.residuals(*best)[0] ** 2).sum())
     # A hundredth of a deviation ends the search.
-    assert float((given.residuals(again)[0] ** 2).sum()) == pytest.approx(lowest, abs=1e-3)
+    assert float((given.residuals(*again)[0] ** 2).sum()) == pytest.approx(lowest, abs=1e-3)
 
 
 def test_valley_widens_the_covariance_and_is_the_same_each_time():
     camera = corner_camera()
     given = evidence(camera)
-    wide = fit_with_curvature(given.problem, camera, given.bars, 1.0)
-    free = np.flatnonzero(given.problem.free)
-    rows = given.residuals(wide.camera)[1]
+    wide = fit_with_curvature(given, camera)
+    free = np.flatnonzero(free_on_pitch(given.problem))
+    rows = given.residuals(wide.camera, wide.surface)[1]
     added = wide.covariance[np.ix_(free, free)] - np.linalg.inv(rows.T @ rows)
     size = np.sqrt(np.diag(wide.covariance)[free])
     assert np.linalg.eigvalsh(added / np.outer(size, size)).min() > -1e-6
-    again = fit_with_curvature(given.problem, camera, given.bars, 1.0)
+    again = fit_with_curvature(given, camera)
     assert (again.covariance == wide.covariance).all()
     assert (camera_row(again.camera) == camera_row(wide.camera)).all()
 

@@ -22,7 +22,13 @@ from worldpose.static_calibration.line_samples import (
     white_structures,
 )
 from worldpose.static_calibration.line_search import LineSearch, adjust
-from worldpose.static_calibration.parameters import CameraEstimate, step_between, step_camera
+from worldpose.static_calibration.paint_noise import EXACT_PAINT, PaintNoise
+from worldpose.static_calibration.parameters import (
+    CameraEstimate,
+    CameraOnPitch,
+    step_between,
+    step_camera,
+)
 from worldpose.static_calibration.settings import LineRefinementSettings
 
 PITCH = PitchTemplate.standard()
@@ -63,7 +69,14 @@ def start(seed, factor=1.0, true=None):
     """Return the true camera with a random error drawn from the returned covariance."""
     spread = factor * SPREAD
     step = spread * np.random.default_rng(seed).standard_normal(12)
-    return CameraEstimate(step_camera(true or camera(), step), np.diag(spread**2))
+    return on_pitch(step_camera(true or camera(), step), np.diag(spread**2))
+
+
+def on_pitch(view, covariance):
+    """Return a camera with a covariance (12, 12) on the pitch, whose surface is known."""
+    return CameraOnPitch.on_known_surface(
+        CameraEstimate(view, covariance), (PITCH.crown, PITCH.end_fall)
+    )
 
 
 def line_error(estimate, true=None):
@@ -125,7 +138,7 @@ def test_empty_picture_keeps_the_start_and_says_why(level):
 
 def test_view_without_markings_says_so():
     away = replace(camera(), cam_from_world=camera(aim=(-20.0, -200.0, 60.0)).cam_from_world)
-    first = CameraEstimate(away, np.diag(SPREAD**2))
+    first = on_pitch(away, np.diag(SPREAD**2))
     assert "no painted line" in refine_on_lines(first, PITCH, picture()).reason
 
 
@@ -140,7 +153,7 @@ def test_samples_that_all_lie_on_other_paint_give_no_lines():
 
 
 def test_lines_that_contradict_the_start_are_refused():
-    sure = CameraEstimate(start(1).camera, np.diag((0.02 * SPREAD) ** 2))
+    sure = on_pitch(start(1).camera, np.diag((0.02 * SPREAD) ** 2))
     found = refine_on_lines(sure, PITCH, picture(), survey_error=EXACT)
     assert not found.refined
     assert found.estimate is sure
@@ -153,10 +166,10 @@ def test_picture_of_another_size_is_refused():
 
 def test_parameters_without_variance_stay_as_they_are():
     first = start(2)
-    covariance = first.covariance.copy()
+    covariance = first.estimate.covariance.copy()
     covariance[7:9] = covariance[:, 7:9] = 0.0
     found = refine_on_lines(
-        CameraEstimate(first.camera, covariance), PITCH, picture(), survey_error=EXACT
+        on_pitch(first.camera, covariance), PITCH, picture(), survey_error=EXACT
     )
     assert (found.estimate.camera.principal_point == first.camera.principal_point).all()
     assert (found.estimate.covariance[7:9] == 0.0).all()
@@ -188,7 +201,7 @@ def test_survey_that_is_off_is_told_by_its_setting():
 def test_derivatives_of_samples_are_those_of_projection():
     view = camera()
     samples = sample_markings(PITCH, 1.0)
-    seen = project_lines(view, samples, 0.12, 1.0, 1.0)
+    seen = project_lines(view, samples, 0.12, PaintNoise(1.0, 0.0, 1.0, 1.0))
     for parameter in range(12):
         step = np.zeros(12)
         step[parameter] = 1e-6 if parameter < 7 else 1e-4
@@ -204,7 +217,7 @@ def test_derivatives_of_samples_are_those_of_projection():
 def test_paint_moves_as_its_surveyed_points_do():
     spec, view = PitchSpec(), camera()
     samples = sample_markings(PITCH, 1.0)
-    seen = project_lines(view, samples, 0.12, 1.0, 1.0)
+    seen = project_lines(view, samples, 0.12, PaintNoise(1.0, 0.0, 1.0, 1.0))
     names = list(PITCH.points)
     # A corner holds one end of two lines, the centre mark an arc.
     for point in ("penalty_area_left_near_front", "penalty_mark_left"):
@@ -225,7 +238,7 @@ def test_paint_moves_as_its_surveyed_points_do():
 def test_curvature_is_that_of_the_projected_arc():
     view = camera()
     samples = sample_markings(PITCH, 0.1)
-    seen = project_lines(view, samples, 0.12, 0.0, 0.0)
+    seen = project_lines(view, samples, 0.12, EXACT_PAINT)
     arc = seen.visible & (samples.marking == samples.names.index("penalty_arc_left"))
     index = np.flatnonzero(arc)[5:-5:20]
     assert len(index) > 3
@@ -249,7 +262,7 @@ def test_samples_near_other_markings_and_the_goal_are_left_out():
         cam_from_world=look_at(np.array([-68.0, 3.0, 9.28]), np.array([-44.0, 0.0, 0.0]), 0.0),
     )
     samples = sample_markings(PITCH, 0.2)
-    seen = project_lines(view, samples, 0.12, 0.0, 0.0)
+    seen = project_lines(view, samples, 0.12, EXACT_PAINT)
     alone = clear(
         view, white_structures(PITCH), 0.06, seen.places, 0.5 * seen.widths + 4.0, samples.marking
     )
