@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
+from itertools import pairwise
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
@@ -71,6 +75,29 @@ PersonId = Annotated[int, Field(ge=0, le=FRAME_LIMIT)]
 class Record(BaseModel):
     """A frozen record that refuses unknown keys, NaN and infinity."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def field_docstrings(record: type[BaseModel]) -> dict[str, str]:
+    """Return the docstring of each field that has one, by the field's name.
+
+    Pydantic can read them too, but does so while each class is created: parsing the sources of all
+    records took every process of a run 0.4 s of CPU time.
+    """
+    found: dict[str, str] = {}
+    for base in reversed(record.__mro__):
+        if not issubclass(base, Record):
+            continue
+        (node,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(node, ast.ClassDef)
+        for field, after in pairwise(node.body):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and field.target.id in record.model_fields
+                and isinstance(after, ast.Expr)
+                and isinstance(after.value, ast.Constant)
+                and isinstance(after.value.value, str)
+            ):
+                found[field.target.id] = inspect.cleandoc(after.value.value)
+    return found

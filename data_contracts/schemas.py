@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import ModelSchema
+
 from data_contracts.arrays import GroupLayout
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrames
@@ -24,7 +27,7 @@ from data_contracts.ingest import INGEST
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pin import Pin
 from data_contracts.pitch import PitchSpec
-from data_contracts.records import Record
+from data_contracts.records import Record, field_docstrings
 from data_contracts.redetection import REDETECTION
 from data_contracts.refitting import REFITTING
 from data_contracts.release import (
@@ -89,10 +92,22 @@ LAYOUTS: tuple[GroupLayout, ...] = (
 )
 
 
+class DescribedFields(GenerateJsonSchema):
+    """JSON Schemas whose fields are described by their docstrings."""
+
+    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
+        """Return the schema of one record."""
+        made = super().model_schema(schema)
+        for name, text in field_docstrings(schema["cls"]).items():
+            made["properties"][name].setdefault("description", text)
+        return made
+
+
 def documents() -> dict[str, Any]:
     """Every generated document by file name: schemas, array layouts, conventions."""
     schemas = {
-        f"{name}.schema.json": record.model_json_schema() for name, record in RECORDS.items()
+        f"{name}.schema.json": record.model_json_schema(schema_generator=DescribedFields)
+        for name, record in RECORDS.items()
     }
     return schemas | {
         "arrays.json": [layout.model_dump(mode="json") for layout in LAYOUTS],

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 import worldpose
+from data_contracts.records import field_docstrings
 from flows.cli.app import COMMANDS, app
 from flows.method import METHOD
 from flows.stage import Stage
@@ -59,8 +60,9 @@ def stage_settings(stage: Stage) -> Iterator[str]:
     yield "| setting | default | meaning |"
     yield "| --- | --- | --- |"
     defaults = stage.settings().model_dump(mode="json")
-    for name, field in stage.settings.model_fields.items():
-        meaning = " ".join((field.description or "").split()).replace("|", "\\|")
+    described = field_docstrings(stage.settings)
+    for name in stage.settings.model_fields:
+        meaning = " ".join(described.get(name, "").split()).replace("|", "\\|")
         yield f"| `{name}` | `{json.dumps(defaults[name])}` | {meaning} |"
 
 

@@ -7,11 +7,15 @@ import threading
 import urllib.request
 from pathlib import Path
 
+import command_line
 import pytest
 from command_line import succeed
 from hypothesis import settings
 
-from flows.orchestration.prefect_environment import prefect_server
+from flows.orchestration.prefect_environment import local_cluster_options, prefect_server
+
+STAGES = ("ingest", "static_calibration", "tracking", "triangulation", "body_fitting", "filtering")
+"""Some of the stages, which import most of the others' modules."""
 
 # How long a case takes says how busy a machine is.
 settings.register_profile("untimed", deadline=None)
@@ -20,12 +24,26 @@ settings.load_profile("untimed")
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory):
-    """The address of one Prefect API for all tests that do not test starting one."""
+    """The address of one Prefect API for all tests that do not test starting one.
+
+    Their runs compute on one standing Dask worker.
+    """
+    from distributed import LocalCluster  # late: many test runs need no cluster
+
     before = dict(os.environ)
     home = str(tmp_path_factory.mktemp("prefect"))
-    with prefect_server(home, is_local=True) as wait_until_ready:
+    options = {**local_cluster_options(1), "host": "127.0.0.1"}
+    stages = [f"tasks.{name}" for name in STAGES]
+    options["preload"] = ["tasks.preload", "prefect_dask", *stages, "flows.match"]
+    with (
+        prefect_server(home, is_local=True) as wait_until_ready,
+        LocalCluster(**options) as cluster,
+    ):
         wait_until_ready()
+        around = command_line.surroundings()
+        command_line.shared.update(dask=cluster.scheduler_address, surroundings=around)
         yield os.environ["PREFECT_API_URL"]
+        command_line.shared.clear()
     os.environ.clear()
     os.environ.update(before)
 

@@ -12,6 +12,7 @@ from typing import Annotated, get_args
 import typer
 from pydantic import JsonValue
 
+from data_contracts.records import field_docstrings
 from data_contracts.run import GatePolicy, RunRecord
 from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
@@ -167,10 +168,11 @@ def _print_settings(as_json: bool) -> None:
         (
             f"{stage.name}.{name}",
             json.dumps(stage.settings().model_dump(mode="json")[name]),
-            " ".join((field.description or "").split()),
+            " ".join(described.get(name, "").split()),
         )
         for stage in METHOD
-        for name, field in stage.settings.model_fields.items()
+        for described in [field_docstrings(stage.settings)]
+        for name in stage.settings.model_fields
     ]
     if as_json:
         print_json(

@@ -14,9 +14,6 @@ from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from worldpose.formats import whole_file
-from worldpose.store.blobs import storage_errors
-
 DATABASE = "prefect.db"
 """In PREFECT_HOME."""
 
@@ -30,6 +27,10 @@ def begin_database(home: Path) -> bool:
     Raises:
         StoreError: `home` is not writable.
     """
+    # Imported here and below: with them, the server's process would import numba and scipy.
+    from worldpose.formats import whole_file
+    from worldpose.store.blobs import storage_errors
+
     kept = kept_database()
     if (home / DATABASE).exists():
         return False
@@ -45,6 +46,8 @@ def begin_database(home: Path) -> bool:
 
 def keep_database(home: Path) -> None:
     """Keep a copy of the unused database that a server has created in `home`."""
+    from worldpose.formats import whole_file
+
     if not (home / DATABASE).exists():
         return  # the environment names another database
     # If the cache is not writable, every project creates its own.

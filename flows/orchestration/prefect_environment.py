@@ -29,7 +29,6 @@ import certifi
 
 from flows.orchestration.prefect_database import begin_database, keep_database
 from worldpose.errors import InputError, WorldposeError
-from worldpose.store.blobs import storage_errors
 
 START_SECONDS = 120.0
 """The very first start creates Prefect's database, which took 15 s on two busy cores."""
@@ -226,6 +225,8 @@ def _home(project: str, scratch: Path) -> Iterator[Path]:
     While another run of the project uses that folder, or on object storage, it is a temporary one:
     two servers that create one database at once destroy it.
     """
+    from worldpose.store.blobs import storage_errors  # the server's process needs none
+
     if "://" in project:
         yield scratch
         return

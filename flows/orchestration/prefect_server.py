@@ -51,6 +51,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     gc.disable()
     from prefect.server.api.server import create_app
 
+    gc.freeze()  # Prefect collects while it creates the app
     app = create_app(ephemeral=is_embedded, final=True)
     gc.freeze()
     gc.enable()
