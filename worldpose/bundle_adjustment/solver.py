@@ -86,7 +86,6 @@ class Solution:
         offset: (cameras, 12) steps from the problem's cameras to these.
         points: (points, 3) [m], world.
         cost: robust sum of squares with priors.
-        start_cost: the same at the start.
         iterations: number of steps tried.
         converged: whether the last step gained less than `min_cost_change`.
         camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
@@ -97,7 +96,6 @@ class Solution:
     offset: Floats
     points: Floats
     cost: float
-    start_cost: float
     iterations: int
     converged: bool
     camera_covariance: Floats
@@ -154,7 +152,6 @@ def solve(
         offset=last.offset,
         points=last.points,
         cost=last.cost,
-        start_cost=start.cost,
         iterations=found.iterations,
         converged=found.converged,
         camera_covariance=spread,

@@ -208,7 +208,6 @@ class Agreement:
     view: str
     source: str
     median_px: float
-    p95_px: float
     count: int
     height_px: float
     """Median height of a person's 2D."""
@@ -268,12 +267,10 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
         if found is not None:
             explains, best = True, found[0]
             least = _median(_errors(source.points, view.rows, sample, best))
-    finite = errors[np.isfinite(errors)]
     return Agreement(
         view=view.name,
         source=source.name,
         median_px=shipped,
-        p95_px=float(np.quantile(finite, 0.95)) if len(finite) == len(errors) else np.inf,
         count=len(errors),
         height_px=height,
         fault=best if explains else SOUND,

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
 from worldpose.evaluation.alignment import align
@@ -77,10 +76,6 @@ def correct_limbs(
     length = np.linalg.norm(true_ends[..., 0, :] - true_ends[..., 1, :], axis=-1)
     correct: NDArray[np.bool_] = error <= alpha * length
     return correct
-
-
-LIMB_JOINTS: Final = COCO17[5:]
-"""Shoulders, elbows, wrists, hips, knees and ankles, left before right."""
 
 
 def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
