@@ -13,7 +13,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from importlib.metadata import entry_points
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from opentelemetry import trace
+    from opentelemetry.context import Context
 
 LOG: Final = logging.getLogger("worldpose.run")
 ENDPOINTS: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
@@ -34,8 +38,9 @@ def start_tracing() -> None:
     """Export the spans of this process from now on; a second call does nothing."""
     if not is_traced():
         return
+    from opentelemetry import trace
+
     try:
-        from opentelemetry import trace
         from opentelemetry.sdk.trace import TracerProvider
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError:
@@ -45,6 +50,8 @@ def start_tracing() -> None:
         return
     os.environ.setdefault("OTEL_SERVICE_NAME", "worldpose")
     provider = TracerProvider()
+    get_tracer = provider.get_tracer
+    provider.get_tracer = lambda *given, **named: _FlowTracer(get_tracer(*given, **named))
     for name in os.environ.get("OTEL_TRACES_EXPORTER", "otlp").split(","):
         asked = name.strip() or "otlp"
         if asked == "otlp":
@@ -56,6 +63,37 @@ def start_tracing() -> None:
             continue
         provider.add_span_processor(BatchSpanProcessor(found[0].load()()))
     trace.set_tracer_provider(provider)
+
+
+class _FlowTracer:
+    """Tracer that puts a span without a parent below the flow run of the current context.
+
+    On a worker, Prefect takes a task for its own parent, and would begin a trace for each.
+    """
+
+    def __init__(self, tracer: trace.Tracer) -> None:
+        self._tracer = tracer
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the tracer has
+        return getattr(self._tracer, name)
+
+    def start_span(
+        self,
+        name: str,
+        context: Context | None = None,
+        **given: Any,  # noqa: ANN401
+    ) -> trace.Span:
+        """Start a span."""
+        from opentelemetry import propagate, trace
+        from prefect.context import FlowRunContext
+
+        flow = FlowRunContext.get()
+        has_parent = context is not None or trace.get_current_span().get_span_context().is_valid
+        if not has_parent and flow is not None and flow.flow_run is not None:
+            label = flow.flow_run.labels.get("__OTEL_TRACEPARENT")
+            if label is not None:
+                context = propagate.extract({"traceparent": str(label)})
+        return self._tracer.start_span(name, context=context, **given)
 
 
 def flush_spans() -> None:

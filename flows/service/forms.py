@@ -51,6 +51,8 @@ def _type_field(name: str, field: dict[str, Any]) -> dict[str, Any]:
     if field.get("default", "") is None:
         del field["default"]
     field["title"] = name.removesuffix("_id").replace("_", " ").capitalize()
+    about = str(field.get("description", ""))
+    field["description"] = about[:1].upper() + about[1:]
     return _offer(field, CHOICES[name]) if name in CHOICES else field
 
 

@@ -81,9 +81,13 @@ await prefect.waitForURL(/deployment\/[-0-9a-f]+/);
 await shot(prefect, "deployment");
 await prefect.getByRole("button", { name: "Run", exact: true }).click();
 await prefect.getByText("Custom run").click();
-for (const [name, value] of Object.entries(task.release)) {
-  await prefect.locator(`xpath=//label[normalize-space()="${name}"]/following::textarea[1]`).fill(value);
-}
+// The form offers the registered matches; its list opens by keyboard.
+const field = (name, kind) => prefect.locator(`xpath=//label[normalize-space()="${name}"]/following::${kind}[1]`);
+await field("Match", 'button[contains(@class,"p-select-button__control")]').focus();
+await prefect.keyboard.press("Space");
+await prefect.getByRole("option", { name: task.match, exact: true }).click();
+await field("Name", "textarea").fill(task.release.name);
+await field("Licence", "textarea").fill(task.release.licence);
 await shot(prefect, "custom_run");
 await prefect.getByRole("button", { name: "Submit" }).click();
 await prefect.waitForURL(/deployment\/[-0-9a-f]+\?/);

@@ -27,7 +27,7 @@ def test_a_match_goes_from_the_inbox_to_its_release_in_a_browser(served, tmp_pat
         "token": TOKEN,
         "login": served.secret("prefect"),
         "match": MATCH,
-        "release": {"match_id": MATCH, "name": "v1", "licence": "for tests"},
+        "release": {"name": "v1", "licence": "for tests"},
         "report": str(released / "v1-report.html"),
         "patience": 1500,
     }
