@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 
 from data_contracts.run import ResultManifest, RunRecord
-from flows.registering import register
-from worldpose.store import Store
+from worldpose.ingest import read_match, register_match
+from worldpose.store import Store, recipe_key
 from worldpose.store.documents import seal
 
 
@@ -17,7 +17,6 @@ def copy_match(project, match_id, count):
     The copies have the folders, runs and metrics of the match, and none of its arrays.
     """
     store = Store.open(str(project))
-    project = Path(project)
     folder = Path(store.registration(match_id).folder)
     for number in range(count):
         name = f"{match_id}-copy{number:03d}"
@@ -29,14 +28,35 @@ def copy_match(project, match_id, count):
         (other / "pitch.json").write_text(json.dumps(pitch, indent=number + 1))  # its own digest
         for file in ("match.yaml", "pitch.json"):
             os.utime(other / file, (1e9, 1e9))  # a file that has just changed is read again later
-        register(store, other, unfinished=True)
-        for kind, record in (("runs", RunRecord), ("results", ResultManifest)):
-            for file in (project / kind / match_id).rglob("*.json"):
-                if kind == "results" and file.name != "manifest.json":
-                    continue
-                content = json.loads(file.read_text().replace(f'"{match_id}"', f'"{name}"'))
-                if "checksum" not in record.model_fields:
-                    del content["checksum"]
-                copied = project / kind / name / file.relative_to(project / kind / match_id)
-                copied.parent.mkdir(parents=True, exist_ok=True)
-                copied.write_bytes(seal(record.model_validate(content)))
+        store.register(register_match(read_match(other), None))
+        copy_results(Path(project), match_id, name)
+
+
+def copy_results(project, match_id, name):
+    """Copy run records and manifests; a result's key depends on the match."""
+    keys = {}
+    for file in (project / "results" / match_id).rglob("manifest.json"):
+        manifest = renamed(ResultManifest, file.read_text(), match_id, name)
+        key = keys[file.parent.name] = recipe_key(manifest.recipe)
+        place = file.parent.parent.relative_to(project / "results" / match_id)
+        write(
+            project / "results" / name / place / key / "manifest.json",
+            manifest.model_copy(update={"key": key}),
+        )
+    for file in (project / "runs" / match_id).glob("*.json"):
+        text = file.read_text()
+        for before, key in keys.items():
+            text = text.replace(before, key)
+        write(project / "runs" / name / file.name, renamed(RunRecord, text, match_id, name))
+
+
+def renamed(record, text, match_id, name):
+    content = json.loads(text.replace(f'"{match_id}"', f'"{name}"'))
+    if "checksum" not in record.model_fields:
+        del content["checksum"]
+    return record.model_validate(content)
+
+
+def write(file, record):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(seal(record))

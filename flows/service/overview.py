@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Final, Literal
 
 from data_contracts.review import ReviewRecord, ReviewRequest
 from data_contracts.run import ResultManifest, RunRecord
@@ -19,6 +21,10 @@ from worldpose.store import Store
 
 UnitState = Literal["done", "waiting", "failed", "blocked"]
 
+ALWAYS_READ: Final = 4
+"""Matches that every look reads."""
+REREAD_SECONDS: Final = 60.0
+"""Age at which a status is read again without a change: a file can be damaged."""
 BODIES = "body_fitting"
 """The stage whose bodies count as the poses of a project."""
 
@@ -58,6 +64,7 @@ class MatchStatus:
         at_work_since: start of a run that has not ended.
         stages: stage to its units, in the order of the method.
         problem: why its status is not readable.
+        is_unseen: whether it was not read yet.
     """
 
     match_id: str
@@ -65,10 +72,13 @@ class MatchStatus:
     at_work_since: datetime | None = None
     stages: Mapping[str, tuple[UnitSummary, ...]] = field(default_factory=dict)
     problem: str = ""
+    is_unseen: bool = False
 
     @property
     def state(self) -> str:
         """The latest run's state, or the state before the first run."""
+        if self.is_unseen:
+            return "being read"
         if self.problem:
             return "unreadable"
         if self.at_work_since is not None:
@@ -95,16 +105,31 @@ class Overview:
         self.store = store
         self._manifests: dict[tuple[str, str, str], ResultManifest] = {}
         self._poses: dict[tuple[str, str], tuple[datetime, float]] = {}
+        self._known: dict[str, tuple[object, MatchStatus]] = {}
+        self._read_at: dict[str, float] = {}
+        self._seen_at: dict[str, float] = {}
 
-    def look(self) -> list[MatchStatus]:
-        """Return the status of every match; an unreadable match does not affect others."""
-        glances = []
-        for match_id in self.store.matches():
+    def look(self, budget: float = math.inf) -> list[MatchStatus]:
+        """Return the status of every match; an unreadable match does not affect others.
+
+        Args:
+            budget: time after which no further match is read [s]; at least `ALWAYS_READ` are, those
+                first that were not read for longest. The others have their last status.
+        """
+        names = self.store.matches()
+        begun = time.monotonic()
+        oldest = sorted(names, key=lambda name: self._seen_at.get(name, 0.0))
+        for number, match_id in enumerate(oldest):
+            if number >= ALWAYS_READ and time.monotonic() - begun > budget:
+                break
             try:
-                glances.append(self._match(match_id))
+                self._match(match_id)
             except (OSError, WorldposeError) as error:
-                glances.append(MatchStatus(match_id, problem=str(error)))
-        return glances
+                self._known[match_id] = (None, MatchStatus(match_id, problem=str(error)))
+            self._seen_at[match_id] = time.monotonic()
+        unseen = (None, None)
+        found = [(name, self._known.get(name, unseen)[1]) for name in names]
+        return [status or MatchStatus(name, is_unseen=True) for name, status in found]
 
     def poses(self) -> list[tuple[datetime, float]]:
         """Return for each run of any match its end and the number of fitted bodies."""
@@ -119,7 +144,18 @@ class Overview:
         self._poses = found
         return list(found.values())
 
-    def _match(self, match_id: str) -> MatchStatus:
+    def _match(self, match_id: str) -> None:
+        """Read the status of a match again after a new run or journal entry, or when it is old."""
+        begun = self.store.unfinished_runs(match_id)
+        journal = read_journal(self.store, match_id)
+        stamp = (journal.last, self.store.runs(match_id), tuple(each.run_id for each in begun))
+        known, last, now = self._known.get(match_id), self._read_at, time.monotonic()
+        is_old = now - last.get(match_id, -math.inf) > REREAD_SECONDS
+        if known is None or known[0] != stamp or is_old:
+            self._known[match_id] = (stamp, self._read(match_id))
+            last[match_id] = now
+
+    def _read(self, match_id: str) -> MatchStatus:
         latest = latest_run(self.store, match_id)
         begun = self.store.unfinished_runs(match_id)
         last = "" if latest is None else latest.run_id

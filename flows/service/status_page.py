@@ -19,9 +19,16 @@ from flows.progress import in_short
 from flows.service.layout import served_state
 from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.web.app_context import PageContext
+from flows.web.browser_words import in_browser
 
 WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
 REFRESH_SECONDS: Final = 15
+UNSEEN_SECONDS: Final = 1
+"""Until the page asks for the matches that the server has not read yet."""
+BUDGET_SECONDS: Final = 0.25
+"""Time that one request spends on reading matches."""
+MAX_DETAILS: Final = 20
+"""Matches whose cameras are on the page at once; of more, one that is asked for."""
 STYLE: Final = """
 :root {
   color-scheme: light dark;
@@ -75,6 +82,16 @@ small, .soft { color: var(--soft); font-size: .82rem; }
 progress { width: 100%; accent-color: var(--accent); }
 details { margin: .4rem 0; }
 summary { cursor: pointer; }
+@media (max-width: 48rem) {
+  main, body > header { padding-inline: .7rem; flex-wrap: wrap; }
+  table, tbody { display: block; }
+  tr { display: flex; flex-wrap: wrap; margin-bottom: .6rem; background: var(--panel); }
+  tr { border: 1px solid var(--line); border-radius: 8px; padding: .4rem .6rem; }
+  tr:has(th), td:empty { display: none; }
+  td { border: 0; flex: 1 1 8rem; }
+  td.cell { flex: 0 0 50%; font-size: .86rem; }
+  td[data-of]::before { content: attr(data-of); display: block; color: var(--soft); }
+}
 """
 """Colours and sizes of the other pages; each state is also given as text."""
 
@@ -92,11 +109,14 @@ def routes(context: PageContext) -> APIRouter:
         }
 
     @router.get("/status")
-    def page() -> HTMLResponse:
+    def page(match: str = "") -> HTMLResponse:
         serving = served_state(context.store.url).read_serving()
         dashboard = "" if serving is None else serving.prefect.removesuffix("/api")
-        rows = [StatusRow(match, *_run_of(context, match)) for match in overview.look()]
-        return HTMLResponse(status_html(rows, _arrivals(context), dashboard))
+        inbox = "" if serving is None else serving.inbox
+        found = overview.look(BUDGET_SECONDS)
+        rows = [StatusRow(each, *_run_of(context, each)) for each in found]
+        text = status_html(rows, _arrivals(context), dashboard, inbox=inbox, opened=match)
+        return HTMLResponse(text)
 
     @router.get("/status/page.css")
     def style() -> Response:
@@ -125,13 +145,22 @@ def _run_of(context: PageContext, match: MatchStatus) -> tuple[Mapping[str, Any]
     return runs.state(match.match_id), runs.links().get(match.match_id, "")
 
 
-def status_html(rows: Sequence[StatusRow], arrivals: Iterable[Arrival], dashboard: str) -> str:
+def status_html(
+    rows: Sequence[StatusRow],
+    arrivals: Iterable[Arrival],
+    dashboard: str,
+    *,
+    inbox: str = "",
+    opened: str = "",
+) -> str:
     """Render the page; every name and message is escaped.
 
     Args:
         rows: all matches.
         arrivals: state of the inbox.
         dashboard: address of Prefect's dashboard; empty if unknown.
+        inbox: path of the inbox; empty if unknown.
+        opened: id of the match whose cameras are shown, if there are more than `MAX_DETAILS`.
     """
     seen = {stage for row in rows for stage in row.match.stages}
     stages = [stage.name for stage in METHOD if stage.name in seen]
@@ -144,12 +173,14 @@ def status_html(rows: Sequence[StatusRow], arrivals: Iterable[Arrival], dashboar
         f'<div class="wide"><table><tr><th>match</th><th>latest run</th>{heads}</tr>{lines}</table>'
         "</div>"
         if rows
-        else "<p>No match yet: put one into the inbox.</p>"
+        else f"<p>No match yet. {_describe_beginning(inbox)}</p>"
     )
-    details = "".join(_details(row.match) for row in rows)
+    has_all, shown = len(rows) <= MAX_DETAILS, [row.match for row in rows]
+    details = "".join(_details(each) for each in shown if has_all or each.match_id == opened)
+    refresh = UNSEEN_SECONDS if any(each.is_unseen for each in shown) else REFRESH_SECONDS
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>worldpose status</title>'
-        f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">'
+        f'<meta http-equiv="refresh" content="{refresh}">'
         '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
         '<link rel="stylesheet" href="/status/page.css"></head><body>'
         '<header><nav aria-label="Where you are"><a href="/">worldpose review</a>'
@@ -160,9 +191,17 @@ def status_html(rows: Sequence[StatusRow], arrivals: Iterable[Arrival], dashboar
     )
 
 
+def _describe_beginning(inbox: str) -> str:
+    """Return what a person does first."""
+    begin = '<a href="/">Create one</a>'
+    if not inbox:
+        return f"{begin} on the pages of the service."
+    return f"{begin}, or copy a match folder into the inbox: <code>{escape(inbox)}</code>"
+
+
 def _row(row: StatusRow, stages: Sequence[str]) -> str:
     match, name = row.match, quote(row.match.match_id, safe="")
-    links = []
+    links = [f'<a href="/status?match={name}">cameras</a>'] if match.stages else []
     if match.latest is not None and match.latest.state == "complete":
         links.append(f'<a href="/api/matches/{name}/results/report">report</a>')
     if row.prefect:
@@ -178,9 +217,10 @@ def _row(row: StatusRow, stages: Sequence[str]) -> str:
         state += f"<br><small>{escape(run.run_id)}, {_time(run.seconds)}, {run.gates}</small>"
         state += f"<br><small>{match.cost}</small>"
     if match.problem:
-        cells = f'<td class="failed" colspan="{max(1, len(stages))}">{escape(match.problem)}</td>'
+        problem = escape(in_browser(match.problem))
+        cells = f'<td class="failed" colspan="{max(1, len(stages))}">{problem}</td>'
     else:
-        cells = "".join(_cell(match.stages.get(stage, ())) for stage in stages)
+        cells = "".join(_cell(stage, match.stages.get(stage, ())) for stage in stages)
     return f'<tr><td class="match">{title}</td><td class="run">{state}</td>{cells}</tr>'
 
 
@@ -194,7 +234,7 @@ def _at_work(run: Mapping[str, Any]) -> str:
     return f'<span class="state">{percent:.0f} %</span> {bar}<br><small>{escape(said)}</small>'
 
 
-def _cell(units: Sequence[UnitSummary]) -> str:
+def _cell(stage: str, units: Sequence[UnitSummary]) -> str:
     """Render one stage of a match: the worst unit state, units done, computation time."""
     if not units:
         return '<td class="cell"></td>'
@@ -206,7 +246,8 @@ def _cell(units: Sequence[UnitSummary]) -> str:
     since = [age(unit.waiting_since) for unit in units if unit.state == "waiting"]
     waits = f"<br>for {_time(max(since))}" if since else ""
     took = f"<br><small>{_time(seconds)}</small>" if seconds else ""
-    return f'<td class="cell"><span class="{worst}">{words}{waits}{took}</span></td>'
+    of = escape(stage.replace("_", " "))
+    return f'<td class="cell" data-of="{of}"><span class="{worst}">{words}{waits}{took}</span></td>'
 
 
 def _details(match: MatchStatus) -> str:
@@ -228,14 +269,16 @@ def _details(match: MatchStatus) -> str:
 
 
 def _describe_unit(unit: UnitSummary) -> str:
-    return "; ".join(filter(None, [unit.why, *unit.objections, in_short(unit.figures)]))
+    said = [in_browser(unit.why), *unit.objections, in_short(unit.figures)]
+    return "; ".join(filter(None, said))
 
 
 def _inbox(arrivals: Iterable[Arrival]) -> str:
     rows = "".join(
         f"<tr><td>{escape(each.name)}</td><td>{each.state}</td><td>{each.priority}</td>"
         f"<td>{_date(each.changed_at)}</td>"
-        f"<td>{escape(each.match_id or '')}</td><td><small>{escape(each.reason)}</small></td></tr>"
+        f"<td>{escape(each.match_id or '')}</td>"
+        f"<td><small>{escape(in_browser(each.reason))}</small></td></tr>"
         for each in sorted(arrivals, key=lambda each: each.changed_at, reverse=True)
     )
     if not rows:

@@ -37,7 +37,7 @@ MOST_REMEMBERED: Final = 10_000
 
 Role = Literal["viewer", "annotator", "approver"]
 """viewer: sees all; annotator: also corrects; approver: also decides, runs and adds matches."""
-EDITING: Final = ("/corrections", "/withdrawals", "/acceptances")
+EDITING: Final = ("/corrections", "/withdrawals", "/withdrawal", "/acceptances")
 """Suffixes of the paths by which an annotator changes something."""
 OF_ALL: Final = ("/api/logout", "/preview")
 """Suffixes of the paths that change nothing of the project."""

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any, Final
 
 from fastapi import APIRouter
 
@@ -16,16 +21,25 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from flows.web.corrections import count_corrections, describe_groups
 from worldpose.errors import WorldposeError
+from worldpose.review import read_journal
 from worldpose.store import Store
+
+BUDGET_SECONDS: Final = 0.25
+"""Time that one request spends on changed matches; the page asks again for the others."""
+REREAD_SECONDS: Final = 60.0
+"""Age at which a summary is made again without a change: a video can be removed."""
+ALWAYS_CHECKED: Final = 8
+"""Matches that every request checks."""
 
 
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the queue and of one match."""
     router = APIRouter(prefix="/api/matches")
+    glances = _Glances(context)
 
     @router.get("")
     def matches() -> dict[str, Any]:
-        return {"matches": [_at_a_glance(context, name) for name in context.store.matches()]}
+        return glances.look()
 
     @router.get("/{match_id}")
     def match(match_id: str) -> dict[str, Any]:
@@ -59,6 +73,84 @@ def routes(context: PageContext) -> APIRouter:
         }
 
     return router
+
+
+@dataclass
+class _Glances:
+    """Summaries of all matches for the queue, of which one request checks as many as time allows.
+
+    A match is opened again only if its folder, journal or runs have changed.
+    """
+
+    context: PageContext
+    _known: dict[str, tuple[Hashable, dict[str, Any]]] = field(default_factory=dict)
+    _folders: dict[str, Path] = field(default_factory=dict)
+    _checked: dict[str, float] = field(default_factory=dict)
+    _opened: dict[str, float] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def look(self) -> dict[str, Any]:
+        """Return all matches, those not seen yet by name only, and how many are still to check."""
+        names = self.context.store.matches()
+        with self._lock:
+            begun = time.monotonic()
+            oldest = sorted(names, key=lambda name: self._checked.get(name, 0.0))
+            left = len(oldest)
+            for number, name in enumerate(oldest):
+                if number >= ALWAYS_CHECKED and time.monotonic() - begun > BUDGET_SECONDS:
+                    break
+                self._check(name)
+                self._checked[name] = time.monotonic()
+                left -= 1
+            found = [
+                dict(self._known[name][1]) if name in self._known else _unseen(name)
+                for name in names
+            ]
+        for each in found:
+            # What a run at work does changes all the time.
+            each["at_work"] = _local_run(self.context, each["match"]) or each["elsewhere"]
+        return {"matches": found, "left": left}
+
+    def _check(self, name: str) -> None:
+        stamp = self._stamp(name)
+        is_old = time.monotonic() - self._opened.get(name, -REREAD_SECONDS) >= REREAD_SECONDS
+        if stamp is not None and not is_old and self._known[name][0] == stamp:
+            return
+        self._opened[name] = time.monotonic()
+        glance = _at_a_glance(self.context, name)
+        if glance["problem"] is None:
+            registration = self.context.store.registration(name)
+            assert registration is not None  # the match was opened
+            self._folders[name] = Path(registration.folder)
+        glance["elsewhere"] = _elsewhere(self.context.store, name)
+        has_problem = glance["problem"] is not None
+        self._known[name] = (None if has_problem else stamp or self._stamp(name), glance)
+
+    def _stamp(self, name: str) -> Hashable:
+        """Return what a summary depends on; None if it must be read again."""
+        store, folder = self.context.store, self._folders.get(name)
+        if folder is None:
+            return None
+        try:
+            journal = read_journal(store, name)
+            files = sorted((folder / "annotations").rglob("*.json"))
+            times = [file.stat().st_mtime_ns for file in (folder / "match.yaml", *files)]
+            listed = folder.stat().st_mtime_ns
+        except (OSError, WorldposeError):
+            return None
+        at_work = tuple(each.run_id for each in store.unfinished_runs(name))
+        return (journal.last, store.runs(name), at_work, listed, tuple(times))
+
+
+def _unseen(name: str) -> dict[str, Any]:
+    return {
+        "match": name,
+        "problem": None,
+        "is_unseen": True,
+        "waiting": [],
+        "run": None,
+        "elsewhere": None,
+    }
 
 
 def describe_review(review: Review) -> dict[str, Any]:
@@ -118,10 +210,18 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
 
 
 def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any] | None:
-    """Return the run started on a page, or else one started elsewhere that has not ended."""
+    """Return the run of the service or of a page, or else one elsewhere that has not ended."""
+    return _local_run(context, match_id) or _elsewhere(store, match_id)
+
+
+def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
     state = context.continuing.state(match_id)
-    if state is not None:
-        return {**state, "lines": [in_browser(line) for line in state["lines"]]}
+    if state is None:
+        return None
+    return {**state, "lines": [in_browser(line) for line in state["lines"]]}
+
+
+def _elsewhere(store: Store, match_id: str) -> dict[str, Any] | None:
     open_runs = store.unfinished_runs(match_id)
     if not open_runs:
         return None

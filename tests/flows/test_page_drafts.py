@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from flows.service.inbox import entries, fingerprint_of, missing_of
-from flows.web.access import access_for
+from flows.web.access import Access, User, access_for
 from flows.web.app import create_app
 from flows.web.intake import CHUNK_BYTES, Intake
 from worldpose.ingest import read_match
@@ -373,3 +373,22 @@ def test_a_kill_between_the_move_and_the_end_leaves_a_match_and_no_draft(place, 
     assert ada.get(DRAFTS).json() == {"drafts": []}
     assert not folder.exists()
     assert (place / "inbox" / "final" / "match.yaml").exists()
+
+
+def test_only_an_approver_creates_a_match(place):
+    roles = ("viewer", "annotator", "approver")
+    users = {role: User(role=role, token=f"the token of {role}") for role in roles}
+    access = Access(page_client.TOKEN, users=users)
+    app = create_app(str(place / "project"), access, Intake(place / "inbox"))
+    for role, status in (("viewer", 403), ("annotator", 403), ("approver", 200)):
+        browser = page_client.browser(app)
+        given = {"who": role, "token": f"the token of {role}"}
+        assert browser.post("/api/login", json=given).status_code == 200
+        secret = browser.get("/api/session").json()["form_secret"]
+        browser.headers["x-form-secret"] = secret
+        assert browser.post(DRAFTS, json={}).status_code == status
+        assert put(browser, "0" * 16, "a", 0, b"abc").status_code == (422 if status == 200 else 403)
+        # A group of corrections is withdrawn by those who correct: of a match that is not there.
+        path = "/api/matches/none/corrections/a/withdrawal"
+        expected = 403 if role == "viewer" else 404
+        assert browser.post(path, json={"count": 1}).status_code == expected

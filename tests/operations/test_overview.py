@@ -71,6 +71,9 @@ class Told:
     def matches(self):
         return ("m",)
 
+    def runs(self, match):
+        return ("0002",)
+
     def manifest(self, *place):
         return SimpleNamespace(content=CONTENT, seconds=2.0, figures=FIGURES, files=())
 
@@ -82,7 +85,7 @@ class Told:
 def glance(monkeypatch):
     """A function that returns the overview's entry for the match of such a store."""
     monkeypatch.setattr(overview, "latest_run", lambda store, match: store.latest)
-    journal = lambda store, match: SimpleNamespace(questions=store.journal)  # noqa: E731
+    journal = lambda store, match: SimpleNamespace(last=0, questions=store.journal)  # noqa: E731
     monkeypatch.setattr(overview, "read_journal", journal)
 
     def look(*told, **more):

@@ -9,7 +9,13 @@ from command_line import TINY
 from data_contracts.operations import Arrival
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, Overview, UnitSummary
-from flows.service.status_page import STYLE, StatusRow, status_html
+from flows.service.status_page import (
+    MAX_DETAILS,
+    STYLE,
+    UNSEEN_SECONDS,
+    StatusRow,
+    status_html,
+)
 from flows.web.access import access_for
 from flows.web.app import create_app
 from worldpose.store import Store
@@ -93,4 +99,23 @@ def test_the_worst_state_of_a_stage_is_what_is_seen():
 
 
 def test_an_empty_project_says_what_to_do():
-    assert "put one into the inbox" in status_html([], [], "")
+    text = status_html([], [], "", inbox="/data/in & out")
+    assert '<a href="/">Create one</a>' in text
+    assert "<code>/data/in &amp; out</code>" in text
+
+
+def test_cameras_of_many_matches_are_shown_for_one_of_them():
+    unit = {"ingest": (UnitSummary("cam00", "done", 1.0),)}
+    names = [f"m{number}" for number in range(MAX_DETAILS + 1)]
+    many = [StatusRow(MatchStatus(name, stages=unit)) for name in names]
+    assert status_html(many[1:], [], "").count("<details>") == MAX_DETAILS
+    assert "<details>" not in status_html(many, [], "")
+    text = status_html(many, [], "", opened="m3")
+    assert text.count("<details>") == 1
+    assert "m3, camera by camera" in text
+
+
+def test_matches_that_were_not_read_yet_are_shown_by_name():
+    text = status_html([StatusRow(MatchStatus("m", is_unseen=True))], [], "")
+    assert "being read" in text
+    assert f'content="{UNSEEN_SECONDS}"' in text
