@@ -51,7 +51,16 @@ def start_tracing() -> None:
     os.environ.setdefault("OTEL_SERVICE_NAME", "worldpose")
     provider = TracerProvider()
     get_tracer = provider.get_tracer
-    provider.get_tracer = lambda *given, **named: _FlowTracer(get_tracer(*given, **named))
+
+    def get_flow_tracer(
+        name: str,
+        version: str | None = None,
+        schema_url: str | None = None,
+        attributes: dict[str, Any] | None = None,
+    ) -> Any:  # noqa: ANN401 - it stands for a tracer
+        return _FlowTracer(get_tracer(name, version, schema_url, attributes))
+
+    provider.get_tracer = get_flow_tracer
     for name in os.environ.get("OTEL_TRACES_EXPORTER", "otlp").split(","):
         asked = name.strip() or "otlp"
         if asked == "otlp":

@@ -21,7 +21,7 @@ from worldpose.store import Store
 def every_route(app):
     """Method and path of every route of the server, from the server itself."""
     names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
-    names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f"}
+    names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f", "group": "g"}
     for path, methods in app.openapi()["paths"].items():
         for method in methods:
             yield method.upper(), path.format_map(names)
@@ -372,7 +372,7 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
     changing = {path for method, path in every_route(served) if method != "GET"} - OPEN
     for path in changing - {"/api/logout"}:
         is_preview = path.endswith("/preview")
-        is_edit = path.endswith(("/corrections", "/withdrawals", "/acceptances"))
+        is_edit = path.endswith(("/corrections", "/withdrawals", "/withdrawal", "/acceptances"))
         codes = [each.post(path, json={"no": 1}).status_code for each in (vera, ann, ake)]
         may = [is_preview, is_preview or is_edit, True]
         assert [code != 403 for code in codes] == may, path

@@ -55,7 +55,12 @@ def run_from_pages(served, names):
     assert all(each["state"] == "running" and each["prefect"] for each in at_work), at_work
     assert "runs are before it" in at_work[-1]["lines"][0]
     ended = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
-    wait_until(lambda: {run["state_type"] for run in at_prefect(served)} <= ended, served.explain)
+
+    def count_ended():
+        return sum(run["state_type"] in ended for run in at_prefect(served))
+
+    for count in range(1, len(names) + 1):  # each in its own time
+        wait_until(lambda count=count: count_ended() >= count, served.explain)
     return at_prefect(served)
 
 
