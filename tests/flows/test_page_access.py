@@ -21,7 +21,7 @@ from worldpose.store import Store
 def every_route(app):
     """Method and path of every route of the server, from the server itself."""
     names = {"match_id": TINY, "owner": "cam00", "request": "r", "number": "0", "clip": "clip"}
-    names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f"}
+    names |= {"form": "joints", "draft": "0123456789abcdef", "file": "f", "group": "g"}
     for path, methods in app.openapi()["paths"].items():
         for method in methods:
             yield method.upper(), path.format_map(names)
