@@ -227,7 +227,7 @@ def _row(row: StatusRow, stages: Sequence[str]) -> str:
 def _at_work(run: Mapping[str, Any]) -> str:
     """Render the run at work: percent, and what it does, with the time left."""
     percent = float(run.get("percent", 0.0))
-    said = " ".join(run.get("lines", ()))
+    said = in_browser(" ".join(run.get("lines", ())))
     if not percent:
         return f'<span class="state">at work</span><br><small>{escape(said)}</small>'
     bar = f'<progress max="100" value="{percent:.0f}"></progress>'
