@@ -21,7 +21,8 @@ _PRIOR_WEIGHT: Final = 4.0
 """Degrees of freedom of a standard deviation before the residuals [1]."""
 _MAX_UNKNOWN: Final = 3.0
 """Value of an unknown [standard deviations] beyond which it is an outlier for the noise."""
-_MIN_UNEVENNESS_M: Final = 0.001
+_MIN_UNEVENNESS_M: Final = 0.0002
+"""Below, errors of readings are larger in any image [m]."""
 _MAX_UNEVENNESS_M: Final = 0.1
 """Largest unevenness [m]; beyond, lines have wrong names."""
 _MAX_READING: Final = 8.0

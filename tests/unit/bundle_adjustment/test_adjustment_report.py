@@ -32,7 +32,7 @@ def test_arrays_and_attributes_are_those_of_the_layout(clip, evidence):
     person = np.array([4, 7, 9], dtype=np.int32)
     arrays, attributes = adjustment_arrays(adjusted, settings, person)
     checked = checked_arrays(BUNDLE_ADJUSTMENT, arrays, {})
-    given = {"camera": list("abcde"), **attributes}
+    given = {"camera": list("abcde"), "surface": None, **attributes}
     stored = checked_attributes(BUNDLE_ADJUSTMENT, checked, given)
     assert set(checked["outlier_person"]) <= {4, 7, 9}
     assert stored["used_frames"] == adjusted.used.tolist()
