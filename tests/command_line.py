@@ -24,7 +24,10 @@ MACHINES = {"--dask", "--workers", "--help"}
 """Options of commands that bring their own machines, or need none."""
 COMPUTING = {"run", "reprocess", "evaluate", "finetune", "serve"}
 
-TAKEN_OVER = ("WORLDPOSE_", "PREFECT_", "DASK_", "HOME", "XDG_", "HF_", "SSL_", "PATH", "PYTHON")
+TAKEN_OVER = (
+    *("WORLDPOSE_", "PREFECT_", "DASK_", "OTEL_", "OPENLINEAGE_"),
+    *("HOME", "XDG_", "HF_", "SSL_", "PATH", "PYTHON"),
+)
 """Beginnings of the variables that a worker's results or access depend on."""
 
 shared = {}

@@ -1,6 +1,7 @@
 """Fixtures that tests of the whole system share: one match, one project, one Prefect server."""
 
 import fcntl
+import importlib
 import os
 import shutil
 import threading
@@ -39,6 +40,10 @@ def server(tmp_path_factory):
         prefect_server(home, is_local=True) as wait_until_ready,
         LocalCluster(**options) as cluster,
     ):
+        # Before the scheduler, a thread of this process, would do it while it receives the first
+        # task: on busy cores it then did not answer for so long that its clients gave up.
+        for name in options["preload"][1:]:
+            importlib.import_module(name)
         wait_until_ready()
         around = command_line.surroundings()
         command_line.shared.update(dask=cluster.scheduler_address, surroundings=around)
