@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -147,10 +149,9 @@ class ConsoleReporter(Reporter):
         if self.spinner is not None:
             self.spinner.stop()
         results = "result is" if self.computed == 1 else "results are"
-        line(
-            f"interrupted: {self.computed} new {results} kept; the same command continues",
-            to=errors,
-        )
+        said = f"\ninterrupted: {self.computed} new {results} kept; the same command continues\n"
+        # A signal may arrive while the console prints: it would keep this line in its buffer.
+        os.write(sys.stderr.fileno(), said.encode())
 
 
 def shorten_name(name: str, width: int) -> str:

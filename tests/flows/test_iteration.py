@@ -250,7 +250,10 @@ def test_the_command_runs_two_iterations_on_the_workers_of_one_run(tmp_path):
     short = tmp_path / "match"
     succeed("simulate", "--scenario", "tiny", "--duration", 0.3, "--no-stills", "--out", short)
     project = tmp_path / "project"
-    answer = succeed("run", short, "--project", project, "--iterations", 2, "--json")
+    alone = {"PREFECT_API_URL": ""}  # as a user: with a server and workers of its own
+    answer = succeed(
+        *("run", short, "--project", project, "--iterations", 2, "--json"), environment=alone
+    )
     assert answer.json["failed"] == 0
     assert answer.err.count("starting Prefect and Dask") == 1
     store = Store.open(str(project))

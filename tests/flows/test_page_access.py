@@ -115,7 +115,7 @@ def test_nothing_is_changed_by_getting(app, ada, project_copy):
     answers = {
         path: ada.get(path).status_code for method, path in every_route(app) if method == "GET"
     }
-    assert answers[MATCH] == answers[f"{MATCH}/corrections"] == 200
+    assert answers[MATCH] == answers[f"{MATCH}/results"] == 200
     after = [path for path in Path(str(project_copy)).rglob("*") if path.is_file()]
     assert {path: path.read_bytes() for path in after} == before
 

@@ -4,6 +4,7 @@ WORLDPOSE_TEST_DATA names a folder with `static_pair` (videos and CVAT clicks).
 """
 
 import csv
+import re
 import os
 from pathlib import Path
 
@@ -73,9 +74,9 @@ def test_cameras_on_one_mast_place_people_on_the_pitch_and_say_why(tmp_path):
     project = ("--project", tmp_path / "worldpose-data")
     answer = worldpose("run", tmp_path / "pair", *project)
     assert answer.code == 4, answer.err
-    # 0.46 m between cameras, about 50 m from the people.
+    # About half a metre between cameras (0.46 to 0.52 m by calibration), 50 m from the people.
     assert "the rays of one person meet at 0." in answer.err
-    assert "the cameras are 0.4" in answer.err
+    assert re.search(r"the cameras are 0\.[45]\d m apart", answer.err)
     assert "contradicts" not in answer.err
     assert "people are placed on the pitch from their feet" in answer.err
     succeed("export", "pair", *project, "--format", "positions", "--out", tmp_path / "out")

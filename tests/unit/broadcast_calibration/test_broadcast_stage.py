@@ -9,6 +9,7 @@ import turning_clip as clip
 
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.broadcast_calibration import FRAME_STATUS, KeyFrame, KeyFrames
+from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
@@ -150,6 +151,13 @@ def calibrated(folder, tmp_path_factory):
     store = Store.create(tmp_path_factory.mktemp("project") / "project")
     match, _ = register(store, folder)
     planned = {unit.name: unit for unit in plan_run(store, match, {})}
+    # Of the static cameras the stage reads the pitch's surface alone.
+    about = {"surface": BUNDLE_ADJUSTMENT.attributes["surface"]}
+    surface = BUNDLE_ADJUSTMENT.model_copy(update={"arrays": (), "labels": {}, "attributes": about})
+    with store.publish(
+        planned["bundle_adjustment/cameras"].work(store.url, match, "0001")
+    ) as result:
+        result.write(surface, arrays={}, coordinates={}, attributes={"surface": None})
     there = joints(FIRST + np.arange(float(COUNT)))
     # Nobody was found in the second clip.
     for name, first, places in (("goal", FIRST, there), ("shot", 90, np.full_like(there, np.nan))):
