@@ -4,8 +4,8 @@ WORLDPOSE_TEST_DATA names a folder with `static_pair` (videos and CVAT clicks).
 """
 
 import csv
-import re
 import os
+import re
 from pathlib import Path
 
 import numpy as np
