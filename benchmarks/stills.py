@@ -8,10 +8,11 @@ r"""Scores person detectors and pose estimators on real stills that were labelle
 into DATA/stills, and puts the labels beside them (tests/real/stills/labels.json: boxes of all
 people at the pitch, and twelve joints of some, drawn on enlargements without help of a detector).
 `score` prints, per height of people, recall and precision at the detection stage's score threshold,
-and AP50: on the pitch alone, where boxes whose feet are off the pitch do not count, as a calibrated
-camera rejects them, and in the whole image, where every spectator counts as false. Then follow PCK
-(a fifth of the torso) of joints in the labelled boxes, and how confidence agrees with the share of
-right boxes and joints. Detectors that take views of a fixed size see tiles, as in the stage.
+and AP50: on the pitch alone, where boxes with feet outside of the pitch do not count, as a
+calibrated camera rejects them, and in the whole image, where every spectator counts as false. Then
+follow PCK (a fifth of the torso) of joints in the labelled boxes, and how confidence agrees with
+the share of right boxes and joints. Detectors that take views of a fixed size see tiles, as in the
+stage.
 """
 
 from __future__ import annotations

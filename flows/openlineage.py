@@ -112,7 +112,7 @@ def _facet(name: str) -> dict[str, str]:
 
 @functools.cache
 def _producer() -> str:
-    return f"https://pypi.org/project/worldpose/{version('worldpose')}"
+    return f"urn:worldpose:{version('worldpose')}"
 
 
 def _uuid(name: str) -> str:

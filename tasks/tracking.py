@@ -201,7 +201,7 @@ def _locate_feet(clip: ClipInputs, pitch: PitchTemplate) -> GroundPositions:
 def _estimate_clocks(
     positions: GroundPositions, clip: ClipInputs, pitch: PitchTemplate, joints: Singles
 ) -> PlaneClocks:
-    """Return the cameras' clock offsets by running people; none beside triangulated people.
+    """Return the cameras' clock offsets by running people; none where people are triangulated.
 
     Triangulation estimates the clocks itself, and its people are at the times of the frames.
     """

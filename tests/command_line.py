@@ -49,7 +49,7 @@ class Answer:
 
 
 def surroundings(arguments=()):
-    """What workers take over from the process that starts them."""
+    """Environment that workers inherit from the process that starts them."""
     at_bucket = any(str(each).startswith("s3:") for each in arguments)
     taken = ("AWS_", *TAKEN_OVER) if at_bucket else TAKEN_OVER
     kept = {name: value for name, value in os.environ.items() if name.startswith(taken)}

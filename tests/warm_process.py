@@ -50,7 +50,7 @@ class WarmProcess:
 
 
 def take_over(request):
-    """Become the process that was asked for."""
+    """Become the requested process."""
     for number, name, flags in (
         (0, os.devnull, os.O_RDONLY),
         (1, request["out"], os.O_WRONLY),

@@ -272,7 +272,7 @@ def serve(
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     logging.getLogger("worldpose.pages").setLevel(logging.INFO)
     # A token chosen by the operator is not printed (the output can go to a log), nor one that
-    # lets nobody in.
+    # admits no user.
     where = address(access, host, port)
     is_shown = token is None and users is None
     shown = where if is_shown else where.partition("#")[0]

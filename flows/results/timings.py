@@ -32,7 +32,7 @@ class StageTime:
 
 @dataclass(frozen=True)
 class Cost:
-    """What the results of a run cost.
+    """Processor time and storage of a run's results.
 
     Attributes:
         core_hours: sum of the computing times of all units, each on one core [h].

@@ -160,7 +160,7 @@ def export_gltf(origin: Origin, out: Path) -> list[Path]:
     """Write `scenes/<clip>.glb`: bodies, cameras and the pitch.
 
     Raises:
-        UsageError: the surface of a body model with terms of its own was asked for without them.
+        UsageError: a body model with terms of its own needs them for its surface.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings

@@ -75,7 +75,7 @@ class ServePlan(Record):
     disk_gb: float = Field(default=10.0, ge=0)
     """Less free space than this raises an alert [GB]."""
     users: Path | None = None
-    """TOML file of the people who may log in to the pages; None: everybody with the token."""
+    """TOML file of the people who may log in to the pages; None: every user with the token."""
 
     @property
     def state_folder(self) -> StateFolder:

@@ -28,7 +28,7 @@ UNSEEN_SECONDS: Final = 1
 BUDGET_SECONDS: Final = 0.25
 """Time that one request spends on reading matches."""
 MAX_DETAILS: Final = 20
-"""Matches whose cameras are on the page at once; of more, one that is asked for."""
+"""Matches whose cameras are on the page at once; of more matches, the one in the address."""
 STYLE: Final = """
 :root {
   color-scheme: light dark;

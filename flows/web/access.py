@@ -47,13 +47,13 @@ class User(Record):
     """Entry of a file of users, under the person's name."""
 
     role: Role
-    """What the person may do."""
+    """Actions that the person is allowed."""
     token: str = Field(min_length=TOKEN_LENGTH)
     """The person's own login token."""
 
 
 class UserFile(Record):
-    """users.toml: the people who may log in; without it, everybody with the one token may."""
+    """users.toml: the people who may log in; without it, every user with the one token may."""
 
     users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User]
     """Name to role and token."""
@@ -105,7 +105,7 @@ class Access:
         hosts: names under which browsers reach the server; any other name is a foreign one that
             points here.
         secure: whether pages are served with TLS.
-        users: people with a role and a token of their own, by name; None = everybody with the login
+        users: people with a role and a token of their own, by name; None = all with the login
             token is an approver.
     """
 
@@ -189,7 +189,7 @@ class Access:
         return role == "annotator" and path.endswith(EDITING)
 
     def _sign_own(self, who: str) -> str | None:
-        """Return what a session holds of the person; None if nobody of the name may log in."""
+        """Return what a session holds of the person; None if no user of the name may log in."""
         if self.users is None:
             return ""
         user = self.users.get(who)
@@ -219,7 +219,7 @@ def access_for(
         token: chosen token; None = a random one, printed when the server starts.
         names: further names of the machine that browsers use.
         secure: whether TLS is used.
-        users: file of the people who may log in; None = everybody with the token.
+        users: file of the people who may log in; None = every user with the token.
 
     Raises:
         UsageError: the file or the token is not valid, or the server would listen to other

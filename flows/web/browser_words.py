@@ -17,7 +17,7 @@ _ON_PAGES: Final = {
     "ingest": "Put the match folder into the inbox.",
     "status": "The status page lists all runs.",
 }
-"""What a page offers in place of a command."""
+"""Actions of pages in place of commands."""
 _ELSE: Final = "Ask the operator of this service."
 
 

@@ -40,7 +40,7 @@ from worldpose.video import FrameIndex, index_frames
 DRAFTS: Final = ".drafts"
 """Folder of all drafts in the inbox."""
 MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
-"""Files beside videos that a person can add."""
+"""Files that a person can add to the videos."""
 MAX_FILES: Final = 200
 """Files of one draft."""
 MAX_DRAFTS: Final = 200

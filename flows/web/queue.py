@@ -107,7 +107,7 @@ class _Glances:
                 for name in names
             ]
         for each in found:
-            # What a run at work does changes all the time.
+            # The progress of a run changes all the time.
             each["at_work"] = _local_run(self.context, each["match"]) or each["elsewhere"]
         return {"matches": found, "left": left}
 

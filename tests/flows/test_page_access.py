@@ -354,7 +354,7 @@ def test_people_of_a_file_may_do_what_their_role_says(project_copy, tmp_path):
         return person, session["role"]
 
     assert enter("Vera", "the token of Ann...") is None
-    assert enter("Vera", TOKEN) is None  # the server's own token lets nobody in
+    assert enter("Vera", TOKEN) is None  # the server's own token admits no user
     assert enter("Eve", TOKEN) is None
     vera, role = enter("Vera", "the token of Vera..")
     assert role == "viewer"

@@ -87,7 +87,7 @@ def test_first_clicks_are_no_corrections(store, ada):
     [
         ("It is dark.", "It is dark."),
         ("Run it first: worldpose run final.", "Run the match on its page."),
-        ("Read with `worldpose review show`, go on.", "The page of the match shows what waits."),
+        ("Read with `worldpose review show`, continue.", "The page of the match shows what waits."),
         ("Use --set a.click_noise_px=2.", "Ask the operator of this service."),
         (
             "It moved. Run worldpose run x --gates auto. It is late.",

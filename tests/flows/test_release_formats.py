@@ -217,7 +217,7 @@ def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_pa
 
 
 def tracked():
-    """What the tools' formats need: kinds of people, triangulated joints, fitted joints."""
+    """The data that tools' formats need: kinds of people, triangulated joints, fitted joints."""
     joints = np.random.default_rng(0).uniform(-20.0, 20.0, (4, 2, 17, 3))
     joints[2, 1] = np.nan  # lost in one frame
     covariance = np.zeros((4, 2, 17, 3, 3)) + 1e-4 * np.eye(3)

@@ -46,7 +46,7 @@ class AnimatedBody:
     poses: BodyParameters
     """(frames,), NaN where the person is missing; betas count from the first frame with a body."""
     about: Mapping[str, Any]
-    """What the node says about the person."""
+    """Notes of the node about the person."""
 
 
 @dataclass
@@ -135,7 +135,7 @@ def write_gltf(
         surface: write the surface of bodies, not only their joints.
 
     Raises:
-        InputError: there is nobody with a body.
+        InputError: no person has a body.
     """
     present = [person for person in people if _there(person.poses).any()]
     if not present:

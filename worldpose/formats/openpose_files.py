@@ -75,7 +75,7 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
     missing = ~(confidence > 0.0)
     keypoints = np.where(missing[..., None], np.nan, keypoints)
     confidence = np.where(missing, np.nan, confidence).astype(np.float32)
-    # Somebody without any keypoint is nobody.
+    # An entry without any keypoint is no person.
     there = ~missing.all(axis=-1)
     boxes = np.full((*there.shape, 4), np.nan, np.float32)
     score = np.full(there.shape, np.nan, np.float32)

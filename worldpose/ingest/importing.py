@@ -324,7 +324,7 @@ def import_pose2sim(
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
     """Return `frame_rate` and `frame_range` where Config.toml sets them, and that file.
 
-    As in Pose2Sim, what the trial's file lacks is taken from the file of the folder above.
+    As in Pose2Sim, the file of the folder above gives what the trial's file lacks.
     """
     if not project.is_dir():
         raise InputError(

@@ -1,4 +1,4 @@
-"""What static cameras tell together about the pitch of a venue (C1, C4).
+"""Joint estimate by static cameras of the pitch of a venue (C1, C4).
 
 Paint lies where it lies for every camera: the surface of the pitch, the errors of a survey, and
 uneven ground and paint. Each camera alone cannot tell these from its own position and lens; two
@@ -33,7 +33,7 @@ ARRAYS: Final = ("number", "prior_mean", "prior", "mean", "information", "respon
 
 @dataclass(frozen=True, eq=False)
 class VenueEvidence:
-    """What one camera tells about the unknowns of a venue.
+    """Evidence of one camera about the unknowns of a venue.
 
     Attributes:
         number: (k,) of the unknowns, see `ProjectedLines`, then `SURFACE`.
@@ -173,7 +173,7 @@ def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
         times[block] += 1.0
         mean[at] = each.prior_mean
         information[block] += each.information
-        # What the evidence alone says about the unknowns.
+        # Information of the evidence alone about the unknowns.
         right[at] += each.information @ each.mean + each.prior @ (each.mean - each.prior_mean)
     prior /= np.maximum(times, 1.0)
     total = information + prior

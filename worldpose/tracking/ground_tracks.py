@@ -184,7 +184,7 @@ def track_on_plane(
     start people. A backward pass smooths each track. Tracks of two cameras that stay together are
     one person.
 
-    A triangulated person is a track as well, which takes the detections near it and goes on where
+    A triangulated person is a track as well, which takes the detections near it and continues where
     triangulation ends. A track by feet that meets a person who begins to be triangulated becomes
     that person's.
 

@@ -57,7 +57,7 @@ def check(model, poses, **expected):
             assert value == pytest.approx(expected.get(name, 0.0), abs=TOLERANCE_DEG), name
 
 
-# A person who stands along the touch line's direction, +x of the world: facing +x, left is +y.
+# A standing person along the touch line's direction, +x of the world: facing +x, left is +y.
 FACING_X = tuple(Rotation.from_euler("XYZ", [90.0, 90.0, 0.0], degrees=True).as_rotvec())
 
 

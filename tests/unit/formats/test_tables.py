@@ -131,7 +131,7 @@ def test_gaps_are_filled_on_the_way_and_flagged():
     joints, covariance = whole.joints.copy(), np.zeros((250, 1, 17, 3, 3)) + np.eye(3)
     joints[:10], joints[-10:] = np.nan, np.nan
     joints[100:104] = np.nan
-    keep = np.delete(np.arange(250), 200)  # a frame that everybody lacks
+    keep = np.delete(np.arange(250), 200)  # a frame that all people lack
     views = np.full((249, 1, 17), 4)
     gappy = JointTracks(whole.frames[keep], whole.person_ids, joints[keep], covariance[keep], views)
     filled = fill_gaps(gappy)

@@ -50,7 +50,7 @@ def write_frame(folder, number, people):
 
 @pytest.fixture
 def trial(tmp_path):
-    """Two cameras; frame 10 has two people, 11 one, 12 nobody, 13 one."""
+    """Two cameras; frame 10 has two people, 11 one, 12 none, 13 one."""
     folder = tmp_path / "trial"
     (folder / "calibration").mkdir(parents=True)
     cameras = {name: camera(name, x) for x, name in enumerate(CAMERAS)}

@@ -165,7 +165,7 @@ def test_every_detection_stays_somebodys_and_replay_gives_the_same(edits):
 
 
 def mixed_identities():
-    """As `identities`; person 0 goes on by the feet for two frames, and 3 is on the plane alone."""
+    """As `identities`; person 0 stays by the feet for two frames, and 3 is on the plane alone."""
     index = np.full((6, 2, 2), -1, dtype=np.int16)
     index[3:5, 1, 0] = 4
     index[1:, 0, 1] = 5

@@ -233,7 +233,7 @@ def test_people_of_one_camera_tell_no_clock():
 
 
 def mixed_run(frames=100):
-    """A runner whom a camera sees, triangulated in frames 30 to 59, and a neighbour."""
+    """A runner in one camera, triangulated in frames 30 to 59, and a neighbour."""
     rng = np.random.default_rng(6)
     truth = walkers(frames, [[0.0, 0.0], [2.0, 3.0]], [[4.0, 1.0], [4.0, 1.0]])
     seen = truth[:, None] + 0.1 * rng.standard_normal((frames, 1, 2, 2))

@@ -312,7 +312,7 @@ def test_arrays_of_different_cameras_are_refused(ring, people, seen):
 
 def test_a_missed_person_does_not_take_the_detections_of_a_newcomer_beside(ring, people, seen):
     # The second appears 0.5 m from the first and 0.35 m from every camera's ray to the first,
-    # whom three of four cameras do not see for a moment.
+    # hidden from three of four cameras for a moment.
     angle = np.radians(72.0)
     places = np.zeros((60, 2, 2))
     places[:, 1] = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
