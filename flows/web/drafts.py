@@ -389,8 +389,15 @@ class Drafts:
         def work() -> None:
             try:
                 job(key, draft_id, file)
-            except Exception:
+            except Exception as error:  # a bug: the page shows it, and polling does not repeat it
                 LOG.exception("%s of a match being created", file.title)
+                failure = InputError(
+                    file.title,
+                    expected="a file that can be taken in",
+                    found=type(error).__name__,
+                    todo="The service's log has the details. Remove the file and add it again.",
+                )
+                self._copying[key], self._indexes[key] = str(failure), failure
             finally:
                 self._jobs.discard(key)
 

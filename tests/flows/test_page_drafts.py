@@ -392,3 +392,20 @@ def test_only_an_approver_creates_a_match(place):
         path = "/api/matches/none/corrections/a/withdrawal"
         expected = 403 if role == "viewer" else 404
         assert browser.post(path, json={"count": 1}).status_code == expected
+
+
+def test_a_fault_of_the_server_is_shown_at_the_file_and_not_repeated(place, footage, monkeypatch):
+    asked = []
+
+    def fail(path):
+        asked.append(path)
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("flows.web.drafts.index_frames", fail)
+    browser = open_pages(place)
+    draft, file_id, _ = begin(browser, footage)
+    assert put(browser, draft, file_id, 0, footage.read_bytes()).status_code == 200
+    (file,) = settle(browser, draft, "broken")["files"]
+    assert "RuntimeError" in file["problem"] and "log" in file["problem"]
+    settle(browser, draft, "broken")
+    assert len(asked) == 1
