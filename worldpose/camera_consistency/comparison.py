@@ -193,44 +193,18 @@ class Comparison:
         scores = pair_scores(view, at, partner, there, self._heights, self._joint_noise)
         return np.asarray(scores)
 
-    def quick(
-        self,
-        c: int,
-        hypothesis: Hypothesis,
-        partners: Sequence[int],
-        shown: NDArray[np.bool_] | None = None,
-    ) -> float:
-        """Return the matches per frame in the fitting frames under a hypothesis, with chance.
+    def quick(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> float:
+        """Return the matches per frame in the fitting frames under a hypothesis, with chance."""
+        view = self.view(c, hypothesis, self.times(hypothesis)[self.search])
+        places = np.arange(len(self.search))
+        return float(
+            sum(self.scores(view, self.views[p], places, self.search).mean() for p in partners)
+        )
 
-        Args:
-            c: the camera.
-            hypothesis: its fault.
-            partners: cameras assumed correct.
-            shown: (sampled frames,) frames that count; None = all.
-        """
-        at = self.search if shown is None else self.search[shown[self.search]]
-        if not len(at):
-            return 0.0
-        view = self.view(c, hypothesis, self.times(hypothesis)[at])
-        places = np.arange(len(at))
-        return float(sum(self.scores(view, self.views[p], places, at).mean() for p in partners))
-
-    def trial(
-        self,
-        c: int,
-        hypothesis: Hypothesis,
-        partners: Sequence[int],
-        shown: NDArray[np.bool_] | None = None,
-    ) -> Trial:
-        """Return how camera `c` agrees with partners under a hypothesis in held-out frames.
-
-        Arguments are those of `quick`.
-        """
+    def trial(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Trial:
+        """Return how camera `c` agrees with partners under a hypothesis in held-out frames."""
         view, there = self.view(c, hypothesis), self.held_out
-        missing = self.times(hypothesis)[there] < 0
-        if shown is not None:
-            missing |= ~shown[there]
-        at = np.where(missing, -1, there)
+        at = np.where(self.times(hypothesis)[there] < 0, -1, there)
         matches = chance = 0.0
         agreeing = 0
         by_frame = np.where(at < 0, np.nan, 0.0)

@@ -39,8 +39,6 @@ RATES: Final = (0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)
 """Candidate ratios of the actual to the stated frame rate."""
 CLOCK_BAND_S: Final = 0.5
 """Range of clock offsets for a camera in partial agreement [s]; else the whole chunk."""
-MIN_SHOWN: Final = 0.4
-"""Share of the moments that a corrected clock must show: at twice the rate it is a half."""
 MIN_GAIN: Final[dict[FaultKind, float]] = {
     "flipped": 1.5,
     "mirrored": 1.5,
@@ -325,29 +323,24 @@ class Diagnosis:
         if not partners:
             return None
         comparison = self.comparison
-        everywhere = comparison.quick(c, STATED, partners)
-        chance = comparison.trial(c, STATED, partners).chance
-        stated: Hypothesis | None = None
-        best: tuple[Trial, Trial] | None = None
+        quick = comparison.quick(c, STATED, partners)
+        now: Trial | None = None
+        best: Trial | None = None
         for value, hypothesis in self.proposals(c, partners, gross):
             need = MIN_GAIN[hypothesis.kind]
-            # A corrected clock may leave moments without a frame: the others are compared.
-            shown = None if hypothesis.time is None else hypothesis.time >= 0
-            quick = everywhere if shown is None else comparison.quick(c, STATED, partners, shown)
-            if value - chance < need * (quick - chance) or value - quick < 0.2:
+            if value < need * quick or value - quick < 0.2:
                 continue
-            if stated is None:
-                stated = self.polish(c, STATED, partners)
-            now = comparison.trial(c, stated, partners, shown)
+            if now is None:
+                now = comparison.trial(c, self.polish(c, STATED, partners), partners)
             # The stated camera was rotated for the best fit; its small corrections get the same.
             fine = hypothesis.kind in FINE
             tried = self.polish(c, hypothesis, partners) if fine else hypothesis
             trial = comparison.trial(c, tried, partners)
             if trial.matches < need * now.matches or not self.certain(trial, now):
                 continue
-            if best is None or self.rank(trial) > self.rank(best[0]):
-                best = trial, now
-        return best
+            if best is None or self.rank(trial) > self.rank(best):
+                best = trial
+        return None if best is None or now is None else (best, now)
 
     @staticmethod
     def certain(trial: Trial, now: Trial) -> bool:
@@ -434,39 +427,20 @@ class Diagnosis:
         moments = comparison.sample[search]
         rates = np.array((1.0, *RATES))
         # Matches along lines of the table, for every rate and start.
-        frames = np.round(shifts[:, None] + rates[:, None, None] * moments).astype(np.int64)
-        rows = frames - moments + band
-        shown = (frames >= 0) & (frames <= longest) & (rows >= 0) & (rows < len(shifts))
+        rows = shifts[:, None] + np.round((rates[:, None, None] - 1.0) * moments) + band
+        rows = rows.astype(np.int64)
+        inside = (rows >= 0) & (rows < len(shifts))
         along = table[rows.clip(0, len(shifts) - 1), np.arange(len(moments))]
-        # Moments without a frame are no evidence: the others are compared with the stated clock.
-        gain = np.where(shown, along - table[band], 0.0).sum(axis=-1)
-        gain[shown.mean(axis=-1) < MIN_SHOWN] = -np.inf
-        mean = np.where(shown, along, 0.0).sum(axis=-1) / np.maximum(1, shown.sum(axis=-1))
-        constant = int(gain[0].argmax())
-        shift = int(shifts[constant])
+        along = np.where(inside, along, 0.0).mean(axis=-1)
+        shift = int(shifts[int(along[0].argmax())])
         if abs(shift) >= MIN_SHIFT:
-            yield float(mean[0, constant]), self.change_clock("clock", float(shift), shift, 1.0)
-        row, column = np.unravel_index(int(gain[1:].argmax()), gain[1:].shape)
+            yield float(along[0].max()), self.change_clock("clock", float(shift), shift, 1.0)
+        row, column = np.unravel_index(int(along[1:].argmax()), along[1:].shape)
         rate = float(rates[1:][row])
         yield (
-            float(mean[1:][row, column]),
+            float(along[1:].max()),
             self.change_clock("frame_rate", rate, int(shifts[column]), rate),
         )
-        if band < longest:
-            yield self.best_rate(c, partners)
-
-    def best_rate(self, c: int, partners: Sequence[int]) -> tuple[float, Hypothesis]:
-        """Return the best other frame rate of a video that begins with the stated first frame."""
-        best, value, most = STATED, 0.0, -math.inf
-        for rate in RATES:
-            tried = self.change_clock("frame_rate", rate, 0, rate)
-            assert tried.time is not None
-            shown = tried.time >= 0
-            found = self.comparison.quick(c, tried, partners, shown)
-            gain = found - self.comparison.quick(c, STATED, partners, shown)
-            if gain > most:
-                best, value, most = tried, found, gain
-        return value, best
 
     def change_clock(self, kind: FaultKind, value: float, start: int, rate: float) -> Hypothesis:
         """Return the hypothesis of another start and rate of a camera's clock."""
