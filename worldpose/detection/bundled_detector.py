@@ -1,7 +1,7 @@
 """The person detector that ships with the project, small and fast on a CPU.
 
-Its training data are rendered matches alone (infra/embedded_detector). On real footage it is a
-fallback; fine-tuned or larger models serve better. Needs torch.
+Its training data are rendered matches and real frames of one stadium (infra/embedded_detector). On
+other real footage fine-tuned or larger models may serve better. Needs torch.
 """
 
 from __future__ import annotations
