@@ -5,7 +5,6 @@ Outputs: `data_contracts.evaluation.Evaluation`, one `PersonScore` per true pers
 `CameraScore` per camera.
 """
 
-from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.metrics import PersonScore, evaluate_joints
 from worldpose.evaluation.settings import CameraErrorSettings, EvaluationSettings
@@ -15,8 +14,6 @@ __all__ = [
     "CameraScore",
     "EvaluationSettings",
     "PersonScore",
-    "Similarity",
-    "align",
     "evaluate_cameras",
     "evaluate_joints",
 ]

@@ -4,14 +4,13 @@ Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians
 """
 
 from worldpose.geometry.cameras import Camera, Projection
-from worldpose.geometry.distortion import fold_radius
+from worldpose.geometry.projection import fold_radius
 from worldpose.geometry.rays import (
     Rays,
     RayStatus,
-    distance_to_rays,
     intersect_rays,
 )
-from worldpose.geometry.rigid import Rigid, nearest_rotation
+from worldpose.geometry.rigid import Rigid, Similarity, align, nearest_rotation
 
 __all__ = [
     "Camera",
@@ -19,7 +18,8 @@ __all__ = [
     "RayStatus",
     "Rays",
     "Rigid",
-    "distance_to_rays",
+    "Similarity",
+    "align",
     "fold_radius",
     "intersect_rays",
     "nearest_rotation",

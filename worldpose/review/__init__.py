@@ -12,7 +12,6 @@ from worldpose.review.journal import (
     read_journal,
     requests_by_id,
     say,
-    standing_corrections,
 )
 
 __all__ = [
@@ -26,5 +25,4 @@ __all__ = [
     "replay_corrections",
     "requests_by_id",
     "say",
-    "standing_corrections",
 ]

@@ -4,7 +4,6 @@ Input: a pitch template, clicked points and drawn markings. Output: a camera and
 """
 
 from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.clip_picture import median_picture
 from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
 from worldpose.static_calibration.parameters import (
     PARAMETERS,
@@ -44,7 +43,6 @@ __all__ = [
     "ground_error_map",
     "image_problems",
     "left_out_attributes",
-    "median_picture",
     "project_with_jacobian",
     "step_camera",
 ]
