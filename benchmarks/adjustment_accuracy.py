@@ -19,7 +19,6 @@ from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -51,9 +50,8 @@ def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Cl
     seen, settings = scene.static_views(list(known)), TriangulationSettings()
     cameras = Camera.stack([each.estimate.camera for each in known.values()])
     covariance = np.stack([each.estimate.covariance for each in known.values()])
-    arrays = (seen.keypoints, seen.confidence)
-    index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
-    detections = KeypointDetections.from_keypoints(*arrays, index, scene.truth.frames)
+    index = track_people(cameras, seen.detections, fps, TrackingSettings()).detection_index
+    detections = seen.detections.assign_people(index)
     placed = triangulate_joints(cameras, detections, settings, covariance)
     surveyed = PitchTemplate.from_spec(scene.surveyed)
     return Clip(

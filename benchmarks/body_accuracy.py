@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import KeypointDetections
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
@@ -84,10 +83,9 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     scene = simulate_scene(scenario, seed)
     seen = scene.static_views()
     cameras = Camera.stack(list(scene.given.values()))
-    arrays = (seen.keypoints, seen.confidence)
-    index = track_people(cameras, *arrays, scenario.fps, TrackingSettings()).detection_index
+    index = track_people(cameras, seen.detections, scenario.fps, TrackingSettings()).detection_index
     placed = reconstruct_joints(
-        cameras, KeypointDetections.from_keypoints(*arrays, index), scenario.fps, TRIANGULATION
+        cameras, seen.detections.assign_people(index), scenario.fps, TRIANGULATION
     ).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     begin = time.process_time()
@@ -149,16 +147,15 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
     fps, frames = scenario.fps, scene.truth.frames
     seen = scene.static_views()
     cameras = Camera.stack(list(scene.cameras.values()))
-    arrays = (seen.keypoints, seen.confidence)
-    index = track_people(cameras, *arrays, fps, TrackingSettings()).detection_index
+    index = track_people(cameras, seen.detections, fps, TrackingSettings()).detection_index
     full = reconstruct_joints(
-        cameras, KeypointDetections.from_keypoints(*arrays, index), fps, TRIANGULATION
+        cameras, seen.detections.assign_people(index), fps, TRIANGULATION
     ).triangulation.joints
     who, away = nearest(full, scene.truth.joints)
     index = index[:, :, away < 0.5].copy()
     who = who[away < 0.5]
     dark = thin_out(scene, index, left, seed)
-    detections = KeypointDetections.from_keypoints(*arrays, index)
+    detections = seen.detections.assign_people(index)
     placed = reconstruct_joints(cameras, detections, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
     unswapped = undo_swaps(detections, placed.exchanged)

@@ -22,6 +22,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_FLIP
+from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
 from worldpose.geometry import Camera, Rigid
 
@@ -517,8 +518,7 @@ def main() -> None:
             result = check_consistency(
                 Camera.stack(rig.cameras),
                 rig.covariance,
-                rig.keypoints,
-                rig.confidence,
+                KeypointDetections.from_keypoints(rig.keypoints, rig.confidence),
                 rig.fps,
                 ConsistencySettings(),
                 ground=rig.pitch_size is not None,

@@ -14,7 +14,6 @@ import argparse
 
 import numpy as np
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.body import find_body
 from worldpose.body_fitting import (
     BodyFittingSettings,
@@ -68,11 +67,10 @@ def count_rejected(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     """Return planted keypoints found, others rejected, and totals of planted and others."""
     scene = simulate_scene(scenario, seed)
     seen = scene.static_views()
-    keypoints, confidence = seen.keypoints, seen.confidence
     cameras = Camera.stack(list(scene.given.values()))
-    tracks = track_people(cameras, keypoints, confidence, scenario.fps, TrackingSettings())
+    tracks = track_people(cameras, seen.detections, scenario.fps, TrackingSettings())
     settings, how = TriangulationSettings(), BodyFittingSettings()
-    detections = KeypointDetections.from_keypoints(keypoints, confidence, tracks.detection_index)
+    detections = seen.detections.assign_people(tracks.detection_index)
     placed = reconstruct_joints(cameras, detections, scenario.fps, settings).triangulation
     ground = PitchTemplate.from_spec(scene.surveyed).height
     unswapped = undo_swaps(detections, placed.exchanged)
@@ -100,7 +98,7 @@ def count_rejected(scenario: Scenario, seed: int) -> tuple[int, int, int, int]:
     )
     spread = learn_keypoint_spread(views, suspects)
     rejected = judge_detections(views, suspects, spread, FilteringSettings()).rejected
-    there = np.isfinite(confidence) & (seen.person >= 0)[..., None]
+    there = np.isfinite(seen.detections.confidence) & (seen.person >= 0)[..., None]
     wrong, others = there & seen.displaced, there & ~seen.displaced
     found, lost = int(rejected[wrong].sum()), int(rejected[others].sum())
     return found, lost, int(wrong.sum()), int(others.sum())

@@ -117,14 +117,12 @@ def measure(
     for moment in moments:
         truth, image = moment["truth"], moment["image"]
         views = count_views(cameras, truth, image)
-        given = (cameras, image[..., :2], image[..., 2])
-        tracks = track_people(*given, 25.0, settings)
+        seen = KeypointDetections.from_keypoints(image[..., :2], image[..., 2])
+        tracks = track_people(cameras, seen, 25.0, settings)
         found = np.empty((0, 8, 3))
         used = (tracks.detection_index[0] >= 0).sum(axis=0)
         if len(tracks.person):
-            detections = KeypointDetections.from_keypoints(
-                image[..., :2], image[..., 2], tracks.detection_index
-            )
+            detections = seen.assign_people(tracks.detection_index)
             placed = reconstruct_joints(cameras, detections, 25.0, TriangulationSettings())
             found = placed.triangulation.joints[0][:, COCO].astype(np.float64)
         off = np.linalg.norm(truth[:, None] - found, axis=-1)

@@ -52,6 +52,7 @@ from common import distances_to_polyline, run_in_process
 from scipy.spatial import KDTree
 
 from data_contracts.broadcast_calibration import KeyFrames
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.broadcast_calibration import BroadcastClip, calibrate_broadcast
@@ -145,10 +146,8 @@ def track_sides(folder: Path, frames: int, work: Path) -> tuple[Metrics, list[ND
         seen = result("detection", f"{side}.clip")
         feet = locate_feet(
             venue.cameras[index : index + 1],
-            seen["keypoints"].values[:, None],
-            seen["confidence"].values[:, None],
+            KeypointDetections.stack([KeypointDetections.from_arrays(seen)]),
             pitch,
-            boxes=seen["boxes"].values[:, None],
             camera_covariance=venue.covariance[index : index + 1],
         )
         tracks = track_on_plane(feet, FPS, pitch_size=(pitch.length, pitch.width))

@@ -20,6 +20,7 @@ import numpy as np
 from common import best_seconds, stadium_rig
 from scipy.optimize import linear_sum_assignment
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.epipolar import associate
@@ -179,9 +180,9 @@ def main() -> None:
                     *figures(run_frames(run, count[name]), owner)
                 )
             print(line)
-    confidence = np.full(keypoints.shape[:-1], 0.9)
+    seen = KeypointDetections.from_keypoints(keypoints, np.full(keypoints.shape[:-1], 0.9))
     start = time.perf_counter()
-    result = track_people(cameras, keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
+    result = track_people(cameras, seen, FPS, SETTINGS, pitch_size=(105.0, 68.0))
     seconds = time.perf_counter() - start
     print(
         f"whole stage  {len(frames) / seconds:.0f} frames/s, {len(result.person)} people found, "

@@ -31,7 +31,7 @@ def tell(name: str, scene: Scene, fps: float) -> None:
     seen = scene.static_views()
     cameras = Camera.stack(list(scene.given.values()))
     begin = time.process_time()
-    tracks = track_people(cameras, seen.keypoints, seen.confidence, fps, TrackingSettings())
+    tracks = track_people(cameras, seen.detections, fps, TrackingSettings())
     spent = time.process_time() - begin
     found = JointTracks(scene.truth.frames, np.asarray(tracks.person), tracks.joints.astype(float))
     scores, _ = evaluate_joints(found, scene.truth, fps=fps)

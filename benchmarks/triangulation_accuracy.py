@@ -15,7 +15,6 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -59,13 +58,11 @@ def some_way_off(scene: Scene, seed: int) -> Camera:
 def score_ways(scene: Scene, cameras: Camera, fps: float) -> NDArray[np.float64]:
     """Return MPJPE, G-MPJPE and PA-MPJPE (3, ways) [mm]."""
     seen, rows = scene.static_views(), []
-    tracks = track_people(cameras, seen.keypoints, seen.confidence, fps, TrackingSettings())
+    tracks = track_people(cameras, seen.detections, fps, TrackingSettings())
     for way in WAYS:
         placed = triangulate_joints(
             cameras,
-            KeypointDetections.from_keypoints(
-                seen.keypoints, seen.confidence, tracks.detection_index
-            ),
+            seen.detections.assign_people(tracks.detection_index),
             TriangulationSettings(offsets=way),
         )
         found = JointTracks(scene.truth.frames, np.asarray(tracks.person), placed.joints)

@@ -25,7 +25,7 @@ def main() -> None:
     cameras = wp.Camera.stack([known[name] for name in names])
     seen = wp.KeypointDetections.stack([wp.read_observations(files[name]) for name in names])
 
-    tracks = wp.track_people(cameras, seen.keypoints, seen.confidence, float(fps))
+    tracks = wp.track_people(cameras, seen, float(fps))
     people = seen.assign_people(tracks.detection_index)
     found = wp.reconstruct_joints(cameras, people, float(fps))
     joints = found.triangulation

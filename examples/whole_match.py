@@ -30,9 +30,7 @@ def main() -> None:
     covariance = np.stack([known.estimate.covariance for known in calibrations])
 
     seen = wp.KeypointDetections.stack([find_people(match, name) for name in names])
-    tracks = wp.track_people(
-        cameras, seen.keypoints, seen.confidence, fps, pitch_size=(pitch.length, pitch.width)
-    )
+    tracks = wp.track_people(cameras, seen, fps, pitch_size=(pitch.length, pitch.width))
     people = seen.assign_people(tracks.detection_index)
     first = wp.reconstruct_joints(cameras, people, fps, camera_covariance=covariance)
 

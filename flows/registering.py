@@ -7,7 +7,6 @@ from pathlib import Path
 from data_contracts.match import MatchSpec, Registration, SourceFile
 from flows.review.corrections import corrected_match
 from flows.stage import Match
-from worldpose.body_fitting import read_monocular
 from worldpose.errors import CorruptionError, InputError
 from worldpose.ingest import (
     MatchFolder,
@@ -155,6 +154,8 @@ def _read_new_files(
         if unit not in match.detections and (path.is_dir() or is_new(path)):
             require_footage(match.spec, unit, path)
     for path in filter(is_new, match.estimates.values()):
+        from worldpose.body_fitting import read_monocular  # late: few matches have such files
+
         read_monocular(path)
     for name, path in match.stills.items():
         camera = match.spec.camera(name)

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.broadcast_tracking import BROADCAST_TRACKING
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import Track
 from data_contracts.work import Work
@@ -89,21 +90,12 @@ def _locate_people(
         {str(name): array.values for name, array in camera.data_vars.items()}
     )
     covariance, cameras = static_covariance(moving, uncertainty), moving.camera
-    arrays = [detections[name].values for name in ("keypoints", "confidence", "boxes")]
+    seen = KeypointDetections.from_arrays(detections)
     parts = []
     for frame in range(len(moving)):
         now = slice(frame, frame + 1)
-        keypoints, confidence, boxes = (array[now, None] for array in arrays)
-        parts.append(
-            locate_feet(
-                cameras[now],
-                keypoints,
-                confidence,
-                pitch,
-                boxes=boxes,
-                camera_covariance=covariance[now],
-            )
-        )
+        people = KeypointDetections.stack([seen[now]])
+        parts.append(locate_feet(cameras[now], people, pitch, camera_covariance=covariance[now]))
     names = ("xy", "noise", "calibration", "height")
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return GroundPositions(**joined)

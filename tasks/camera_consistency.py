@@ -31,8 +31,7 @@ def camera_consistency(work: Work) -> str:
         found = check_consistency(
             clip.cameras,
             open_venue(store, work, names).covariance,
-            clip.detections.keypoints,
-            clip.detections.confidence,
+            clip.detections,
             clip.fps,
             settings,
             ground=sources["ground"],

@@ -33,10 +33,9 @@ from worldpose.static_calibration import (
     calibration_coordinates,
     given_attributes,
     left_out_attributes,
-    median_picture,
 )
 from worldpose.store import Store
-from worldpose.video import index_video, open_video
+from worldpose.video import index_video, median_picture, open_video
 
 STILL_FRAMES: Final = 25
 """Number of video frames for a median still."""

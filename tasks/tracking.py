@@ -119,8 +119,7 @@ def _track_people(store: Store, work: Work) -> Tracked:
     settings = TrackingSettings.model_validate(work.recipe.settings)
     tracks = track_people(
         clip.cameras,
-        clip.detections.keypoints,
-        clip.detections.confidence,
+        clip.detections,
         clip.fps,
         settings,
         pitch_size=None if pitch is None else (pitch.length, pitch.width),
@@ -143,8 +142,7 @@ def _track_people(store: Store, work: Work) -> Tracked:
         reason = diagnose_no_people(
             clip.cameras,
             clip.camera_ids,
-            clip.detections.keypoints,
-            clip.detections.confidence,
+            clip.detections,
             clip.fps,
             settings,
             ground=pitch is not None,
@@ -185,14 +183,7 @@ def _locate_feet(clip: ClipInputs, pitch: PitchTemplate) -> GroundPositions:
     parts = [clip.detections[start : start + BLOCK] for start in range(0, frames, BLOCK)]
     return GroundPositions.concatenate(
         [
-            locate_feet(
-                clip.cameras,
-                part.keypoints,
-                part.confidence,
-                pitch,
-                boxes=part.boxes,
-                camera_covariance=clip.camera_covariance,
-            )
+            locate_feet(clip.cameras, part, pitch, camera_covariance=clip.camera_covariance)
             for part in parts
         ]
     )

@@ -12,11 +12,9 @@ import command_line
 import pytest
 from command_line import succeed
 from hypothesis import settings
+from warm_process import STAGES
 
 from flows.orchestration.prefect_environment import local_cluster_options, prefect_server
-
-STAGES = ("ingest", "static_calibration", "tracking", "triangulation", "body_fitting", "filtering")
-"""Some of the stages, which import most of the others' modules."""
 
 # How long a case takes says how busy a machine is.
 settings.register_profile("untimed", deadline=None)

@@ -20,10 +20,13 @@ def listening(process):
     return found
 
 
-def says_nothing(port):
-    """Whether a port that is not for people hangs up on those without its certificate or secret."""
-    with socket.create_connection(("127.0.0.1", port), 10) as plain:
-        plain.settimeout(10)
+def says_nothing(port, patience=10.0):
+    """Whether a port that is not for people hangs up on those without its certificate or secret.
+
+    One that takes what comes and answers nothing for so many seconds does not hang up.
+    """
+    with socket.create_connection(("127.0.0.1", port), patience) as plain:
+        plain.settimeout(patience)
         plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         try:
             said = plain.recv(100)
@@ -38,7 +41,7 @@ def says_nothing(port):
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         with (
-            socket.create_connection(("127.0.0.1", port), 10) as raw,
+            socket.create_connection(("127.0.0.1", port), patience) as raw,
             context.wrap_socket(raw) as wrapped,
         ):
             return wrapped.recv(100) == b""

@@ -18,7 +18,12 @@ import sys
 import threading
 from select import select
 
-MODULES = ("flows.match", "prefect_dask", "flows.iterate", "flows.cli.app", "zarr", "xarray")
+STAGES = ("ingest", "static_calibration", "tracking", "triangulation", "body_fitting", "filtering")
+"""Some of the stages, which import most of the others' modules."""
+MODULES = (
+    *("flows.match", "prefect_dask", "flows.iterate", "flows.cli.app", "zarr", "xarray"),
+    *(f"tasks.{stage}" for stage in STAGES),
+)
 """Not `flows.cli.console`, which looks at the terminal while it is imported."""
 
 

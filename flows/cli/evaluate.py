@@ -296,7 +296,7 @@ def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) ->
     Raises:
         UsageError: an unknown format.
     """
-    from worldpose.evaluation.method_table import COLUMNS, table_csv, table_latex, table_rows
+    from flows.results.baselines import COLUMNS, table_csv, table_latex, table_rows
 
     if form not in FORMS:
         raise UsageError(

@@ -113,7 +113,7 @@ def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]
 def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     """Cut a range of images out, and print the entry for match.yaml."""
     from worldpose.formats import whole_file
-    from worldpose.video.writing import cut_video
+    from worldpose.video.files import cut_video
 
     first, _, stop = take.partition(":")
     if not (first.isdecimal() and stop.isdecimal()):

@@ -37,7 +37,7 @@ from worldpose.reports.broadcast import (
 )
 from worldpose.reports.clips import plot_camera_view
 from worldpose.reports.html_page import Table
-from worldpose.reports.overlay_video import overlay_frames
+from worldpose.reports.videos import overlay_frames
 from worldpose.store import Run
 from worldpose.video import open_video, write_video
 

@@ -20,7 +20,7 @@ from flows.results.best_results import (
 )
 from flows.stage import Match
 from worldpose.geometry import Camera
-from worldpose.reports.overlay_video import overlay_frames
+from worldpose.reports.videos import overlay_frames
 from worldpose.store import Run, Store
 from worldpose.video import write_video
 

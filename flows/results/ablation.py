@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.body import find_body
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
 from worldpose.bundle_adjustment import (
@@ -161,13 +160,10 @@ def _clip(
 ) -> Clip:
     """Track and triangulate the trial with the base cameras; return bundle adjustment's input."""
     seen = scene.static_views(list(calibrations))
-    keypoints, confidence = seen.keypoints, seen.confidence
     cameras = Camera.stack([known.estimate.camera for known in calibrations.values()])
     fps = SCENARIOS[SCENARIO].fps
-    tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
-    detections = KeypointDetections.from_keypoints(
-        keypoints, confidence, tracks.detection_index, scene.truth.frames
-    )
+    tracks = track_people(cameras, seen.detections, fps, TrackingSettings())
+    detections = seen.detections.assign_people(tracks.detection_index)
     placed = triangulate_joints(cameras, detections, _OURS)
     return Clip(
         cameras=cameras,

@@ -205,7 +205,7 @@ def export_minimap(origin: Origin, out: Path) -> list[Path]:
         UsageError: the match has no pitch.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
-    from worldpose.reports.minimap import minimap_frames
+    from worldpose.reports.videos import minimap_frames
 
     pitch = read_match(Path(origin.registration.folder)).pitch
     if pitch is None:

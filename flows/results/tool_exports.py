@@ -23,10 +23,12 @@ from flows.results.best_results import (
 from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
-from worldpose.formats.motion_capture import stretches, write_markers, write_motion
-from worldpose.formats.opensim_file import (
-    CONVENTION,
+from worldpose.formats.motion_capture import (
+    OPENSIM_CONVENTION,
     opensim_coordinates,
+    stretches,
+    write_markers,
+    write_motion,
     write_opensim_motion,
 )
 from worldpose.formats.tables import (
@@ -140,7 +142,7 @@ def export_opensim(origin: Origin, out: Path) -> list[Path]:
         kinds = person_kinds(origin, clip)
         notes = describe_clip(origin, clip) | {
             "world": "x as in the world of the match, y up, z = minus its y",
-            "joints": CONVENTION,
+            "joints": OPENSIM_CONVENTION,
             "units": "degrees, metres, seconds; time is match frame / frames per second",
         }
         for person, person_id in enumerate(persons.tolist()):

@@ -24,11 +24,12 @@ from worldpose.review.detections import (
     find_objection,
     replay_detections,
 )
-from worldpose.review.evidence import OpenDetections, open_detections
 from worldpose.store import Store, recipe_key
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from worldpose.review.evidence import OpenDetections
 
 
 def detections_now(store: Store, match: Match, camera: str, frame: int) -> KeypointDetections:
@@ -178,6 +179,8 @@ def left_to_look_at(store: Store, match: Match, camera: str) -> list[OpenDetecti
     Raises:
         InputError: the latest run has no detections of this camera.
     """
+    from worldpose.review.evidence import open_detections  # late: it imports the calibration
+
     said = [each for each in match.journal.records if isinstance(each, Acceptance)]
     edits = [
         correction.edit

@@ -137,7 +137,8 @@ class Continuing:
             lines = [doing] if doing else []
             if run.state in QUEUED:
                 ahead = [each for each in seen.active[: seen.active.index(run)] if each.is_ahead]
-                lines = [f"waits for its turn; {len(ahead)} runs are before it"]
+                runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
+                lines = [f"waits for its turn; {runs} before it"]
             return {"state": "running", "lines": lines, "percent": percent, "prefect": run.link}
         last = seen.latest.get(match_id)
         if last is None or last.state not in ("FAILED", "CRASHED"):

@@ -81,7 +81,7 @@ class Connections:
             if len(self._open) > self.limit:
                 self._close(next(waiting, address))
 
-    def wait(self, address: object, seconds: float = REQUEST_SECONDS) -> None:
+    def wait(self, address: object, seconds: float) -> None:
         """Start a deadline for the client of a connection [s]."""
         with self._lock:
             if address in self._open:
@@ -180,7 +180,7 @@ class _Protocol(H11Protocol):
             if is_working:
                 self.connections_open.work(self._address)
             else:
-                self.connections_open.wait(self._address)
+                self.connections_open.wait(self._address, REQUEST_SECONDS)
 
 
 class _Server(uvicorn.Server):

@@ -84,7 +84,7 @@ class Structure:
             return inner
         if self.files[module].name != "__init__.py" or importer == module:
             return module
-        for node in self.trees[module].body:
+        for node in ast.walk(self.trees[module]):  # also below `if TYPE_CHECKING`
             if isinstance(node, ast.ImportFrom) and node.module in self.files:
                 for alias in node.names:
                     if (alias.asname or alias.name) == imported:

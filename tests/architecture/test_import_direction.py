@@ -22,6 +22,7 @@ FORBIDDEN = {
 
 ORDER_IN_WORLDPOSE = (
     "errors",
+    "lazy_names",
     "compiled",
     "geometry",
     "pickles",

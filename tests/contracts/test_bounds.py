@@ -11,7 +11,7 @@ from pydantic import ValidationError
 import data_contracts
 import worldpose
 from data_contracts.records import Record
-from worldpose.bundle_adjustment.solver import SolverSettings
+from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 MEASURED = {"figures"}

@@ -12,7 +12,6 @@ from flows.review.verdicts import origins_of
 from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from tasks.tracking import tracking
-from worldpose.review import standing_corrections
 from worldpose.review.identities import find_sighting
 from worldpose.store import ResultId, Store
 
@@ -68,7 +67,7 @@ def test_a_split_and_a_merge_are_in_the_tracks_and_replayed_to_the_same_bytes(st
     compute(store, planned(store))
     whole = store.open_result(TINY, "tracking", clip, planned(store).key)
     assert (whole["detection_index"].values == found.detection_index).all()
-    corrections = standing_corrections(open_match(store, TINY).journal.records)
+    corrections = open_match(store, TINY).journal.standing.values()
     assert [type(each) for each in corrections] == [Correction, Correction]
 
 

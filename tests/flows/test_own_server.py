@@ -53,17 +53,44 @@ def tables(database):
         return set(opened.execute("select type, name, sql from sqlite_master"))
 
 
-def test_what_the_first_server_makes_all_later_ones_begin_with(tmp_path, kept):
+def test_a_server_answers_its_run_alone_and_later_ones_begin_with_its_database(
+    tmp_path, kept, monkeypatch
+):
+    for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
+        monkeypatch.delenv(name, raising=False)
     first, second = tmp_path / "first", tmp_path / "second"
     with prefect_server(str(first), is_local=True) as wait_until_ready:
         wait_until_ready()
         made = tables(first / "prefect" / DATABASE)
+        login = require_answers_for_its_run_alone()
+    assert CLIENT_LOGIN not in os.environ
     assert len(made) > 50
     assert [file.name for file in kept.parent.iterdir()] == [kept.name]
     with prefect_server(str(second), is_local=True) as wait_until_ready:
         assert tables(second / "prefect" / DATABASE) == made  # before the server is up
+        assert os.environ[CLIENT_LOGIN] != login
         wait_until_ready()
     assert tables(kept) == made
+
+
+def require_answers_for_its_run_alone():
+    """Ask the server of this process with right and wrong headers; return the right login."""
+    api, login = os.environ["PREFECT_API_URL"], os.environ[CLIENT_LOGIN]
+    assert SERVER_LOGIN not in os.environ
+    address = urlsplit(api)
+
+    def ask(**headers):
+        connection = http.client.HTTPConnection(address.hostname, address.port, timeout=60)
+        connection.request("POST", "/api/flow_runs/filter", "{}", {**headers})
+        return connection.getresponse().status
+
+    right = {"Authorization": authorization(login), "Content-Type": "application/json"}
+    assert ask(**right) == 200
+    assert ask() == 401
+    assert ask(Authorization=authorization(f"{login}x")) == 401
+    assert ask(**right, Host="evil.example") == 421
+    assert ask(**right, Origin="http://evil.example") == 403
+    return login
 
 
 def test_a_database_that_is_there_stays(tmp_path, kept):
@@ -112,31 +139,6 @@ def test_only_those_on_this_machine_who_talk_plainly_are_given_it(tmp_path, monk
     # Workers elsewhere do not see the file, and another's server may be one with TLS.
     for other in ({"dask": "tcp://far:8786"}, {"owns_prefect": False}):
         assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
-
-
-def test_only_the_run_itself_gets_an_answer_of_its_server(tmp_path, kept, monkeypatch):
-    for name in ("PREFECT_API_URL", CLIENT_LOGIN, SERVER_LOGIN):  # of a server of other tests
-        monkeypatch.delenv(name, raising=False)
-    with prefect_server(str(tmp_path), is_local=True) as wait_until_ready:
-        wait_until_ready()
-        api, login = os.environ["PREFECT_API_URL"], os.environ[CLIENT_LOGIN]
-        assert SERVER_LOGIN not in os.environ
-        address = urlsplit(api)
-
-        def ask(**headers):
-            connection = http.client.HTTPConnection(address.hostname, address.port, timeout=60)
-            connection.request("POST", "/api/flow_runs/filter", "{}", {**headers})
-            return connection.getresponse().status
-
-        right = {"Authorization": authorization(login), "Content-Type": "application/json"}
-        assert ask(**right) == 200
-        assert ask() == 401
-        assert ask(Authorization=authorization(f"{login}x")) == 401
-        assert ask(**right, Host="evil.example") == 421
-        assert ask(**right, Origin="http://evil.example") == 403
-    assert CLIENT_LOGIN not in os.environ
-    with prefect_server(str(tmp_path), is_local=True):
-        assert os.environ[CLIENT_LOGIN] != login
 
 
 def test_a_prefect_server_without_a_login_does_not_start():

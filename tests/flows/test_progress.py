@@ -11,7 +11,7 @@ import time
 from datetime import UTC, datetime
 
 import pytest
-from command_line import TINY, WORLDPOSE, worldpose
+from command_line import TINY, WORLDPOSE, succeed, worldpose
 from rich.console import Console
 
 from flows import progress
@@ -185,3 +185,4 @@ def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(serve
     found = [path.parent.name for path in (tmp_path / "project").rglob("manifest.json")]
     assert len(found) >= kept >= 1
     assert "working" not in last and "Traceback" not in text and "leaked" not in text
+    succeed("run", tiny, "--project", tmp_path / "project", "--until", "tracking")

@@ -88,7 +88,7 @@ def test_a_silent_webhook_is_asked_once_and_then_left_for_a_while(
     silent, tmp_path, caplog, monkeypatch
 ):
     """Sixty alerts were sixty times ten seconds, and a line of the log each, for ever."""
-    monkeypatch.setattr("flows.service.senders.ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr("flows.service.senders.ANSWER_SECONDS", 0.05)
     clock = SimpleNamespace(now=1000.0)
     monkeypatch.setattr("flows.service.alerts.time", SimpleNamespace(monotonic=lambda: clock.now))
     teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(silent)])

@@ -56,7 +56,7 @@ def test_a_port_that_takes_anything_and_is_silent_is_found():
             pass
 
     with answering(swallow) as port:
-        assert not says_nothing(port)
+        assert not says_nothing(port, patience=1.0)
 
 
 def test_a_port_that_hangs_up_is_none():

@@ -5,27 +5,32 @@ Input: `BodyParameters`, and the open body or an installed one. Output: world po
 gradients; only the latter needs torch.
 """
 
-from worldpose.body.body_file import (
-    BODY_FOLDER,
-    OPEN_BODY,
-    body_path,
-    digest_of_body,
-    find_body,
-    install_body,
-    load_body,
-    load_open_body,
-    save_body,
-)
-from worldpose.body.keypoints import (
-    BODY25,
-    CHALLENGE15,
-    EVALUATED14,
-    SKELETONS,
-    FoldedKeypoints,
-    fold_keypoints,
-    fold_regressor,
-)
-from worldpose.body.model import BodyModel, BodyParameters
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.body.body_file import (
+        BODY_FOLDER,
+        OPEN_BODY,
+        body_path,
+        digest_of_body,
+        find_body,
+        install_body,
+        load_body,
+        load_open_body,
+        save_body,
+    )
+    from worldpose.body.keypoints import (
+        BODY25,
+        CHALLENGE15,
+        EVALUATED14,
+        SKELETONS,
+        FoldedKeypoints,
+        fold_keypoints,
+        fold_regressor,
+    )
+    from worldpose.body.model import BodyModel, BodyParameters
 
 __all__ = [
     "BODY25",
@@ -47,3 +52,33 @@ __all__ = [
     "load_open_body",
     "save_body",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.body.body_file": (
+            "BODY_FOLDER",
+            "OPEN_BODY",
+            "body_path",
+            "digest_of_body",
+            "find_body",
+            "install_body",
+            "load_body",
+            "load_open_body",
+            "save_body",
+        ),
+        "worldpose.body.keypoints": (
+            "BODY25",
+            "CHALLENGE15",
+            "EVALUATED14",
+            "SKELETONS",
+            "FoldedKeypoints",
+            "fold_keypoints",
+            "fold_regressor",
+        ),
+        "worldpose.body.model": (
+            "BodyModel",
+            "BodyParameters",
+        ),
+    },
+)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from worldpose.body.model import POSE_FEATURES, SMPL_VERTICES, BodyModel
 from worldpose.errors import InputError, UsageError
-from worldpose.pickles import plain, read_notes
 
 OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
@@ -109,6 +108,8 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
     Raises:
         InputError: the file cannot be read, names anything but arrays, or lacks a key.
     """
+    from worldpose.pickles import plain, read_notes  # late: they import scipy
+
     try:
         content = read_notes(path)
     except OSError as error:

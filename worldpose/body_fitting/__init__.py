@@ -4,35 +4,40 @@ Input: triangulated joints with covariance, a body model, and the ground where k
 parameters, the bodies' keypoints with covariance, and the detector's systematic offsets.
 """
 
-from worldpose.body_fitting.body_fit import (
-    BodyFit,
-    BodyFittingReport,
-    ClipEvidence,
-    fit_bodies,
-    report_fit,
-)
-from worldpose.body_fitting.bones import (
-    BoneLengths,
-    Shape,
-    fit_shape,
-    measure_bones,
-    pool_shapes,
-)
-from worldpose.body_fitting.monocular import (
-    MonocularEstimates,
-    MonocularPoses,
-    place_monocular_poses,
-    read_monocular,
-)
-from worldpose.body_fitting.ray_constraints import (
-    RayConstraints,
-    constrain_to_rays,
-    find_ray_constraints,
-    identify_people,
-    shift_frames,
-)
-from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import far_offsets
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.body_fitting.body_fit import (
+        BodyFit,
+        BodyFittingReport,
+        ClipEvidence,
+        fit_bodies,
+        report_fit,
+    )
+    from worldpose.body_fitting.bones import (
+        BoneLengths,
+        Shape,
+        fit_shape,
+        measure_bones,
+        pool_shapes,
+    )
+    from worldpose.body_fitting.monocular import (
+        MonocularEstimates,
+        MonocularPoses,
+        place_monocular_poses,
+        read_monocular,
+    )
+    from worldpose.body_fitting.ray_constraints import (
+        RayConstraints,
+        constrain_to_rays,
+        find_ray_constraints,
+        identify_people,
+        shift_frames,
+    )
+    from worldpose.body_fitting.settings import BodyFittingSettings
+    from worldpose.body_fitting.shared_bias import far_offsets
 
 __all__ = [
     "BodyFit",
@@ -57,3 +62,38 @@ __all__ = [
     "report_fit",
     "shift_frames",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.body_fitting.body_fit": (
+            "BodyFit",
+            "BodyFittingReport",
+            "ClipEvidence",
+            "fit_bodies",
+            "report_fit",
+        ),
+        "worldpose.body_fitting.bones": (
+            "BoneLengths",
+            "Shape",
+            "fit_shape",
+            "measure_bones",
+            "pool_shapes",
+        ),
+        "worldpose.body_fitting.monocular": (
+            "MonocularEstimates",
+            "MonocularPoses",
+            "place_monocular_poses",
+            "read_monocular",
+        ),
+        "worldpose.body_fitting.ray_constraints": (
+            "RayConstraints",
+            "constrain_to_rays",
+            "find_ray_constraints",
+            "identify_people",
+            "shift_frames",
+        ),
+        "worldpose.body_fitting.settings": ("BodyFittingSettings",),
+        "worldpose.body_fitting.shared_bias": ("far_offsets",),
+    },
+)

@@ -9,8 +9,8 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.bundle_adjustment.clip import Clip, Observations
-from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
-from worldpose.bundle_adjustment.solver import Problem, Solution, SolverSettings
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
+from worldpose.bundle_adjustment.solver import Problem, Solution
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS
 

@@ -7,8 +7,19 @@ from typing import Literal
 from pydantic import Field
 
 from data_contracts.records import Frame, Record
-from worldpose.bundle_adjustment.solver import SolverSettings
 from worldpose.static_calibration.settings import SURVEY_ERROR
+
+
+class SolverSettings(Record):
+    """Stopping rule and initial damping of the solver."""
+
+    max_iterations: int = Field(default=50, ge=1, le=10000)
+    """Maximum steps [1]; a dozen are usual."""
+    min_cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
+    """Relative gain below which a step is the last [1]: two orders below the gain that moves a
+    joint by a tenth of a millimetre."""
+    damping: float = Field(default=1e-4, ge=1e-12, le=1e6)
+    """Initial Marquardt damping [1]: initial errors are a few pixels, where plain steps work."""
 
 
 class GivenCameraPrior(Record):

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from pydantic import Field
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
 from data_contracts.arrays import Flags, Floats, Integers
-from data_contracts.records import Record
+from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.errors import InputError, InternalError
 from worldpose.geometry import Camera
 from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
@@ -30,18 +29,6 @@ BLOCK: Final = 256
 _MIN_SHARE: Final = 0.1
 """Minimum share of a camera in the weakest direction for a message to name it, relative to an equal
 share of all cameras [1]."""
-
-
-class SolverSettings(Record):
-    """Stopping rule and initial damping of the solver."""
-
-    max_iterations: int = Field(default=50, ge=1, le=10000)
-    """Maximum steps [1]; a dozen are usual."""
-    min_cost_change: float = Field(default=1e-8, ge=1e-12, le=1)
-    """Relative gain below which a step is the last [1]: two orders below the gain that moves a
-    joint by a tenth of a millimetre."""
-    damping: float = Field(default=1e-4, ge=1e-12, le=1e6)
-    """Initial Marquardt damping [1]: initial errors are a few pixels, where plain steps work."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,17 @@
 """Detection and diagnosis of cameras that are inconsistent with the others."""
 
-from worldpose.camera_consistency.comparison import ConsistencySettings
-from worldpose.camera_consistency.consistency import (
-    check_consistency,
-    describe_faults,
-    faulty_cameras,
-)
-from worldpose.camera_consistency.diagnosis import Consistency, Fault
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.camera_consistency.comparison import ConsistencySettings
+    from worldpose.camera_consistency.consistency import (
+        check_consistency,
+        describe_faults,
+        faulty_cameras,
+    )
+    from worldpose.camera_consistency.diagnosis import Consistency, Fault
 
 __all__ = [
     "Consistency",
@@ -16,3 +21,19 @@ __all__ = [
     "describe_faults",
     "faulty_cameras",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.camera_consistency.comparison": ("ConsistencySettings",),
+        "worldpose.camera_consistency.consistency": (
+            "check_consistency",
+            "describe_faults",
+            "faulty_cameras",
+        ),
+        "worldpose.camera_consistency.diagnosis": (
+            "Consistency",
+            "Fault",
+        ),
+    },
+)

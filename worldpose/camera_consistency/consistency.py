@@ -10,6 +10,7 @@ import numpy as np
 
 from data_contracts.arrays import ClipArray, Floats
 from data_contracts.camera_consistency import CameraFault
+from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.comparison import Comparison, ConsistencySettings
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
 from worldpose.errors import InputError
@@ -25,8 +26,7 @@ MIN_FOCAL_ERROR: Final = 0.03
 def check_consistency(
     cameras: Camera,
     covariance: Floats | None,
-    keypoints: ClipArray,
-    confidence: ClipArray,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: ConsistencySettings,
     *,
@@ -43,9 +43,8 @@ def check_consistency(
     Args:
         cameras: batch (cameras,).
         covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); 0 or less excludes a keypoint, only the sign
-            counts.
+        detections: (frames, cameras, detections); a confidence of 0 or less excludes a keypoint,
+            only its sign counts.
         fps: frames per second [1/s].
         settings: number of compared frames, and noise.
         ground: whether people stand on z = 0; else they may be anywhere.
@@ -53,6 +52,7 @@ def check_consistency(
     Raises:
         InputError: the shapes do not fit together.
     """
+    keypoints, confidence = detections.keypoints, detections.confidence
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
         raise InputError(
             "camera consistency",

@@ -5,18 +5,38 @@ Outputs: `data_contracts.evaluation.Evaluation`, one `PersonScore` per true pers
 `CameraScore` per camera.
 """
 
-from worldpose.evaluation.alignment import Similarity, align
-from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
-from worldpose.evaluation.metrics import PersonScore, evaluate_joints
-from worldpose.evaluation.settings import CameraErrorSettings, EvaluationSettings
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
+    from worldpose.evaluation.metrics import PersonScore, evaluate_joints
+    from worldpose.evaluation.settings import CameraErrorSettings, EvaluationSettings
 
 __all__ = [
     "CameraErrorSettings",
     "CameraScore",
     "EvaluationSettings",
     "PersonScore",
-    "Similarity",
-    "align",
     "evaluate_cameras",
     "evaluate_joints",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.evaluation.cameras": (
+            "CameraScore",
+            "evaluate_cameras",
+        ),
+        "worldpose.evaluation.metrics": (
+            "PersonScore",
+            "evaluate_joints",
+        ),
+        "worldpose.evaluation.settings": (
+            "CameraErrorSettings",
+            "EvaluationSettings",
+        ),
+    },
+)

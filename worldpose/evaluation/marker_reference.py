@@ -17,7 +17,6 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.records import Record
 from worldpose.errors import DegenerateError, InputError
-from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.matching import (
     joint_distances,
     match_people,
@@ -25,6 +24,7 @@ from worldpose.evaluation.matching import (
     take_matched,
 )
 from worldpose.formats import JointTracks
+from worldpose.geometry.rigid import Similarity, align
 
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit in such files [m]."""

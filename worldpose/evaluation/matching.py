@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from worldpose.errors import InputError
-from worldpose.evaluation.alignment import Similarity, align
 from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_iou
+from worldpose.geometry.rigid import Similarity, align
 
 HOTA_LEVELS: Final = np.arange(1, 20) / 20.0
 """Similarity thresholds from 0.05 to 0.95 that HOTA averages over."""

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
-from worldpose.evaluation.alignment import align
 from worldpose.evaluation.matching import (
     identity_scores,
     joint_distances,
@@ -22,6 +21,7 @@ from worldpose.evaluation.matching import (
 from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
+from worldpose.geometry.rigid import align
 
 LIMBS: Final = {
     "left upper arm": ((5,), (7,)),

@@ -4,28 +4,33 @@ Input: fitted bodies, cameras, detections and their matches to people. Output: k
 out and corrections to subtract in the next iteration, and prediction errors in held-out cameras.
 """
 
-from worldpose.filtering.held_out import HeldOut, measure_held_out
-from worldpose.filtering.judging import (
-    Judgement,
-    Spread,
-    TriangulatedDetections,
-    judge_detections,
-    learn_keypoint_spread,
-)
-from worldpose.filtering.settings import FilteringSettings
-from worldpose.filtering.systematic_errors import (
-    BodyMotion,
-    SystematicErrors,
-    ViewBias,
-    learn_systematic_errors,
-    watch_motion,
-)
-from worldpose.filtering.views import (
-    BodyViews,
-    perceived_covariance,
-    perceived_joints,
-    view_bodies,
-)
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.filtering.held_out import HeldOut, measure_held_out
+    from worldpose.filtering.judging import (
+        Judgement,
+        Spread,
+        TriangulatedDetections,
+        judge_detections,
+        learn_keypoint_spread,
+    )
+    from worldpose.filtering.settings import FilteringSettings
+    from worldpose.filtering.systematic_errors import (
+        BodyMotion,
+        SystematicErrors,
+        ViewBias,
+        learn_systematic_errors,
+        watch_motion,
+    )
+    from worldpose.filtering.views import (
+        BodyViews,
+        perceived_covariance,
+        perceived_joints,
+        view_bodies,
+    )
 
 __all__ = [
     "BodyMotion",
@@ -46,3 +51,34 @@ __all__ = [
     "view_bodies",
     "watch_motion",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.filtering.held_out": (
+            "HeldOut",
+            "measure_held_out",
+        ),
+        "worldpose.filtering.judging": (
+            "Judgement",
+            "Spread",
+            "TriangulatedDetections",
+            "judge_detections",
+            "learn_keypoint_spread",
+        ),
+        "worldpose.filtering.settings": ("FilteringSettings",),
+        "worldpose.filtering.systematic_errors": (
+            "BodyMotion",
+            "SystematicErrors",
+            "ViewBias",
+            "learn_systematic_errors",
+            "watch_motion",
+        ),
+        "worldpose.filtering.views": (
+            "BodyViews",
+            "perceived_covariance",
+            "perceived_joints",
+            "view_bodies",
+        ),
+    },
+)

@@ -14,17 +14,18 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
 from worldpose.formats.files import SETTINGS_BYTES, read_toml, require_file
-from worldpose.geometry import Camera
+
+if TYPE_CHECKING:
+    from worldpose.geometry import Camera
 
 SIZE_LIMIT: Final = 1 << 16
 """Maximum width and height of an image [px]; OpenCV's own limit for most operations."""
@@ -280,6 +281,8 @@ def _read_rotation(table: Mapping[str, Any], where: str) -> NDArray[np.float64]:
             found=f"one of length {angle:g}",
             todo="If these are degrees, multiply them by pi / 180.",
         )
+    from scipy.spatial.transform import Rotation  # late: it takes 0.1 s, and few rotations are read
+
     matrix: NDArray[np.float64] = Rotation.from_rotvec(given.ravel()).as_matrix()
     return matrix
 
@@ -330,6 +333,8 @@ def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibrat
     Numbers keep all digits. A rotation becomes a Rodrigues vector, the only form that all of them
     read, with rounding errors of 1e-15 on reading.
     """
+    from scipy.spatial.transform import Rotation  # late: as above
+
     lines = []
     for index, (name, camera) in enumerate(calibrations.items()):
         (fx, fy), (cx, cy) = camera.focal_px, camera.principal_point_px
@@ -442,6 +447,8 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     Raises:
         InputError: an unknown file type, or an invalid entry, with file and key.
     """
+    from worldpose.geometry import Camera  # late: most commands only check calibrations
+
     given = read_calibration(Path(path))
     return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}
 

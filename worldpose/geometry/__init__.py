@@ -3,15 +3,19 @@
 Inputs: calibrations, world points [m] or pixels. Outputs: pixels with Jacobians, rays, distances.
 """
 
-from worldpose.geometry.cameras import Camera, Projection
-from worldpose.geometry.distortion import fold_radius
-from worldpose.geometry.rays import (
-    Rays,
-    RayStatus,
-    distance_to_rays,
-    intersect_rays,
-)
-from worldpose.geometry.rigid import Rigid, nearest_rotation
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.geometry.cameras import Camera, Projection
+    from worldpose.geometry.projection import fold_radius
+    from worldpose.geometry.rays import (
+        Rays,
+        RayStatus,
+        intersect_rays,
+    )
+    from worldpose.geometry.rigid import Rigid, Similarity, align, nearest_rotation
 
 __all__ = [
     "Camera",
@@ -19,8 +23,31 @@ __all__ = [
     "RayStatus",
     "Rays",
     "Rigid",
-    "distance_to_rays",
+    "Similarity",
+    "align",
     "fold_radius",
     "intersect_rays",
     "nearest_rotation",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.geometry.cameras": (
+            "Camera",
+            "Projection",
+        ),
+        "worldpose.geometry.projection": ("fold_radius",),
+        "worldpose.geometry.rays": (
+            "Rays",
+            "RayStatus",
+            "intersect_rays",
+        ),
+        "worldpose.geometry.rigid": (
+            "Rigid",
+            "Similarity",
+            "align",
+            "nearest_rotation",
+        ),
+    },
+)

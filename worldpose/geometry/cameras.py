@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from data_contracts.cameras import CameraCalibration, Vector3
 from worldpose.errors import InputError
 from worldpose.geometry import projection
-from worldpose.geometry.distortion import fold_radius
+from worldpose.geometry.projection import fold_radius
 from worldpose.geometry.rays import Rays
 from worldpose.geometry.rigid import (
     Index,

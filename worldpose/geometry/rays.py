@@ -63,29 +63,6 @@ class Rays:
         )
 
 
-def distance_to_rays(points: ArrayLike, rays: Rays) -> NDArray[np.float64]:
-    """Return the distance of points to rays.
-
-    A ray begins at its camera: for a point behind it, the distance to the camera counts.
-
-    Args:
-        points: (..., 3) [m], world; broadcasts against the rays.
-        rays: (...) rays.
-
-    Returns:
-        (...) [m]; NaN where the point or the ray is missing.
-
-    Note:
-        T1.
-    """
-    offset = check_shape("distance_to_rays: points", points, (3,)) - rays.origins
-    along = np.maximum(np.einsum("...i,...i->...", offset, rays.directions), 0.0)
-    distance: NDArray[np.float64] = np.linalg.norm(
-        offset - along[..., None] * rays.directions, axis=-1
-    )
-    return distance
-
-
 def intersect_rays(
     rays: Rays, weights: ArrayLike | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,9 @@ from worldpose.errors import InputError
 from worldpose.formats.files import require_file
 from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder
-from worldpose.video import FrameIndex, index_video
-from worldpose.video.folder import declared_size, decode_image
+
+if TYPE_CHECKING:
+    from worldpose.video import FrameIndex
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,8 @@ def read_footage(
     Raises:
         InputError: no video, another size or rate, or a clip of which it has no frame.
     """
+    from worldpose.video import index_video  # late: most commands open no video
+
     index = index_video(path) if index is None else index
     if index.size != image_size:
         raise InputError(
@@ -207,6 +211,8 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     Raises:
         InputError: no such file, no image, or another image size.
     """
+    from worldpose.video.folder import declared_size, decode_image  # late: as above
+
     path = Path(path)
     size = require_file(path)
     content = np.fromfile(path, dtype=np.uint8) if size <= STILL_BYTES else np.empty(0, np.uint8)

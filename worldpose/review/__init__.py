@@ -4,16 +4,25 @@ Input: the journal of a match in the store, and the content of the match folder.
 results, corrected clicks and stale corrections.
 """
 
-from worldpose.review.clicks import Replay, add_previous_value, current_value, replay_corrections
-from worldpose.review.journal import (
-    Journal,
-    append,
-    last_decision,
-    read_journal,
-    requests_by_id,
-    say,
-    standing_corrections,
-)
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.review.clicks import (
+        Replay,
+        add_previous_value,
+        current_value,
+        replay_corrections,
+    )
+    from worldpose.review.journal import (
+        Journal,
+        append,
+        last_decision,
+        read_journal,
+        requests_by_id,
+        say,
+    )
 
 __all__ = [
     "Journal",
@@ -26,5 +35,24 @@ __all__ = [
     "replay_corrections",
     "requests_by_id",
     "say",
-    "standing_corrections",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.review.clicks": (
+            "Replay",
+            "add_previous_value",
+            "current_value",
+            "replay_corrections",
+        ),
+        "worldpose.review.journal": (
+            "Journal",
+            "append",
+            "last_decision",
+            "read_journal",
+            "requests_by_id",
+            "say",
+        ),
+    },
+)

@@ -273,14 +273,3 @@ def last_decision(
         elif isinstance(record, ReviewDecision) and record.request in about:
             last = record
     return last
-
-
-def standing_corrections(records: Iterable[ReviewRecord]) -> tuple[Correction, ...]:
-    """Return the corrections in the order they were made, without withdrawn ones."""
-    standing: dict[str, Correction] = {}
-    for record in records:
-        if isinstance(record, Correction):
-            standing[record.id] = record
-        elif isinstance(record, Withdrawal):
-            standing.pop(record.correction, None)
-    return tuple(standing.values())

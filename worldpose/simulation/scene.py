@@ -214,15 +214,13 @@ class StaticViews:
     """Detections of static cameras per frame, the input of tracking.
 
     Attributes:
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where there is none.
-        confidence: (frames, cameras, detections, 17); NaN where there is none.
+        detections: (frames, cameras, detections); NaN where there is none.
         person: (frames, cameras, detections) index into the truth's `person_ids`; -1 for false
             positives and padding.
         displaced: (frames, cameras, detections, 17) bool, keypoints with deliberate gross errors.
     """
 
-    keypoints: NDArray[np.float64]
-    confidence: NDArray[np.float64]
+    detections: KeypointDetections
     person: NDArray[np.int16]
     displaced: NDArray[np.bool_]
 
@@ -279,7 +277,8 @@ class Scene:
             confidence[rows, c, :last] = each.confidence
             person[rows, c, :last] = self.identities[name].person
             displaced[rows, c, :last] = self.identities[name].displaced
-        return StaticViews(keypoints, confidence, person, displaced)
+        detections = KeypointDetections.from_keypoints(keypoints, confidence, frame=frames)
+        return StaticViews(detections, person, displaced)
 
 
 @dataclass(frozen=True, eq=False)

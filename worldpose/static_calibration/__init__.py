@@ -3,28 +3,32 @@
 Input: a pitch template, clicked points and drawn markings. Output: a camera and its covariance.
 """
 
-from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.clip_picture import median_picture
-from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
-from worldpose.static_calibration.parameters import (
-    PARAMETERS,
-    CameraEstimate,
-    project_with_jacobian,
-    step_camera,
-)
-from worldpose.static_calibration.report import (
-    CalibrationReport,
-    MarkingResidual,
-    PointResidual,
-    StaticCalibration,
-    calibration_arrays,
-    calibration_attributes,
-    calibration_coordinates,
-    given_attributes,
-    image_problems,
-    left_out_attributes,
-)
-from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.static_calibration.calibration import calibrate_camera
+    from worldpose.static_calibration.ground_error import GroundErrorMap, ground_error_map
+    from worldpose.static_calibration.parameters import (
+        PARAMETERS,
+        CameraEstimate,
+        project_with_jacobian,
+        step_camera,
+    )
+    from worldpose.static_calibration.report import (
+        CalibrationReport,
+        MarkingResidual,
+        PointResidual,
+        StaticCalibration,
+        calibration_arrays,
+        calibration_attributes,
+        calibration_coordinates,
+        given_attributes,
+        image_problems,
+        left_out_attributes,
+    )
+    from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
 __all__ = [
     "PARAMETERS",
@@ -44,7 +48,39 @@ __all__ = [
     "ground_error_map",
     "image_problems",
     "left_out_attributes",
-    "median_picture",
     "project_with_jacobian",
     "step_camera",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.static_calibration.calibration": ("calibrate_camera",),
+        "worldpose.static_calibration.ground_error": (
+            "GroundErrorMap",
+            "ground_error_map",
+        ),
+        "worldpose.static_calibration.parameters": (
+            "PARAMETERS",
+            "CameraEstimate",
+            "project_with_jacobian",
+            "step_camera",
+        ),
+        "worldpose.static_calibration.report": (
+            "CalibrationReport",
+            "MarkingResidual",
+            "PointResidual",
+            "StaticCalibration",
+            "calibration_arrays",
+            "calibration_attributes",
+            "calibration_coordinates",
+            "given_attributes",
+            "image_problems",
+            "left_out_attributes",
+        ),
+        "worldpose.static_calibration.settings": (
+            "CameraPrior",
+            "StaticCalibrationSettings",
+        ),
+    },
+)

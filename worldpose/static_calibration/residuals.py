@@ -12,8 +12,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compile_kernel
-from worldpose.geometry.distortion import fold_squared
-from worldpose.geometry.projection import project_with_jacobians
+from worldpose.geometry.projection import fold_squared, project_with_jacobians
 
 SIZE: Final = 12
 """Parameters of a step."""

@@ -4,20 +4,25 @@ Inputs: cameras and the detections of each. Outputs: the detection of every pers
 and camera, quick joints [m], and a summary of each track.
 """
 
-from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
-from worldpose.tracking.feet import GroundPositions, count_covering_cameras, locate_feet
-from worldpose.tracking.ground_tracks import (
-    GroundTracks,
-    TriangulatedPeople,
-    locate_tracks,
-    track_on_plane,
-    triangulated_places,
-)
-from worldpose.tracking.joins import describe_doubts
-from worldpose.tracking.people_selection import roster_limit
-from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
-from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
+    from worldpose.tracking.feet import GroundPositions, count_covering_cameras, locate_feet
+    from worldpose.tracking.ground_tracks import (
+        GroundTracks,
+        TriangulatedPeople,
+        locate_tracks,
+        track_on_plane,
+        triangulated_places,
+    )
+    from worldpose.tracking.joins import describe_doubts
+    from worldpose.tracking.people_selection import roster_limit
+    from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
+    from worldpose.tracking.settings import TrackingSettings
+    from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
 __all__ = [
     "GroundPositions",
@@ -39,3 +44,37 @@ __all__ = [
     "track_people",
     "triangulated_places",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.tracking.diagnosis": (
+            "NoPeople",
+            "diagnose_no_people",
+        ),
+        "worldpose.tracking.feet": (
+            "GroundPositions",
+            "count_covering_cameras",
+            "locate_feet",
+        ),
+        "worldpose.tracking.ground_tracks": (
+            "GroundTracks",
+            "TriangulatedPeople",
+            "locate_tracks",
+            "track_on_plane",
+            "triangulated_places",
+        ),
+        "worldpose.tracking.joins": ("describe_doubts",),
+        "worldpose.tracking.people_selection": ("roster_limit",),
+        "worldpose.tracking.plane_clocks": (
+            "PlaneClocks",
+            "estimate_plane_clocks",
+        ),
+        "worldpose.tracking.settings": ("TrackingSettings",),
+        "worldpose.tracking.tracker": (
+            "Tracking",
+            "TrackingReport",
+            "track_people",
+        ),
+    },
+)

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import ClipArray, Flags, Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
@@ -202,8 +203,7 @@ class NoPeople:
 def diagnose_no_people(
     cameras: Camera,
     camera_ids: Sequence[str],
-    keypoints: ClipArray,
-    confidence: ClipArray,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TrackingSettings,
     *,
@@ -215,22 +215,21 @@ def diagnose_no_people(
     Args:
         cameras: batch (cameras,).
         camera_ids: of these.
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17); 0, less or NaN where not found.
+        detections: (frames, cameras, detections); a confidence of 0, less or NaN where not found.
         fps: frames per second [1/s].
         settings: of the tracking run.
         ground: whether people stand on z = 0.
         births: tracks that began and were dropped again.
     """
-    usable = _usable_detections(keypoints, confidence, settings.min_joints)
+    usable = _usable_detections(detections, settings.min_joints)
     present = np.asarray(usable.any(axis=-1))
     counts = usable.sum(axis=(0, 2))
     detected = {name: float(n) for name, n in zip(camera_ids, counts, strict=True)}
-    empty = _explain_missing_detections(present, detected, keypoints, confidence, settings)
+    empty = _explain_missing_detections(present, detected, detections, settings)
     if empty is not None:
         return empty
     frames = _common_window(present)
-    rays = _usable_rays(cameras, keypoints, confidence, frames, settings.min_joints)
+    rays = _usable_rays(cameras, detections[frames], settings.min_joints)
     extent = float(np.ptp(cameras.center[counts > 0], axis=0).max())
     if extent < SAME_PLACE:
         together = " and ".join(name for name, count in detected.items() if count > 0)
@@ -301,8 +300,9 @@ def _all_pairs_have_rivals(
     return some
 
 
-def _usable_detections(keypoints: ClipArray, confidence: ClipArray, least: int) -> Flags:
+def _usable_detections(detections: KeypointDetections[ClipArray], least: int) -> Flags:
     """Return which detections (frames, cameras, detections) have enough joints."""
+    keypoints, confidence = detections.keypoints, detections.confidence
     rows = [
         np.count_nonzero(
             (confidence[start : start + WINDOW] > 0.0)
@@ -318,8 +318,7 @@ def _usable_detections(keypoints: ClipArray, confidence: ClipArray, least: int) 
 def _explain_missing_detections(
     present: Flags,
     detected: dict[str, float],
-    keypoints: ClipArray,
-    confidence: ClipArray,
+    detections: KeypointDetections[ClipArray],
     settings: TrackingSettings,
 ) -> NoPeople | None:
     """Return the reason if detections cannot be compared at all, else None.
@@ -327,15 +326,14 @@ def _explain_missing_detections(
     Args:
         present: (frames, cameras), whether the camera has a usable detection.
         detected: usable detections by camera.
-        keypoints: as given.
-        confidence: as given.
+        detections: as given.
         settings: of tracking.
     """
     seeing = [name for name, count in detected.items() if count > 0]
     counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
     if not seeing:
-        any_, most = _usable_detections(keypoints, confidence, 1).sum(), 0
-        while any_ and _usable_detections(keypoints, confidence, most + 1).any():
+        any_, most = _usable_detections(detections, 1).sum(), 0
+        while any_ and _usable_detections(detections, most + 1).any():
             most += 1
         if any_:
             return NoPeople(
@@ -378,14 +376,12 @@ def _common_window(present: Flags) -> slice:
     return slice(start, min(len(present), start + WINDOW))
 
 
-def _usable_rays(
-    cameras: Camera, keypoints: ClipArray, confidence: ClipArray, frames: slice, least: int
-) -> Floats:
+def _usable_rays(cameras: Camera, detections: KeypointDetections, least: int) -> Floats:
     """Return unit rays (frames, cameras, detections, 17, 3) [world]; NaN where not usable."""
-    image = np.asarray(keypoints[frames], dtype=np.float64)
+    image = np.asarray(detections.keypoints, dtype=np.float64)
     rays = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
     rays = rays.reshape(*image.shape[:-1], 3).copy()
-    rays[~(np.asarray(confidence[frames]) > 0.0)] = np.nan
+    rays[~(detections.confidence > 0.0)] = np.nan
     rays[np.count_nonzero(np.isfinite(rays[..., 0]), axis=-1) < least] = np.nan
     return rays
 

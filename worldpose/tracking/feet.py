@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
@@ -86,11 +87,9 @@ class GroundPositions:
 
 def locate_feet(
     cameras: Camera,
-    keypoints: AnyFloats,
-    confidence: AnyFloats,
+    detections: KeypointDetections,
     pitch: PitchTemplate,
     *,
-    boxes: AnyFloats | None = None,
     camera_covariance: Floats | None = None,
 ) -> GroundPositions:
     """Return where detected people stand on the pitch.
@@ -101,18 +100,17 @@ def locate_feet(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-        confidence: (frames, cameras, detections, 17).
+        detections: (frames, cameras, detections); without a box, the ankles alone tell the place.
         pitch: surface under the feet.
-        boxes: (frames, cameras, detections, 4) x0 y0 x1 y1 [px]; None = ankles alone.
         camera_covariance: (cameras, 12, 12) of the calibration; None = exact.
     """
-    shape = confidence.shape[:3]
+    keypoints, confidence, boxes = detections.keypoints, detections.confidence, detections.boxes
+    shape = detections.score.shape
     xy = np.full((*shape, 2), np.nan)
     noise = np.full((*shape, 2, 2), np.nan)
     calibration = np.zeros((*shape, 2, 2))
     height = np.full(shape, np.nan)
-    is_whole = None if boxes is None else np.zeros(shape, dtype=np.bool_)
+    is_whole = np.zeros(shape, dtype=np.bool_)
     for c in range(shape[1]):
         camera = cameras[c]
         feet = np.array(keypoints[:, c, :, ANKLES, :], dtype=np.float64)  # (2, frames, people, 2)
@@ -133,22 +131,20 @@ def locate_feet(
         along = ((nearer - place) * sight).sum(axis=-1)
         place[both] += (0.5 * along[..., None] * sight)[both]
         height_std = np.where(both, FOOT_HEIGHT_STD, 1.5 * FOOT_HEIGHT_STD)
-        size = _image_heights(keypoints[:, c], None if boxes is None else boxes[:, c])
-        if boxes is not None:
-            box = np.asarray(boxes[:, c], dtype=np.float64)
-            bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
-            # A person who is cut by the image's border has no known middle or feet.
-            inside = _are_inside(box, camera.image_size)
-            assert is_whole is not None
-            is_whole[:, c] = inside & ~_are_parts(box, confidence[:, c])
-            lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
-            absent = ~np.isfinite(place[..., 0])
-            place[absent] = lower[absent]
-            height_std = np.where(absent, BOX_HEIGHT_STD, height_std)
-            known = ~absent & np.isfinite(lower[..., 0])
-            place[known] = ((1.0 - BOX_SHARE) * place + BOX_SHARE * lower)[known]
-            top = np.stack([bottom[..., 0], box[..., 1]], axis=-1)
-            height[:, c] = _height_above(camera, top, place, pitch)
+        box = np.asarray(boxes[:, c], dtype=np.float64)
+        size = _image_heights(keypoints[:, c], boxes[:, c])
+        bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
+        # A person who is cut by the image's border has no known middle or feet.
+        inside = _are_inside(box, camera.image_size)
+        is_whole[:, c] = (inside | np.isnan(box[..., 0])) & ~_are_parts(box, confidence[:, c])
+        lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
+        absent = ~np.isfinite(place[..., 0])
+        place[absent] = lower[absent]
+        height_std = np.where(absent, BOX_HEIGHT_STD, height_std)
+        known = ~absent & np.isfinite(lower[..., 0])
+        place[known] = ((1.0 - BOX_SHARE) * place + BOX_SHARE * lower)[known]
+        top = np.stack([bottom[..., 0], box[..., 1]], axis=-1)
+        height[:, c] = _height_above(camera, top, place, pitch)
         xy[:, c] = place
         noise[:, c] = _foot_noise(camera, place, height_std, size)
         if camera_covariance is not None:
@@ -159,7 +155,7 @@ def locate_feet(
             calibration[:, c][known] = motion @ camera_covariance[c] @ motion.swapaxes(1, 2)
     xy[~np.isfinite(noise).all(axis=(-1, -2))] = np.nan
     xy[~np.isfinite(calibration).all(axis=(-1, -2))] = np.nan
-    kept = None if boxes is None else np.asarray(boxes, dtype=np.float64)
+    kept = np.asarray(boxes, dtype=np.float64)
     return GroundPositions(xy, noise, calibration, height, is_whole, kept)
 
 
@@ -243,15 +239,13 @@ def _meet(camera: Camera, pixels: Floats, pitch: PitchTemplate, above: float) ->
     return place.reshape(pixels.shape)
 
 
-def _image_heights(keypoints: AnyFloats, boxes: AnyFloats | None) -> Floats:
-    """Return the height of people in the image [px] (...), by box or keypoints."""
-    if boxes is not None:
-        return np.asarray(boxes[..., 3] - boxes[..., 1], dtype=np.float64)
+def _image_heights(keypoints: AnyFloats, boxes: AnyFloats) -> Floats:
+    """Return the height of people in the image [px] (...), by box, or by keypoints without one."""
     y = np.asarray(keypoints[..., 1], dtype=np.float64)
     known = np.isfinite(y)
-    return np.asarray(
-        np.where(known, y, -np.inf).max(axis=-1) - np.where(known, y, np.inf).min(axis=-1)
-    )
+    spread = np.where(known, y, -np.inf).max(axis=-1) - np.where(known, y, np.inf).min(axis=-1)
+    by_box = np.asarray(boxes[..., 3] - boxes[..., 1], dtype=np.float64)
+    return np.asarray(np.where(np.isnan(by_box), spread, by_box))
 
 
 def _foot_noise(camera: Camera, place: Floats, height_std: Floats, size: Floats) -> Floats:

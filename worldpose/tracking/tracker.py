@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Singles
 from data_contracts.conventions import COCO17
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.errors import InputError
@@ -83,8 +84,7 @@ class Tracking:
 
 def track_people(
     cameras: Camera,
-    keypoints: ClipArray,
-    confidence: ClipArray,
+    detections: KeypointDetections[ClipArray],
     fps: float,
     settings: TrackingSettings = TrackingSettings(),  # noqa: B008
     progress: Callable[[int, int], None] | None = None,
@@ -102,10 +102,8 @@ def track_people(
 
     Args:
         cameras: batch (cameras,).
-        keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found. Read in blocks
-            of frames.
-        confidence: (frames, cameras, detections, 17) in (0, 1]; NaN, 0 or less excludes a
-            keypoint.
+        detections: (frames, cameras, detections), read in blocks of frames; a confidence of NaN, 0
+            or less excludes a keypoint.
         fps: frames per second [1/s].
         settings: gates, least views and times.
         progress: called with frames done and frames in all.
@@ -119,6 +117,7 @@ def track_people(
     Note:
         T1, T2, D2. Constant velocity between frames departs from the paper (`predict_motion`).
     """
+    keypoints, confidence = detections.keypoints, detections.confidence
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
         raise InputError(
             "tracking",

@@ -4,20 +4,25 @@ Inputs: cameras, detected keypoints, and the detection of each person in each vi
 [m] per frame and of whole tracks, with covariance and inlier views; clock offsets of the cameras.
 """
 
-from worldpose.triangulation.chunking import (
-    Chunk,
-    ClipModel,
-    Reconstruction,
-    learn_clip,
-    reconstruct_chunks,
-    reconstruct_joints,
-)
-from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
-from worldpose.triangulation.left_right_swaps import undo_swaps
-from worldpose.triangulation.passes import Triangulation, triangulate_joints
-from worldpose.triangulation.reports import TriangulationReport
-from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import Smoothing, smooth_joints
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.triangulation.chunking import (
+        Chunk,
+        ClipModel,
+        Reconstruction,
+        learn_clip,
+        reconstruct_chunks,
+        reconstruct_joints,
+    )
+    from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
+    from worldpose.triangulation.left_right_swaps import undo_swaps
+    from worldpose.triangulation.passes import Triangulation, triangulate_joints
+    from worldpose.triangulation.reports import TriangulationReport
+    from worldpose.triangulation.settings import TriangulationSettings
+    from worldpose.triangulation.smoothing import Smoothing, smooth_joints
 
 __all__ = [
     "CameraClocks",
@@ -37,3 +42,33 @@ __all__ = [
     "triangulate_joints",
     "undo_swaps",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.triangulation.chunking": (
+            "Chunk",
+            "ClipModel",
+            "Reconstruction",
+            "learn_clip",
+            "reconstruct_chunks",
+            "reconstruct_joints",
+        ),
+        "worldpose.triangulation.clocks": (
+            "CameraClocks",
+            "estimate_clocks",
+            "shift_in_time",
+        ),
+        "worldpose.triangulation.left_right_swaps": ("undo_swaps",),
+        "worldpose.triangulation.passes": (
+            "Triangulation",
+            "triangulate_joints",
+        ),
+        "worldpose.triangulation.reports": ("TriangulationReport",),
+        "worldpose.triangulation.settings": ("TriangulationSettings",),
+        "worldpose.triangulation.smoothing": (
+            "Smoothing",
+            "smooth_joints",
+        ),
+    },
+)

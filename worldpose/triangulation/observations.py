@@ -13,7 +13,7 @@ from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, fold_radius, projection
-from worldpose.geometry.distortion import distort
+from worldpose.geometry.projection import distort
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,

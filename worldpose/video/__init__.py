@@ -4,9 +4,13 @@ Input: a video file, a folder of images, or images. Output: images by frame numb
 or a file.
 """
 
-from worldpose.video.folder import ImageFolder, index_video, open_video
-from worldpose.video.reading import FrameIndex, VideoReader, index_frames
-from worldpose.video.writing import write_video
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.video.files import FrameIndex, VideoReader, index_frames, write_video
+    from worldpose.video.folder import ImageFolder, index_video, median_picture, open_video
 
 __all__ = [
     "FrameIndex",
@@ -14,6 +18,25 @@ __all__ = [
     "VideoReader",
     "index_frames",
     "index_video",
+    "median_picture",
     "open_video",
     "write_video",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.video.files": (
+            "FrameIndex",
+            "VideoReader",
+            "index_frames",
+            "write_video",
+        ),
+        "worldpose.video.folder": (
+            "ImageFolder",
+            "index_video",
+            "median_picture",
+            "open_video",
+        ),
+    },
+)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -16,8 +16,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.errors import InputError
-from worldpose.video.reading import FrameIndex, VideoReader, index_frames
+from worldpose.video.files import FrameIndex, VideoReader, index_frames
 
 HEADER_BYTES: Final = 1 << 20
 """First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""
@@ -252,3 +253,62 @@ def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[
     begin = keys[np.maximum(np.searchsorted(keys, numbers, side="right") - 1, 0)]
     saved = begin[1:] - numbers[:-1] - 1
     return np.split(numbers, np.flatnonzero(saved >= WORTH) + 1)
+
+
+_BAND: Final = 64
+"""Rows per median computation: sorting copies them."""
+
+
+def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
+    """Return the median of a clip's frames, which shows no moving people.
+
+    At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
+    function drops every second frame and doubles the stride.
+
+    Args:
+        frames: (height, width) or (height, width, 3) each, of one camera that does not move.
+        most: maximum number of frames in memory, two or more.
+
+    Raises:
+        InputError: there are no frames, their sizes differ, or `most` is below two.
+
+    Note:
+        C4.
+    """
+    if most < 2:
+        raise InputError(
+            "median_picture: most",
+            expected="two frames or more",
+            found=f"{most}",
+            todo="Give for example 64.",
+        )
+    kept: list[Image] = []
+    stride = 1
+    for index, frame in enumerate(frames):
+        if kept and frame.shape != kept[0].shape:
+            raise _sizes(f"{kept[0].shape} and, in frame {index}, {frame.shape}")
+        if index % stride:
+            continue
+        if len(kept) == most:
+            kept, stride = kept[::2], 2 * stride
+            if index % stride:
+                continue
+        kept.append(frame.copy())  # readers may fill the same buffer again
+    if not kept:
+        raise _sizes("no frames")
+    median = np.empty_like(kept[0])
+    for top in range(0, len(median), _BAND):
+        band = np.stack([frame[top : top + _BAND] for frame in kept])
+        # The lower of the two middle values: levels stay integers.
+        middle = (len(kept) - 1) // 2
+        median[top : top + _BAND] = np.partition(band, middle, axis=0)[middle]
+    return median
+
+
+def _sizes(found: str) -> InputError:
+    return InputError(
+        "median_picture",
+        expected="one or more frames of one size",
+        found=found,
+        todo="Give frames of one camera's clip.",
+    )

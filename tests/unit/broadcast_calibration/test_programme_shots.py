@@ -11,7 +11,7 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.scene import look_at
 from worldpose.video import VideoReader, index_frames, write_video
-from worldpose.video.writing import cut_video
+from worldpose.video.files import cut_video
 
 SIZE = np.array([320, 180])
 FPS = 10.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
 from worldpose.camera_consistency.hypotheses import LEFT_RIGHT
 from worldpose.errors import InputError
@@ -76,8 +77,7 @@ def check(cameras, keypoints, covariance=None, pitch=PITCH):
     return check_consistency(
         Camera.stack(cameras),
         covariance,
-        keypoints,
-        confidence,
+        KeypointDetections.from_keypoints(keypoints, confidence),
         FPS,
         SETTINGS,
         ground=pitch is not None,
@@ -267,8 +267,7 @@ def test_shapes_that_do_not_fit_are_refused():
         check_consistency(
             Camera.stack(rig()),
             None,
-            np.zeros((4, 3, 1, 17, 2)),
-            np.zeros((4, 3, 1, 17)),
+            KeypointDetections.from_keypoints(np.zeros((4, 3, 1, 17, 2)), np.zeros((4, 3, 1, 17))),
             FPS,
             SETTINGS,
         )

@@ -27,7 +27,7 @@ def test_overlap_of_boxes():
 
 def test_missing_boxes_have_no_overlap():
     assert np.isnan(overlap([np.nan] * 4, [0, 0, 2, 2]))
-    assert box_overlaps(np.empty((3, 0, 4)), np.empty((3, 2, 4))).shape == (3, 2, 0)
+    assert box_overlaps(np.zeros((3, 0, 4)), np.zeros((3, 2, 4))).shape == (3, 2, 0)
 
 
 def test_boxes_go_around_the_joints_in_front_of_the_camera():

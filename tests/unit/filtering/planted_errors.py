@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.filtering import TriangulatedDetections, perceived_joints, view_bodies
 from worldpose.geometry import Camera
 from worldpose.simulation.scenarios import SCENARIOS
@@ -54,7 +53,7 @@ def plant(seed, scenario="tiny", duration=0.8, displaced=0.06):
         scene.truth.joints,
         view_bodies(cameras, perceived_joints(joints, np.zeros((17, 3))), covariance),
         TriangulatedDetections(
-            KeypointDetections.from_keypoints(seen.keypoints, seen.confidence, index),
+            seen.detections.assign_people(index),
             np.zeros((*index.shape, 2)),
             np.zeros((*index.shape, 3), dtype=bool),
             np.zeros(seen.person.shape, dtype=bool),

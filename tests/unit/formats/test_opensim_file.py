@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from worldpose.body import SKELETONS, BodyParameters, load_open_body
 from worldpose.errors import InputError
-from worldpose.formats.opensim_file import (
-    COORDINATES,
+from worldpose.formats.motion_capture import (
+    OPENSIM_COORDINATES,
     opensim_coordinates,
     write_opensim_motion,
 )
@@ -46,7 +46,7 @@ def body(orient=(np.pi / 2, 0.0, 0.0), place=(0.0, 0.0, 0.0), **rotations):
 
 
 def angles(model, poses, frame=0):
-    return dict(zip(COORDINATES, opensim_coordinates(model, poses)[frame], strict=True))
+    return dict(zip(OPENSIM_COORDINATES, opensim_coordinates(model, poses)[frame], strict=True))
 
 
 def check(model, poses, **expected):
@@ -158,7 +158,7 @@ def test_the_file_comes_back_from_pandas(model, tmp_path):
     assert lines[:5] == ["Coordinates", "version=1", "nRows=60", "nColumns=28", "inDegrees=yes"]
     assert lines[5:7] == ["licence=For tests.", "endheader"]
     table = pd.read_csv(tmp_path / "p.mot", sep="\t", skiprows=7)
-    assert list(table.columns) == ["time", *COORDINATES]
+    assert list(table.columns) == ["time", *OPENSIM_COORDINATES]
     np.testing.assert_allclose(table.to_numpy()[:, 1:], coordinates, atol=5.1e-6)
     # Two turns in 59 steps, without a jump of 360 degrees.
     np.testing.assert_allclose(np.diff(table.pelvis_rotation), 700.0 / 59, atol=1e-4)
@@ -169,7 +169,7 @@ def test_opensim_reads_the_file(model, tmp_path):
     coordinates = opensim_coordinates(model, body(FACING_X, **lowered(right_knee=(LEFT, 70.0))))
     write_opensim_motion(tmp_path / "p.mot", coordinates, np.array([0.5]), {"licence": "a b"})
     table = opensim.TimeSeriesTable(str(tmp_path / "p.mot"))
-    assert list(table.getColumnLabels()) == list(COORDINATES)
+    assert list(table.getColumnLabels()) == list(OPENSIM_COORDINATES)
     assert table.getDependentColumn("knee_angle_r")[0] == pytest.approx(70.0, abs=1e-4)
     assert table.getTableMetaDataString("inDegrees") == "yes"
     assert table.getTableMetaDataString("licence") == "a b"
@@ -184,7 +184,7 @@ def test_thighs_and_shanks_of_the_open_body_point_where_its_joints_are():
         rng.uniform(-0.5, 0.5, (20, 69)),
         rng.uniform(-50.0, 50.0, (20, 3)),
     )
-    found = dict(zip(COORDINATES, opensim_coordinates(body_model, poses).T, strict=True))
+    found = dict(zip(OPENSIM_COORDINATES, opensim_coordinates(body_model, poses).T, strict=True))
     joints = body_model.joints(poses)
     y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     pelvis = Rotation.from_euler(

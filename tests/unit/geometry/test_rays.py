@@ -6,7 +6,6 @@ from worldpose.errors import InputError
 from worldpose.geometry import (
     Rays,
     RayStatus,
-    distance_to_rays,
     intersect_rays,
 )
 
@@ -29,22 +28,6 @@ def without(rays: Rays, *index) -> Rays:
 
 def random_rays(rng: np.random.Generator, *shape: int) -> Rays:
     return rays_through(rng.uniform(-50, 50, (*shape, 3)), rng.uniform(-50, 50, (*shape, 3)))
-
-
-def test_distance_to_a_ray_along_x_is_the_3_4_5_triangle():
-    ray = rays_through([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    assert distance_to_rays([7.0, 3.0, 4.0], ray) == 5.0
-
-
-def test_point_behind_the_camera_is_as_far_as_the_camera():
-    ray = rays_through([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    assert distance_to_rays([-12.0, 3.0, 4.0], ray) == 13.0
-
-
-def test_missing_point_or_ray_has_no_distance():
-    rays = without(rays_through(np.zeros((2, 3)), [1.0, 0.0, 0.0]), 1)
-    distance = distance_to_rays([[np.nan, 0.0, 0.0], [1.0, 1.0, 1.0]], rays)
-    assert np.isnan(distance).all()
 
 
 def test_rays_through_one_point_meet_there():
@@ -144,7 +127,6 @@ def test_rays_broadcast_and_index():
     assert rays[:, 2].directions.shape == (4, 3)
     assert rays[..., 2].directions.shape == (4, 3)
     assert rays[:, None].directions.shape == (4, 1, 5, 3)
-    assert distance_to_rays(np.zeros((7, 1, 1, 3)), rays).shape == (7, 4, 5)
     with pytest.raises(IndexError):
         _ = rays[1, 2, 0]
 
@@ -153,7 +135,5 @@ def test_negative_weights_and_wrong_shapes_are_refused():
     rays = random_rays(np.random.default_rng(0), 2)
     with pytest.raises(InputError, match="no negative weight, found -1"):
         intersect_rays(rays, [1.0, -1.0])
-    with pytest.raises(InputError, match=r"\(\.\.\., 3\), found shape \(2,\)"):
-        distance_to_rays([0.0, 1.0], rays)
     with pytest.raises(InputError, match="broadcast"):
         Rays(np.zeros((2, 3)), np.zeros((4, 3)), np.zeros(4, np.uint8))

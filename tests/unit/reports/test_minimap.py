@@ -4,7 +4,7 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.tables import Positions
-from worldpose.reports.minimap import MARGIN_M, PIXELS_PER_M, minimap_frames
+from worldpose.reports.videos import MARGIN_M, PIXELS_PER_M, minimap_frames
 
 
 def test_people_are_drawn_at_their_places_and_in_the_way_of_their_kind():

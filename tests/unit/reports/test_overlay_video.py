@@ -8,7 +8,7 @@ from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.reports.bodies import BodyTracks
-from worldpose.reports.overlay_video import overlay_frames
+from worldpose.reports.videos import overlay_frames
 from worldpose.simulation.scene import look_at
 
 SIZE = (322, 182)

@@ -29,7 +29,6 @@ from worldpose.review import (
     append,
     read_journal,
     replay_corrections,
-    standing_corrections,
 )
 from worldpose.store import Store
 from worldpose.store.blobs import Entry
@@ -283,7 +282,7 @@ def interleave(folder, rng):
     for editor in rng.integers(0, 2, 10).tolist():
         if editor not in seen:
             journal = read_journal(store, "m")
-            state = replay_corrections(folder, standing_corrections(journal.records)).folder
+            state = replay_corrections(folder, journal.standing.values()).folder
             seen[editor] = journal
             wanted[editor] = MovedPoint(
                 camera="a",
@@ -297,7 +296,7 @@ def interleave(folder, rng):
             count += 1
             if append(store, seen.pop(editor), [correction]) is not None:
                 acknowledged.append(correction)
-    kept = standing_corrections(read_journal(store, "m").records)
+    kept = tuple(read_journal(store, "m").standing.values())
     replay = replay_corrections(folder, kept)
     assert list(kept) == acknowledged, "an acknowledged edit is lost or doubled"
     assert replay.stale == (), "an edit overwrote another person's unseen edit"

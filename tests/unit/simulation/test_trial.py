@@ -3,7 +3,6 @@ from statistics import mean
 import numpy as np
 import pytest
 
-from data_contracts.keypoints import KeypointDetections
 from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
@@ -17,13 +16,10 @@ from worldpose.triangulation import TriangulationSettings, triangulate_joints
 def reconstructed(scene, cameras, fps):
     """Scores of tracked and plainly triangulated joints: cameras are taken as exact."""
     seen = scene.static_views()
-    keypoints, confidence = seen.keypoints, seen.confidence
-    tracks = track_people(cameras, keypoints, confidence, fps, TrackingSettings())
+    tracks = track_people(cameras, seen.detections, fps, TrackingSettings())
     index = tracks.detection_index
     plain = TriangulationSettings(learn_noise=False, offsets="none")
-    joints = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), plain
-    )
+    joints = triangulate_joints(cameras, seen.detections.assign_people(index), plain)
     prediction = JointTracks(scene.truth.frames, np.asarray(tracks.person), joints.joints)
     scores, _ = evaluate_joints(prediction, scene.truth, fps=fps)
     return scores

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from worldpose.store import sources
-from worldpose.store.sources import Import, SourceCache, parse_source
+from worldpose.store import recipes
+from worldpose.store.recipes import Import, SourceCache, parse_source
 
 SOURCE = b'''
 """Docstring."""
@@ -86,7 +86,7 @@ def test_a_damaged_file_is_parsed_again(
 def test_a_file_of_another_parser_is_parsed_again(
     written: Path, parsed_sources: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sources, "_parser_version", lambda: b"another Python")
+    monkeypatch.setattr(recipes, "_parser_version", lambda: b"another Python")
     SourceCache(written).parse("worldpose.one", SOURCE)
     assert parsed_sources == [SOURCE]
 
@@ -140,6 +140,6 @@ def test_a_package_that_cannot_be_written_to_keeps_its_file_at_home(
 ) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    found = sources.own_cache_file()
+    found = recipes.own_cache_file()
     assert found is not None
     assert found.parent == tmp_path / ".cache" / "worldpose" / "__pycache__"

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+
+detections = KeypointDetections.from_keypoints
 
 FPS = 25.0
 SETTINGS = TrackingSettings()
@@ -30,10 +33,12 @@ def moved(cameras, centers):
 def reason(cameras, keypoints, confidence, *, ground=True, settings=SETTINGS):
     """The diagnosis, after tracking has found no person."""
     pitch = (105.0, 68.0) if ground else None
-    tracks = track_people(cameras, keypoints, confidence, FPS, settings, pitch_size=pitch)
+    tracks = track_people(
+        cameras, detections(keypoints, confidence), FPS, settings, pitch_size=pitch
+    )
     assert tracks.report.people == 0
     names = [f"cam{n}" for n in range(len(cameras.focal))]
-    given = (cameras, names, keypoints, confidence, FPS, settings)
+    given = (cameras, names, detections(keypoints, confidence), FPS, settings)
     return diagnose_no_people(*given, ground=ground, births=tracks.report.births)
 
 
@@ -113,7 +118,13 @@ def test_a_clock_that_is_off(ring, people, seen, late):
     late_keypoints = keypoints[40:160].copy()
     late_keypoints[:, 1] = keypoints[40 - late : 160 - late, 1]
     # Tracking may find people who are none: rays of two people meet now and then.
-    given = (cameras, ("cam0", "cam1"), late_keypoints, confidence[40:160], FPS, SETTINGS)
+    given = (
+        cameras,
+        ("cam0", "cam1"),
+        detections(late_keypoints, confidence[40:160]),
+        FPS,
+        SETTINGS,
+    )
     found = diagnose_no_people(*given, ground=True)
     assert (found.cause, found.evidence["shift_frames"]) == ("clock", late)
     assert f"by {abs(late)}" in found.message

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.tracking import Join
 from worldpose.tracking import TrackingSettings, describe_doubts, track_people
 from worldpose.tracking.joins import Takeover
+
+detections = KeypointDetections.from_keypoints
 
 FRAMES = np.arange(300, 400)
 FPS = 50.0
@@ -43,14 +46,14 @@ def hidden(ring, people, seen):
 def test_person_who_takes_the_detection_that_another_loses_is_a_takeover(hidden):
     cameras, keypoints, confidence = hidden
     keypoints[BACK:, 0, 1] = np.nan  # one detection is left to the two of them
-    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    result = track_people(cameras, detections(keypoints, confidence), FPS, TrackingSettings())
     hidden_one, other = np.argsort(result.detection_index[0, 0])
     assert result.takeovers == (Takeover(BACK, hidden_one, other),)
     assert result.report.takeovers == 1
 
 
 def test_person_who_is_seen_again_beside_the_other_is_no_takeover(hidden):
-    result = track_people(*hidden, FPS, TrackingSettings())
+    result = track_people(hidden[0], detections(*hidden[1:]), FPS, TrackingSettings())
     assert len(result.person) == 2
     assert result.takeovers == ()
 
@@ -58,7 +61,7 @@ def test_person_who_is_seen_again_beside_the_other_is_no_takeover(hidden):
 def test_other_who_is_placed_again_makes_it_no_takeover(hidden):
     cameras, keypoints, confidence = hidden
     keypoints[BACK : BACK + 3, 0, 1] = np.nan
-    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    result = track_people(cameras, detections(keypoints, confidence), FPS, TrackingSettings())
     assert len(result.person) == 2
     assert result.takeovers == ()
 
@@ -67,7 +70,7 @@ def test_takeover_of_a_track_too_short_to_be_a_person_is_left_out(hidden):
     cameras, keypoints, confidence = hidden
     keypoints[BACK:, 0, 1] = np.nan
     keypoints[: LOST - 4, :, 1] = np.nan  # 4 frames of 0.02 s; min_track_s is 0.2 s
-    result = track_people(cameras, keypoints, confidence, FPS, TrackingSettings())
+    result = track_people(cameras, detections(keypoints, confidence), FPS, TrackingSettings())
     assert len(result.person) == 1
     assert result.takeovers == ()
 

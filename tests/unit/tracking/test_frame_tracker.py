@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.person import Person, Sighting
+
+detections = KeypointDetections.from_keypoints
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -29,14 +32,17 @@ def test_person_found_again_beyond_the_gate_is_counted(ring, people, seen):
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[20:70] = np.nan
     pitch = {"pitch_size": (105.0, 68.0)}
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, **pitch)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS, **pitch)
     assert len(result.tracks) == 1
     assert result.report.joined == 1
     (join,) = result.joins
     assert (join.before, join.after, join.decided) == (0, 0, True)
     assert (join.last_frame, join.first_frame) == (19, 70)
     slow = SETTINGS.model_copy(update={"velocity_change_std_m_s": 0.2, "rms_speed_m_s": 0.1})
-    assert len(track_people(ring(5), keypoints, confidence, FPS, slow, **pitch).tracks) == 2
+    assert (
+        len(track_people(ring(5), detections(keypoints, confidence), FPS, slow, **pitch).tracks)
+        == 2
+    )
 
 
 def test_person_who_appears_in_a_room_is_not_taken_for_somebody_lost_elsewhere(ring, people, seen):
@@ -45,7 +51,7 @@ def test_person_who_appears_in_a_room_is_not_taken_for_somebody_lost_elsewhere(r
     places[70:] = [1.2, 0.0]
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[20:70] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert len(result.tracks) == 2
     assert (result.report.joined, result.report.undecided) == (0, 1)
 
@@ -57,7 +63,7 @@ def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
     places[80:] = [[0.0, -0.8], [0.0, 0.8]]
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[30:80] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert len(result.tracks) == 4
     assert result.report.undecided == len(result.joins) == 2
     assert {(join.before, join.after) for join in result.joins} in (
@@ -73,7 +79,7 @@ def test_join_that_may_be_either_way_is_left_to_review(ring, people, seen):
 def test_roster_leaves_out_who_is_too_many(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 40))
     keypoints[:15, :, 1] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, people=3)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS, people=3)
     assert sorted(owners(result)) == [0, 2, 3]
     assert result.report.dropped == 1
 
@@ -84,9 +90,9 @@ def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[30:60, :, :2] = np.nan
     causal = SETTINGS.model_copy(update={"causal": True})
-    whole = track_people(ring(5), keypoints, confidence, FPS, causal)
+    whole = track_people(ring(5), detections(keypoints, confidence), FPS, causal)
     for end in (20, 50, 62, 90):
-        part = track_people(ring(5), keypoints[:end], confidence[:end], FPS, causal)
+        part = track_people(ring(5), detections(keypoints[:end], confidence[:end]), FPS, causal)
         known = len(part.person)
         np.testing.assert_array_equal(part.detection_index, whole.detection_index[:end, :, :known])
         np.testing.assert_array_equal(part.joints, whole.joints[:end, :known])
@@ -97,10 +103,16 @@ def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
 def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 60))
     keypoints[:, 2:, 2] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
+    result = track_people(
+        ring(5), detections(keypoints, confidence), FPS, SETTINGS, pitch_size=(105.0, 68.0)
+    )
     assert sorted(owners(result)) == [0, 1, 2, 3]
     short = track_people(
-        ring(5), keypoints[:40], confidence[:40], FPS, SETTINGS, pitch_size=(105.0, 68.0)
+        ring(5),
+        detections(keypoints[:40], confidence[:40]),
+        FPS,
+        SETTINGS,
+        pitch_size=(105.0, 68.0),
     )
     assert sorted(owners(short)) == [0, 1, 3]
 
@@ -108,7 +120,7 @@ def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
 def test_cameras_that_drop_out_lose_nobody(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 60))
     keypoints[20:, :3] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 2, 3]
     assert (result.detection_index[20:, 3:] >= 0).all()
     assert (result.detection_index[20:, :3] == -1).all()
@@ -118,7 +130,7 @@ def test_negative_confidence_counts_as_not_seen(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people))
     confidence[:, :, 1] = -0.5
     confidence[:, 0, 2] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 2, 3]
     assert (result.detection_index[:, 0, owners(result).index(2)] == -1).all()
 
@@ -126,13 +138,15 @@ def test_negative_confidence_counts_as_not_seen(ring, people, seen):
 @pytest.mark.parametrize("hungarian", [True, False])
 def test_both_matchings_keep_people_apart(ring, people, seen, hungarian):
     matching = SETTINGS.model_copy(update={"hungarian": hungarian})
-    result = track_people(ring(5), *seen(ring(5), still(people)), FPS, matching)
+    result = track_people(ring(5), detections(*seen(ring(5), still(people))), FPS, matching)
     assert sorted(owners(result)) == [0, 1, 2, 3]
 
 
 def test_one_camera_alone_invents_nobody(ring, people, seen):
     keypoints, confidence = seen(ring(1), still(people, 40))
-    result = track_people(ring(1), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
+    result = track_people(
+        ring(1), detections(keypoints, confidence), FPS, SETTINGS, pitch_size=(105.0, 68.0)
+    )
     assert result.detection_index.shape == (40, 1, 0)
     assert result.report.births == 0
     assert result.report.unmatched_share == 1.0
@@ -142,7 +156,9 @@ def test_every_detection_twice_makes_nobody_twice(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 40))
     keypoints = np.concatenate([keypoints, keypoints], axis=2)
     confidence = np.concatenate([confidence, confidence], axis=2)
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS, pitch_size=(105.0, 68.0))
+    result = track_people(
+        ring(5), detections(keypoints, confidence), FPS, SETTINGS, pitch_size=(105.0, 68.0)
+    )
     assert len(result.tracks) == 4
     assert ((result.detection_index >= 0).sum(axis=2) == 4).all()
 
@@ -155,7 +171,9 @@ def test_two_seconds_without_anybody_hold_nobody(ring, people, seen):
     keypoints[50:150] = np.nan
     for causal in (False, True):
         chosen = SETTINGS.model_copy(update={"causal": causal})
-        result = track_people(ring(6), keypoints, confidence, FPS, chosen, pitch_size=(105.0, 68.0))
+        result = track_people(
+            ring(6), detections(keypoints, confidence), FPS, chosen, pitch_size=(105.0, 68.0)
+        )
         assert (result.detection_index[50:150] == -1).all()
         assert np.isnan(result.joints[50:150]).all()
         for frame in (20, 180):
@@ -173,7 +191,7 @@ def test_who_is_unseen_may_be_as_far_beyond_the_gate_as_he_can_have_gone(
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[20:28] = np.nan
     settings = SETTINGS.model_copy(update={"velocity_change_std_m_s": agility})
-    result = track_people(ring(5), keypoints, confidence, FPS, settings)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, settings)
     assert result.report.births == births
 
 
@@ -199,12 +217,12 @@ def test_person_whom_a_camera_loses_is_not_carried_away_by_a_neighbour(ring, peo
     camera = ring(2)
     keypoints, confidence = seen(camera, people(places), noise=0.5)
     keypoints[:, :, 1] = np.nan
-    alone = track_people(camera, keypoints, confidence, FPS, SETTINGS)
+    alone = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
     assert owners(alone) == [0]
     keypoints, confidence = seen(camera, people(places), noise=0.5)
     keypoints[:, 0, 1] = np.nan
     keypoints[:20, 1, 1] = np.nan
     keypoints[20:, 1, 0] = np.nan
-    taken = track_people(camera, keypoints, confidence, FPS, SETTINGS)
+    taken = track_people(camera, detections(keypoints, confidence), FPS, SETTINGS)
     together = (taken.detection_index[20:] >= 0).all(axis=1)
     assert not together.any()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -19,6 +20,8 @@ from worldpose.tracking import (
     track_on_plane,
 )
 from worldpose.tracking.feet import ANKLE_HEIGHT
+
+detections = KeypointDetections.from_keypoints
 
 PITCH = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 SIZE = (105.0, 68.0)
@@ -52,7 +55,7 @@ def walkers(frames, starts, velocities):
 def test_feet_on_the_grass_are_found_where_they_are(ring):
     places = np.array([[[0.0, 0.0], [5.0, -8.0], [-11.0, 3.0]]])
     cameras = ring(3)
-    found = locate_feet(cameras, *seen_feet(cameras, places), PITCH)
+    found = locate_feet(cameras, detections(*seen_feet(cameras, places)), PITCH)
     known = np.isfinite(found.xy)
     assert known[:, :, 0].all()
     expected = np.broadcast_to(places[:, None], found.xy.shape)
@@ -61,7 +64,7 @@ def test_feet_on_the_grass_are_found_where_they_are(ring):
 
 def test_the_error_is_long_along_the_line_of_sight(ring):
     camera = ring(3)
-    found = locate_feet(camera, *seen_feet(camera, np.zeros((1, 1, 2))), PITCH)
+    found = locate_feet(camera, detections(*seen_feet(camera, np.zeros((1, 1, 2)))), PITCH)
     for c in range(3):
         values, vectors = np.linalg.eigh(found.noise[0, c, 0])
         sight = camera[c].center[:2] / np.linalg.norm(camera[c].center[:2])
@@ -74,7 +77,7 @@ def test_a_pixel_above_the_horizon_is_nobody(ring):
     keypoints = np.full((1, 1, 1, 17, 2), np.nan)
     keypoints[..., 15:17, :] = (960.0, 5.0)  # 20 degrees over the middle of the image
     assert camera[0].unproject(keypoints[0, 0, 0, 15:16]).directions[0, 2] > 0.0
-    found = locate_feet(camera, keypoints, np.ones((1, 1, 1, 17)), PITCH)
+    found = locate_feet(camera, detections(keypoints, np.ones((1, 1, 1, 17))), PITCH)
     assert np.isnan(found.xy).all()
 
 
@@ -85,10 +88,11 @@ def test_a_box_tells_the_place_without_ankles_unless_it_ends_with_the_image(ring
         [[[[foot[0] - 20, foot[1] - 90, foot[0] + 20, foot[1]], [0, 900, 40, 1079.5]]]]
     )
     keypoints = np.full((1, 1, 2, 17, 2), np.nan)
-    found = locate_feet(camera, keypoints, np.zeros((1, 1, 2, 17)), PITCH, boxes=boxes)
+    bare = detections(keypoints, np.zeros((1, 1, 2, 17)))
+    found = locate_feet(camera, replace(bare, boxes=boxes), PITCH)
     assert np.linalg.norm(found.xy[0, 0, 0]) < 0.5
     assert np.isnan(found.xy[0, 0, 1]).all()
-    assert np.isnan(locate_feet(camera, keypoints, np.zeros((1, 1, 2, 17)), PITCH).xy).all()
+    assert np.isnan(locate_feet(camera, bare, PITCH).xy).all()
 
 
 def test_the_upper_edge_of_a_box_tells_the_height(ring):
@@ -99,7 +103,8 @@ def test_the_upper_edge_of_a_box_tells_the_height(ring):
     )
     boxes = np.concatenate([head - [20, 0], foot + [20, 0]], axis=1)[None, :, None]
     keypoints = np.full((1, 2, 1, 17, 2), np.nan)
-    found = locate_feet(camera, keypoints, np.zeros((1, 2, 1, 17)), PITCH, boxes=boxes)
+    bare = detections(keypoints, np.zeros((1, 2, 1, 17)))
+    found = locate_feet(camera, replace(bare, boxes=boxes), PITCH)
     np.testing.assert_allclose(found.height, 1.83, atol=0.06)
 
 
@@ -108,13 +113,13 @@ def test_calibration_errors_move_places_by_the_stated_covariance(ring):
     stated = np.zeros((1, 12, 12))
     stated[0, :7, :7] = np.diag(np.array([2e-3, 1e-3, 1e-3, 0.05, 0.04, 0.03, 2e-3]) ** 2)
     seen = seen_feet(camera, np.array([[[4.0, -6.0]]]))
-    found = locate_feet(camera, *seen, PITCH, camera_covariance=stated)
+    found = locate_feet(camera, detections(*seen), PITCH, camera_covariance=stated)
     rng = np.random.default_rng(0)
     moved = []
     for _ in range(2000):
         step = np.sqrt(np.diag(stated[0])) * rng.standard_normal(12)
         other = Camera.stack([step_camera(camera[0], step)])
-        moved.append(locate_feet(other, *seen, PITCH).xy[0, 0, 0])
+        moved.append(locate_feet(other, detections(*seen), PITCH).xy[0, 0, 0])
     np.testing.assert_allclose(found.calibration[0, 0, 0], np.cov(np.array(moved).T), rtol=0.15)
 
 
@@ -301,9 +306,10 @@ def test_parts_of_a_person_continue_the_track_and_start_none(ring):
     confidence = np.full((50, 1, 3, 17), 0.9)
     confidence[:, :, 2, 11:] = 0.1
     keypoints = np.full((*confidence.shape, 2), np.nan)
-    found = locate_feet(camera, keypoints, np.where(confidence > 0.5, 0.0, 0.0), PITCH, boxes=boxes)
+    boxed = replace(detections(keypoints, 0.2 * confidence), boxes=boxes)
+    found = locate_feet(camera, replace(boxed, confidence=np.zeros_like(confidence)), PITCH)
     assert found.is_whole[:, 0, :2].all()  # of equally sure detections none is a part
-    found = locate_feet(camera, keypoints, 0.2 * confidence, PITCH, boxes=boxes)
+    found = locate_feet(camera, boxed, PITCH)
     assert found.is_whole[:, 0, :2].all() and not found.is_whole[20:, 0, 2].any()
     tracks = track_on_plane(found, FPS, pitch_size=SIZE)
     assert tracks.xy.shape[1] == 2

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
@@ -13,6 +14,8 @@ from worldpose.tracking.pair_births import (
     group_pairs,
     judge_pairs,
 )
+
+detections = KeypointDetections.from_keypoints
 
 SETTINGS = TrackingSettings()
 FPS = 25.0
@@ -201,7 +204,7 @@ def picture(cameras, joints, show):
 def test_single_frame_of_two_cameras_is_enough_where_the_pair_is_clear(people):
     cameras = rig(*HIGH)
     seen = picture(cameras, people([[[-1.5, 0.5], [1.5, 1.0]]]), np.ones((2, 2)))
-    found = track_people(cameras, *seen, FPS, SETTINGS)
+    found = track_people(cameras, detections(*seen), FPS, SETTINGS)
     assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0), (1, 1)]
 
 
@@ -212,21 +215,22 @@ def test_person_whom_two_of_three_cameras_can_see_is_found_in_a_single_frame(peo
     image = cameras.project(joints.reshape(1, 1, -1, 3)).reshape(1, 3, 2, 17, 2)
     inside = ((image >= 0.0) & (image <= [1920.0, 1080.0])).all(axis=(-1, -2))[0]
     assert inside.tolist() == [[True, True], [True, True], [True, False]]
-    found = track_people(cameras, *picture(cameras, joints, inside), FPS, SETTINGS)
+    found = track_people(cameras, detections(*picture(cameras, joints, inside)), FPS, SETTINGS)
     assert sorted(map(tuple, found.detection_index[0].T)) == [(0, 0, 0), (1, 1, -1)]
 
 
 def test_single_frame_at_eye_level_gives_nobody_rather_than_ghosts(people):
     cameras = rig(*LOW)
     seen = picture(cameras, people([[[-0.8, -0.8], [0.8, 0.8]]]), np.ones((2, 2)))
-    found = track_people(cameras, *seen, FPS, SETTINGS)
+    found = track_people(cameras, detections(*seen), FPS, SETTINGS)
     assert len(found.person) == 0 and found.report.births == 0
 
 
 def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people):
     cameras = rig(*LOW)
     joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (4, 2, 2)))
-    given = (cameras, ["left", "right"], *picture(cameras, joints, np.ones((2, 2))), FPS, SETTINGS)
+    both = detections(*picture(cameras, joints, np.ones((2, 2))))
+    given = (cameras, ["left", "right"], both, FPS, SETTINGS)
     reason = diagnose_no_people(*given, ground=True, births=0)
     assert reason.cause == "ambiguous_pairs"
     assert "detections of left and right fit each other in several ways" in reason.message
@@ -238,14 +242,16 @@ def test_people_at_eye_level_are_found_once_they_stand_apart(people):
     joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (60, 2, 2)))
     keypoints, confidence = picture(cameras, joints, np.ones((2, 2)))
     keypoints[:25, :, 1] = np.nan
-    found = track_people(cameras, keypoints, confidence, FPS, SETTINGS)
+    found = track_people(cameras, detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(map(tuple, found.detection_index[-1].T)) == [(0, 0), (1, 1)]
 
 
 def test_second_detections_of_a_person_start_no_second_person_in_one_frame(people):
     cameras = rig(*HIGH)
     body = people([[[0.0, 0.0], [0.03, 0.0]]])
-    found = track_people(cameras, *picture(cameras, body, np.ones((2, 2))), FPS, SETTINGS)
+    found = track_people(
+        cameras, detections(*picture(cameras, body, np.ones((2, 2)))), FPS, SETTINGS
+    )
     assert len(found.person) == 1
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import PlayerSpec
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
@@ -15,6 +16,8 @@ from worldpose.tracking.people_selection import (
     roster_limit,
 )
 from worldpose.tracking.person import Person, Sighting
+
+detections = KeypointDetections.from_keypoints
 
 FRAMES, FULL_PITCH = 20, (105.0, 68.0)
 BODY = np.stack([np.zeros(17), np.zeros(17), np.linspace(0.0, 1.7, 17)], axis=1)
@@ -268,7 +271,9 @@ def test_tracking_keeps_a_player_who_fetches_the_ball(ring, people, seen, margin
     unseen = ((seconds > 1.0) & (seconds < 2.0)) | ((seconds > 4.0) & (seconds < 5.0))
     keypoints[unseen] = np.nan
     settings = TrackingSettings(pitch_margin_m=margin)
-    result = track_people(ring(5), keypoints, confidence, FPS, settings, pitch_size=PITCH)
+    result = track_people(
+        ring(5), detections(keypoints, confidence), FPS, settings, pitch_size=PITCH
+    )
     assert len(result.tracks) == 1
     assert result.tracks[0].frames_seen == np.count_nonzero(~unseen)
     assert result.report.dropped == 0

@@ -3,9 +3,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
+
+detections = KeypointDetections.from_keypoints
 
 SETTINGS = TrackingSettings()
 FPS = 50.0
@@ -27,7 +30,9 @@ def owners(tracking):
 @pytest.mark.parametrize("shape", [(0, 4, 3), (5, 4, 0), (5, 4, 3)])
 def test_nothing_to_see_gives_no_tracks(ring, shape):
     keypoints = np.full((*shape, 17, 2), np.nan)
-    result = track_people(ring(4), keypoints, np.full((*shape, 17), np.nan), FPS, SETTINGS)
+    result = track_people(
+        ring(4), detections(keypoints, np.full((*shape, 17), np.nan)), FPS, SETTINGS
+    )
     assert result.detection_index.shape == (shape[0], 4, 0)
     assert result.joints.shape == (shape[0], 0, 17, 3)
     assert result.tracks == ()
@@ -37,7 +42,7 @@ def test_nothing_to_see_gives_no_tracks(ring, shape):
 
 def test_one_camera_makes_no_track(ring, people, seen):
     camera = ring(4)[np.array([0])]
-    result = track_people(camera, *seen(camera, still(people)), FPS, SETTINGS)
+    result = track_people(camera, detections(*seen(camera, still(people))), FPS, SETTINGS)
     assert result.tracks == ()
     assert result.report.unmatched_share == 1.0
 
@@ -45,12 +50,12 @@ def test_one_camera_makes_no_track(ring, people, seen):
 def test_person_seen_by_one_camera_only_makes_no_track(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people))
     keypoints[:, 1:, 2] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 3]
 
 
 def test_everyone_is_followed_in_every_camera(ring, people, seen):
-    result = track_people(ring(5), *seen(ring(5), still(people)), FPS, SETTINGS)
+    result = track_people(ring(5), detections(*seen(ring(5), still(people))), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 2, 3]
     assert (result.detection_index >= 0).all()
     assert result.detection_index.dtype == np.int16
@@ -70,7 +75,7 @@ def test_everyone_is_followed_in_every_camera(ring, people, seen):
 
 
 def test_a_single_frame_is_enough_for_a_short_clip(ring, people, seen):
-    result = track_people(ring(5), *seen(ring(5), still(people, 1)), FPS, SETTINGS)
+    result = track_people(ring(5), detections(*seen(ring(5), still(people, 1))), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 2, 3]
 
 
@@ -81,7 +86,7 @@ def test_people_who_cross_keep_their_identity(ring, people, seen, fps):
     places = np.stack(
         [np.stack([6 * time, 0 * time], -1), np.stack([-6 * time, 0 * time + 0.6], -1)], axis=1
     )
-    result = track_people(ring(6), *seen(ring(6), people(places)), fps, SETTINGS)
+    result = track_people(ring(6), detections(*seen(ring(6), people(places))), fps, SETTINGS)
     assert sorted(owners(result)) == [0, 1]
     assert (result.detection_index >= 0).all()
 
@@ -92,11 +97,11 @@ def test_prediction_carries_a_sprinter_through_a_low_frame_rate(ring, people, se
     time = np.arange(0.0, 2.4, 0.1)
     run = np.where(time < 1.6, 2.5 * time**2, 6.4 + 8.0 * (time - 1.6)) - 7.0
     keypoints, confidence = seen(ring(6), people(np.stack([run, 0 * run], -1)[:, None]))
-    moving = track_people(ring(6), keypoints, confidence, 10.0, SETTINGS)
+    moving = track_people(ring(6), detections(keypoints, confidence), 10.0, SETTINGS)
     assert len(moving.tracks) == 1
     assert (moving.detection_index >= 0).all()
     at_rest = SETTINGS.model_copy(update={"predict_motion": False})
-    resting = track_people(ring(6), keypoints, confidence, 10.0, at_rest)
+    resting = track_people(ring(6), detections(keypoints, confidence), 10.0, at_rest)
     assert (resting.detection_index[-5:] < 0).any()
 
 
@@ -106,7 +111,7 @@ def test_lost_person_is_found_again_under_the_same_identity(ring, people, seen):
     places = np.stack([np.stack([np.sin(time), 0 * time], -1)], axis=1)
     keypoints, confidence = seen(ring(5), people(places))
     keypoints[50:90] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert len(result.tracks) == 1
     assert result.tracks[0].frames_seen == 110
     assert (result.detection_index[50:90] == -1).all()
@@ -118,7 +123,7 @@ def test_everything_missing_for_two_seconds_keeps_those_who_stand_still(ring, pe
     # Not the two who stand so near that they may have changed places.
     keypoints, confidence = seen(ring(5), still(people, 140, PLACES[1:]))
     keypoints[20:120] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 2]
     assert result.report.births == 6
     assert result.report.joined == 3
@@ -130,7 +135,7 @@ def test_track_ends_when_a_person_is_unseen_for_longer(ring, people, seen):
     keypoints[20:140] = np.nan
     causal = SETTINGS.model_copy(update={"causal": True})
     for setting in (causal, SETTINGS.model_copy(update={"max_join_gap_s": 2.0})):
-        result = track_people(ring(5), keypoints, confidence, FPS, setting)
+        result = track_people(ring(5), detections(keypoints, confidence), FPS, setting)
         assert sorted(owners(result)) == [0, 0, 1, 1, 2, 2, 3, 3]
         assert result.report.losses == 4
 
@@ -151,17 +156,17 @@ def test_frames_without_any_detection_cost_no_step_and_change_nothing(
         step(tracker, frame, *rays)
 
     monkeypatch.setattr(FrameTracker, "step", counted)
-    result = track_people(ring(5), long, told, FPS, SETTINGS)
+    result = track_people(ring(5), detections(long, told), FPS, SETTINGS)
     assert steps[0] == 900
     assert steps[-1] < 940 + FPS * max(SETTINGS.max_lost_s, SETTINGS.max_coast_s) + 2
-    alone = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    alone = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     np.testing.assert_array_equal(result.detection_index[900:940], alone.detection_index)
 
 
 def test_person_who_leaves_ends_and_the_others_go_on(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 150))
     keypoints[30:, :, 1] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert sorted(owners(result)) == [0, 1, 2, 3]
     gone = owners(result).index(1)
     assert result.tracks[gone].last_frame == 29
@@ -173,14 +178,14 @@ def test_single_view_after_the_last_fix_is_not_kept(ring, people, seen):
     # From frame 30 on only one camera sees the person: it may be anyone on that ray.
     keypoints, confidence = seen(ring(5), still(people, 60, PLACES[:1]))
     keypoints[30:, 1:] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert result.tracks[0].last_frame == 29
 
 
 def test_single_view_between_two_fixes_is_kept(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 60, PLACES[:1]))
     keypoints[30:35, 1:] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert (result.detection_index[30:35, 0, 0] == 0).all()
     assert np.isnan(result.joints[30:35]).all()
 
@@ -189,7 +194,9 @@ def test_ghosts_of_two_people_in_two_cameras_make_no_tracks(ring, people, seen):
     # Two views of two people meet at four places; two of them are empty.
     camera = ring(5)[np.array([0, 1])]
     places = np.array([[-1.5, 0.5], [1.5, 1.0]])
-    result = track_people(camera, *seen(camera, still(people, 40, places)), FPS, SETTINGS)
+    result = track_people(
+        camera, detections(*seen(camera, still(people, 40, places))), FPS, SETTINGS
+    )
     assert sorted(owners(result)) == [0, 1]
     assert result.report.births == 2
 
@@ -200,7 +207,7 @@ def test_false_detections_make_no_tracks(ring, people, seen):
     bogus = keypoints[:, :, rng.integers(0, 4, 2)] + rng.uniform(-600, 600, (60, 6, 2, 1, 2))
     keypoints = np.concatenate([keypoints, bogus], axis=2)
     confidence = np.concatenate([confidence, confidence[:, :, :2]], axis=2)
-    result = track_people(ring(6), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(6), detections(keypoints, confidence), FPS, SETTINGS)
     assert len(result.tracks) == 4
     mine = result.detection_index
     # A false detection may land on a person whose own is farther by noise: seen 0 of 1440.
@@ -212,7 +219,7 @@ def test_second_detections_of_a_person_make_no_second_track(ring, people, seen):
     twin = keypoints + np.random.default_rng(9).normal(0, 2.0, keypoints.shape)
     keypoints = np.concatenate([keypoints, twin], axis=2)
     confidence = np.concatenate([confidence, confidence], axis=2)
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert len(result.tracks) == 2
     assert result.report.unmatched_share == 0.5
 
@@ -221,7 +228,7 @@ def test_two_tracks_that_come_together_on_one_person_are_merged(ring, people, se
     # The second comes nearer at 2.5 m/s until both are on one place, from frame 20 on.
     places = np.zeros((60, 2, 2))
     places[:, 1, 0] = np.maximum(1.0 - np.arange(60) / 20, 0.0)
-    result = track_people(ring(6), *seen(ring(6), people(places)), FPS, SETTINGS)
+    result = track_people(ring(6), detections(*seen(ring(6), people(places))), FPS, SETTINGS)
     assert (result.report.births, result.report.merged) == (2, 1)
     ends = sorted(track.last_frame for track in result.tracks)
     # Nearer than 0.2 m after frame 16: the end is dated back to that.
@@ -234,7 +241,7 @@ def test_nan_and_zero_confidence_count_as_not_seen(ring, people, seen):
     keypoints[:, 0, 0] = np.nan
     confidence[:, 1, 0] = 0.0
     confidence[:, 2, 1] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     first, second = owners(result).index(0), owners(result).index(1)
     assert (result.detection_index[:, :2, first] == -1).all()
     assert (result.detection_index[:, 2:, first] == 0).all()
@@ -244,7 +251,7 @@ def test_nan_and_zero_confidence_count_as_not_seen(ring, people, seen):
 def test_detection_with_too_few_joints_is_not_matched(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people))
     keypoints[:, 3, 1, 4:] = np.nan
-    result = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     assert (result.detection_index[:, 3, owners(result).index(1)] == -1).all()
     assert result.report.detections == 380
 
@@ -253,12 +260,11 @@ def test_detection_with_too_few_joints_is_not_matched(ring, people, seen):
 @given(seed=st.integers(0, 10_000))
 def test_order_of_detections_does_not_matter(ring, people, seen, seed):
     keypoints, confidence = seen(ring(5), still(people, 5))
-    straight = track_people(ring(5), keypoints, confidence, FPS, SETTINGS)
+    straight = track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS)
     order = np.random.default_rng(seed).permuted(np.broadcast_to(np.arange(4), (5, 5, 4)), axis=-1)
     shuffled = track_people(
         ring(5),
-        np.take_along_axis(keypoints, order[..., None, None], axis=2),
-        confidence,
+        detections(np.take_along_axis(keypoints, order[..., None, None], axis=2), confidence),
         FPS,
         SETTINGS,
     )
@@ -272,7 +278,9 @@ def test_order_of_detections_does_not_matter(ring, people, seen, seed):
 
 def test_same_input_gives_the_same_bytes(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 30), noise=4.0)
-    runs = [track_people(ring(5), keypoints, confidence, FPS, SETTINGS) for _ in range(2)]
+    runs = [
+        track_people(ring(5), detections(keypoints, confidence), FPS, SETTINGS) for _ in range(2)
+    ]
     for name in ("person", "detection_index", "ray_distance", "joints"):
         assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes()
     assert runs[0].tracks == runs[1].tracks
@@ -284,8 +292,7 @@ def test_progress_counts_every_frame(ring, people, seen):
     keypoints, confidence = seen(ring(3), still(people, 70))
     track_people(
         ring(3),
-        keypoints,
-        confidence,
+        detections(keypoints, confidence),
         FPS,
         SETTINGS,
         lambda done, total: calls.append((done, total)),
@@ -297,7 +304,7 @@ def test_inputs_are_left_as_they_were(ring, people, seen):
     keypoints, confidence = seen(ring(4), still(people, 3))
     confidence[0, 0, 0, 0] = np.nan
     before = keypoints.copy(), confidence.copy()
-    track_people(ring(4), keypoints, confidence, FPS, SETTINGS)
+    track_people(ring(4), detections(keypoints, confidence), FPS, SETTINGS)
     np.testing.assert_array_equal(keypoints, before[0])
     np.testing.assert_array_equal(confidence, before[1])
 
@@ -305,9 +312,9 @@ def test_inputs_are_left_as_they_were(ring, people, seen):
 def test_arrays_of_different_cameras_are_refused(ring, people, seen):
     keypoints, confidence = seen(ring(4), still(people, 3))
     with pytest.raises(InputError, match="same clip"):
-        track_people(ring(3), keypoints, confidence, FPS, SETTINGS)
+        track_people(ring(3), detections(keypoints, confidence), FPS, SETTINGS)
     with pytest.raises(InputError, match="expected keypoints"):
-        track_people(ring(4), keypoints[:2], confidence, FPS, SETTINGS)
+        track_people(ring(4), detections(keypoints[:2], confidence), FPS, SETTINGS)
 
 
 def test_a_missed_person_does_not_take_the_detections_of_a_newcomer_beside(ring, people, seen):
@@ -319,7 +326,7 @@ def test_a_missed_person_does_not_take_the_detections_of_a_newcomer_beside(ring,
     keypoints, confidence = seen(ring(4), people(places))
     keypoints[:20, :, 1] = np.nan
     keypoints[20:24, :3, 0] = np.nan
-    result = track_people(ring(4), keypoints, confidence, FPS, SETTINGS)
+    result = track_people(ring(4), detections(keypoints, confidence), FPS, SETTINGS)
     assert owners(result) == [0, 1]
 
 
@@ -333,6 +340,6 @@ def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
     height = joints[:, 0, :, 2].copy()
     joints[:, 0, :, 0] += np.sin(tilt) * height
     joints[:, 0, :, 2] = np.cos(tilt) * height + 0.1
-    result = track_people(ring(4), *seen(ring(4), joints), FPS, SETTINGS)
+    result = track_people(ring(4), detections(*seen(ring(4), joints)), FPS, SETTINGS)
     assert owners(result) == [0]
     assert (result.detection_index >= 0).all()

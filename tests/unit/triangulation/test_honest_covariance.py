@@ -31,7 +31,11 @@ def arrays_of(scene, people):
     """Cameras, arrays as the tracker would match them, and the truth."""
     seen = scene.static_views()
     cameras = Camera.stack(list(scene.cameras.values()))
-    return cameras, (seen.keypoints, seen.confidence, seen.index(people)), scene.truth.joints
+    return (
+        cameras,
+        (seen.detections.keypoints, seen.detections.confidence, seen.index(people)),
+        scene.truth.joints,
+    )
 
 
 def squared_deviations(result, truth):

@@ -17,8 +17,9 @@ from worldpose.formats.annotations.annotated_images import (
     AnnotatedImage,
     AnnotatedPerson,
     ContentError,
+    coco_bytes,
+    read_coco,
 )
-from worldpose.formats.annotations.coco import coco_bytes, read_coco
 from worldpose.formats.annotations.cvat import cvat_bytes, read_cvat
 from worldpose.formats.annotations.label_studio import label_studio_bytes, read_label_studio
 

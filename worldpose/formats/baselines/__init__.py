@@ -15,12 +15,10 @@ from worldpose.body import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.baselines.camera_methods import read_humans4d, read_hybrik
 from worldpose.formats.baselines.result import MethodResult, resample_result
-from worldpose.formats.baselines.slahmr import (
+from worldpose.formats.baselines.world_methods import (
     WITH_MOTION_PRIOR,
     WITHOUT_MOTION_PRIOR,
     make_slahmr_reader,
-)
-from worldpose.formats.baselines.world_methods import (
     read_glamr,
     read_gvhmr,
     read_prompthmr,

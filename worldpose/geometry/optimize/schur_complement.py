@@ -14,8 +14,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compile_kernel
-from worldpose.geometry.distortion import distort
-from worldpose.geometry.projection import project_point
+from worldpose.geometry.projection import distort, project_point
 
 STEPS = 12
 """Parameters per camera, in the order of `worldpose.static_calibration.PARAMETERS`."""

@@ -16,7 +16,7 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.geometry import Camera, Rigid
-from worldpose.geometry.distortion import fold_radius
+from worldpose.geometry.projection import fold_radius
 from worldpose.pitch import PitchTemplate
 
 Layout = Literal["bowl", "one-side", "low", "goals", "mixed", "hall"]

@@ -226,7 +226,7 @@ def test_an_error_of_ours_is_no_fault_of_the_file(tmp_path, monkeypatch):
     def broken(*_):
         raise ValueError("operands could not be broadcast together")
 
-    monkeypatch.setattr("worldpose.formats.annotations.coco._read", broken)
+    monkeypatch.setattr("worldpose.formats.annotations.annotated_images._read", broken)
     with pytest.raises(ValueError, match="broadcast") as error:
         read_annotations(file)
     assert not isinstance(error.value, InputError)

@@ -21,9 +21,8 @@ from method_files import (
 from typer.testing import CliRunner
 
 from flows.cli.app import app
-from flows.results.baselines import score_methods
+from flows.results.baselines import score_methods, table_csv, table_latex, table_rows
 from worldpose.errors import InputError, UsageError
-from worldpose.evaluation.method_table import table_csv, table_latex, table_rows
 from worldpose.evaluation.metrics import paper_joints
 from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.formats.baselines import METHODS

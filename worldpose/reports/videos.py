@@ -1,4 +1,4 @@
-"""Overlay of projected markings and people on a camera's video."""
+"""Frames of videos: markings and people over a camera's video, and the pitch from above."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.reports.bodies import BodyTracks, paint_bodies, zoom_camera
-from worldpose.reports.drawing import TEMPLATE, markings, person_color
+from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, person_color
 
 _PARTS: Final = 16
 """Subpixel steps of line coordinates per pixel."""
@@ -25,6 +26,12 @@ _OPACITY: Final = 0.6
 """Opacity of bodies [1]: the player in the image stays visible for comparison."""
 _MARGIN: Final = 0.1
 """Margin around the image within which joints count as visible, in image widths [1]."""
+PIXELS_PER_M: Final = 10.0
+"""Scale of the pitch from above [px/m]."""
+MARGIN_M: Final = 5.0
+"""Ground around the pitch [m]."""
+RADIUS_PX: Final = 8
+"""Of a person's disc on the pitch from above [px]."""
 
 
 def overlay_frames(
@@ -102,6 +109,41 @@ def _draw(canvas: Image, pixels: Floats, color: tuple[int, int, int]) -> None:
         whole = np.rint(_PARTS * pixels[begin:end]).astype(np.int32)
         shift = _PARTS.bit_length() - 1
         cv2.polylines(canvas, [whole], False, color, 1, cv2.LINE_AA, shift)
+
+
+def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
+    """Yield the pitch from above, an image (height, width, 3) RGB per frame of `positions`.
+
+    A disc is a triangulated person, a ring one placed by the feet alone; the label is the roster
+    id, or else the person's number. Images have even sides.
+    """
+    half = 0.5 * np.array([pitch.length, pitch.width]) + MARGIN_M
+    width, height = (2.0 * np.rint(half * PIXELS_PER_M)).astype(int).tolist()
+
+    def locate(xy: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+        pixels = np.stack([xy[..., 0] + half[0], half[1] - xy[..., 1]], axis=-1) * PIXELS_PER_M
+        return np.rint(pixels).astype(np.int32)
+
+    ground = np.full((height, width, 3), _rgb(GRASS), dtype=np.uint8)
+    for line in markings(pitch):
+        cv2.polylines(ground, [locate(line[:, :2])], False, _rgb(LINE), 2, cv2.LINE_AA)
+    legend = "disc: triangulated, ring: by the feet"
+    for row, frame in enumerate(positions.frames.tolist()):
+        canvas = ground.copy()
+        _write(canvas, f"frame {frame}   {legend}", (10, 24), INK)
+        for p in np.flatnonzero(np.isfinite(positions.xy[row, :, 0])).tolist():
+            person = int(positions.person[p])
+            x, y = locate(positions.xy[row, p]).tolist()
+            thickness = 2 if positions.on_plane[row, p] else cv2.FILLED
+            color = person_color(person)
+            cv2.circle(canvas, (x, y), RADIUS_PX, _rgb(color), thickness, cv2.LINE_AA)
+            _write(canvas, positions.names[p] or str(person), (x + 10, y - 6), color)
+        yield canvas
+
+
+def _write(canvas: Image, text: str, place: tuple[int, int], color: str) -> None:
+    """Write a label."""
+    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _rgb(color), 1, cv2.LINE_AA)
 
 
 def _rgb(color: str) -> tuple[int, int, int]:

@@ -1,4 +1,8 @@
-"""People missing from a camera's detections, the boxes to search, and acceptance of the results."""
+"""Redetection of people at the predicted projections of their bodies (R2).
+
+Input: bodies of the previous iteration in one camera's frames, its detections, a pose estimator.
+Output: the people searched for, the estimator's results, and the accepted ones.
+"""
 
 from __future__ import annotations
 
