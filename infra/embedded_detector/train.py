@@ -129,13 +129,14 @@ PHASES: Final = {
         Phase(6000, 6000, 1e-3, 2, FEW),
         Phase(3750, 5000, 1e-3, 11, ALL),
         Phase(3500, 3500, 1e-3, 7, {"training": 1, "crowds": 1, "pair": 7}, real=True),
+        Phase(5000, 5000, 1e-3, 9, {"training": 1, "crowds": 1, "pair": 7}, real=True),
     ),
 }
 """Phases of the shipped weights, with exceptions in the model card."""
 SMALL_WINDOWS: Final = PeopleWindows(height=(20.0, 160.0), aimed=0.65, looks=REAL_LOOKS)
 """Windows of the detector's last phases."""
 REAL_CROPS: Final = KeypointCrops(looks=REAL_LOOKS)
-"""Crops of the pose estimator's last phase."""
+"""Crops of the pose estimator's last phases."""
 
 
 def main(
