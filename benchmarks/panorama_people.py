@@ -24,11 +24,9 @@ import numpy as np
 from worldpose.detection import DetectionSettings, People
 from worldpose.detection.models import load_detectors
 from worldpose.detection.suppression import fuse
-from worldpose.training.labels import LabelledPicture, read_picture
+from worldpose.training import LabelledPicture, read_picture, read_yolo_labels
 from worldpose.training.metrics import average_precision
 
-PERSON = 0
-"""Class of people in the label files."""
 PARTS = {"train": "_1st_", "test": "_2nd_", "all": ""}
 """Text in the names of the images of each part."""
 
@@ -46,32 +44,7 @@ def load_stills(folder: Path, count: int | None = None, part: str = "all") -> li
             files[i]
             for i in np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)
         ]
-    return [_read_still(file) for file in files]
-
-
-def _read_still(image: Path) -> LabelledPicture:
-    height, width = read_picture(image).shape[:2]
-    boxes = []
-    for line in image.with_suffix(".txt").read_text().splitlines():
-        kind, *numbers = line.split()
-        if int(kind) != PERSON:
-            continue
-        values = np.array(numbers, dtype=np.float64)
-        if len(values) == 4:
-            low, high = values[:2] - values[2:] / 2, values[:2] + values[2:] / 2
-        else:
-            corners = values.reshape(-1, 2)
-            low, high = corners.min(axis=0), corners.max(axis=0)
-        # Labels count from the corner of the first pixel, boxes from its centre.
-        boxes.append(np.concatenate([low, high]) * [width, height, width, height] - 0.5)
-    people = len(boxes)
-    return LabelledPicture(
-        path=image,
-        boxes=np.array(boxes).reshape(-1, 4),
-        keypoints=np.full((people, 17, 2), np.nan),
-        visible=np.zeros((people, 17), dtype=np.int8),
-        ignored=np.zeros(people, dtype=np.bool_),
-    )
+    return [read_yolo_labels(file) for file in files]
 
 
 def detect_people(stills: Sequence[LabelledPicture], settings: DetectionSettings) -> list[People]:

@@ -68,6 +68,10 @@ VARIETY = replace(TRAINING, first_seed=50_000)
 """More stadiums, kits and people, in fewer images each."""
 CROWDS = replace(TRAINING, first_seed=60_000, movements=(0.1, 0.7, 0.1, 0.1))
 """Mostly corners: people who occlude one another."""
+FAR = replace(
+    TRAINING, first_seed=70_000, person_height=(14.0, 40.0), movements=(0.7, 0.1, 0.1, 0.1)
+)
+"""Small people in match play."""
 CHECKING = SceneKind(20_000, TRAINING.patterns, TRAINING.heights)
 HELD_OUT = SceneKind(30_000, PATTERNS, (1.60, 2.02))
 """Kits with patterns outside the training data, and shorter and taller people."""

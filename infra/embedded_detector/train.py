@@ -1,9 +1,11 @@
 """Trains the weights that ship with the project: renders scenes, trains both nets, scores them.
 
-    python infra/embedded_detector/train.py FOLDER [--share 1.0] [scenes people keypoints figures]
+    python infra/embedded_detector/train.py FOLDER [--share 1.0] [--real DATA --movenet FILE] \
+        [scenes people keypoints figures]
 
 A training has phases, each of which begins with the weights of the previous one. Every phase
-resumes after an interruption, and ends with the same weights as without it. Weights and
+resumes after an interruption, and ends with the same weights as without it. The last phases of
+each net add real frames, see real_frames.py; without `--real` they are left out. Weights and
 figures.json end in FOLDER; with another seed or torch their bytes differ, but metrics are similar.
 """
 
@@ -12,14 +14,15 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
 import torch
-from scenes import CHECKING, CROWDS, HELD_OUT, TRAINING, VARIETY, read_set, render_set
+from real_frames import label_pair, read_panorama
+from scenes import CHECKING, CROWDS, FAR, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
 from worldpose.detection import DetectionSettings
 from worldpose.detection.bundled_detector import BundledDetector
@@ -27,13 +30,16 @@ from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weight
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.geometry.boxes import box_iou
 from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
+from worldpose.training.augmentation import REAL_LOOKS
 from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
+from worldpose.training.keypoint_training import KeypointCrops
 from worldpose.training.metrics import (
     HEIGHTS,
     detect_labelled,
     score_keypoints,
     score_people,
 )
+from worldpose.training.people_training import PeopleWindows
 
 Net = TypeVar("Net", PeopleNet, KeypointNet)
 
@@ -41,6 +47,7 @@ SCENES: Final = {
     "training": (TRAINING, 50, 4, 2),
     "variety": (VARIETY, 139, 2, 1),
     "crowds": (CROWDS, 88, 2, 2),
+    "far": (FAR, 40, 3, 1),
     "checking": (CHECKING, 10, 4, 2),
     "held_out": (HELD_OUT, 10, 4, 2),
 }
@@ -74,14 +81,16 @@ class Phase:
         planned: batches over which the learning rate would have decayed fully.
         rate: highest learning rate [1].
         seed: of its batches.
-        learned: sets of scenes to learn from.
+        learned: sets to learn from, and how often each of their images counts.
+        real: learns from real frames, too: no held-out renderings choose its weights.
     """
 
     steps: int
     planned: int
     rate: float
     seed: int
-    learned: tuple[str, ...]
+    learned: Mapping[str, int]
+    real: bool = False
 
     def settings(self, share: float) -> TrainingSettings:
         """Return the training settings for a share of the phase."""
@@ -90,36 +99,57 @@ class Phase:
             steps=steps,
             planned=planned,
             check_every=max(round(share * 1000), 1),
+            keep="last" if self.real else "best",
             rate=self.rate,
             seed=self.seed,
             bfloat16=True,
         )
 
 
-FEW: Final = ("training", "variety")
-ALL: Final = (*FEW, "crowds")
+FEW: Final = {"training": 1, "variety": 1}
+ALL: Final = {**FEW, "crowds": 1}
 PHASES: Final = {
     "people": (
         Phase(6000, 6000, 1.5e-3, 1, FEW),
         Phase(3000, 8000, 1e-3, 3, ALL),
         Phase(2000, 2000, 6e-4, 4, ALL),
+        Phase(
+            *(4000, 4000, 1e-3, 5),
+            {"training": 2, "far": 2, "crowds": 1, "panorama": 3, "pair": 4},
+            real=True,
+        ),
+        Phase(
+            *(6000, 6000, 1e-3, 6),
+            {"training": 2, "far": 1, "crowds": 3, "panorama": 3, "pair": 4},
+            real=True,
+        ),
     ),
     "keypoints": (
         Phase(8000, 8000, 1.5e-3, 1, FEW),
         Phase(6000, 6000, 1e-3, 2, FEW),
         Phase(3750, 5000, 1e-3, 11, ALL),
+        Phase(3500, 3500, 1e-3, 7, {"training": 1, "crowds": 1, "pair": 7}, real=True),
+        Phase(5000, 5000, 1e-3, 9, {"training": 1, "crowds": 1, "pair": 7}, real=True),
     ),
 }
 """Phases of the shipped weights, with exceptions in the model card."""
+SMALL_WINDOWS: Final = PeopleWindows(height=(20.0, 160.0), aimed=0.65, looks=REAL_LOOKS)
+"""Windows of the detector's last phases."""
+REAL_CROPS: Final = KeypointCrops(looks=REAL_LOOKS)
+"""Crops of the pose estimator's last phases."""
 
 
-def main(folder: Path, parts: Sequence[str], share: float) -> None:
+def main(
+    folder: Path, parts: Sequence[str], share: float, real: tuple[Path, Path] | None = None
+) -> None:
     """Run the named parts: `scenes`, `people`, `keypoints`, `figures`.
 
     Args:
         folder: of all outputs.
         parts: parts to run.
         share: of scenes and steps [1]; less than 1 is a smoke test only.
+        real: folder of the real frames, see real_frames.py, and MoveNet; None leaves out the phases
+            that learn from them.
     """
     torch.set_num_threads(1)
     if "scenes" in parts:
@@ -127,42 +157,79 @@ def main(folder: Path, parts: Sequence[str], share: float) -> None:
             scenes = max(round(share * count), 1)
             for line in render_set(folder / name, kind, scenes, views=views, frames=frames):
                 say(line)
-    cache = PictureCache()
+        for line in label_pair(*real, folder / "pair") if real else ():
+            say(line)
+    cache, data = PictureCache(), real[0] if real else None
     if "people" in parts:
-        train(folder, "people", PeopleNet(), train_people_net, cache, share)
+        train_phases(folder, "people", PeopleNet(), cache, share, data)
     if "keypoints" in parts:
-        train(folder, "keypoints", KeypointNet(), train_keypoint_net, cache, share)
+        train_phases(folder, "keypoints", KeypointNet(), cache, share, data)
     if "figures" in parts:
         figures = score(folder, read_set(folder / "held_out"), cache)
         (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
         say(json.dumps(figures))
 
 
-def train(
-    folder: Path,
-    name: str,
-    net: Net,
-    how: Callable[..., object],
-    cache: PictureCache,
-    share: float,
+def train_phases(
+    folder: Path, name: str, net: Net, cache: PictureCache, share: float, data: Path | None
 ) -> None:
-    """Train a net through its phases; each phase's weights are those of its best check."""
+    """Train a net through its phases; without DATA those of real frames are left out."""
     checked = read_set(folder / "checking")[::2]
-    for number, phase in enumerate(PHASES[name]):
+    phases = [phase for phase in PHASES[name] if data is not None or not phase.real]
+    for number, phase in enumerate(phases):
         done = folder / f"{name}-{number}.safetensors"
         if not done.exists():
-            say(f"{name}: phase {number + 1} of {len(PHASES[name])}")
+            say(f"{name}: phase {number + 1} of {len(phases)}")
             torch.manual_seed(phase.seed)
             net = type(net)() if number == 0 else net
-            how(
-                *(net, [q for each in phase.learned for q in read_set(folder / each)]),
-                *(checked, cache, phase.settings(share)),
-                checkpoint=folder / f"{name}-{number}.checkpoint",
-                progress=say,
-            )
-            save_weights(done, net, {"trained-on": "rendered scenes", "seed": str(phase.seed)})
+            learned = [
+                picture
+                for each, times in phase.learned.items()
+                for picture in times * _read(folder, each, data)
+            ]
+            train_phase(net, phase, (learned, checked, cache), share, done)
+            trained_on = "rendered scenes and real frames" if phase.real else "rendered scenes"
+            save_weights(done, net, {"trained-on": trained_on, "seed": str(phase.seed)})
         net = load_weights(done, type(net)())
     (folder / f"embedded_{name}.safetensors").write_bytes(done.read_bytes())
+
+
+def train_phase(
+    net: PeopleNet | KeypointNet,
+    phase: Phase,
+    given: tuple[list[LabelledPicture], list[LabelledPicture], PictureCache],
+    share: float,
+    done: Path,
+) -> None:
+    """Train a net through one phase, in place.
+
+    Args:
+        net: begins with the weights of the phase before.
+        phase: steps and rate.
+        given: images to learn from, images of the checks, and their cache.
+        share: of the steps [1].
+        done: file of the result; the checkpoint is beside it.
+    """
+    learned, checked, cache = given
+    settings, checkpoint = phase.settings(share), done.with_suffix(".checkpoint")
+    if isinstance(net, PeopleNet):
+        windows = SMALL_WINDOWS if phase.real else None
+        train_people_net(
+            net, learned, checked, cache, settings,
+            windows=windows, checkpoint=checkpoint, progress=say,
+        )  # fmt: skip
+    else:
+        crops = REAL_CROPS if phase.real else None
+        train_keypoint_net(
+            net, learned, checked, cache, settings,
+            crops=crops, checkpoint=checkpoint, progress=say,
+        )  # fmt: skip
+
+
+def _read(folder: Path, name: str, data: Path | None) -> list[LabelledPicture]:
+    if name == "panorama" and data is not None:
+        return read_panorama(data)
+    return read_set(folder / name)
 
 
 def score(
@@ -210,5 +277,10 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("parts", nargs="*", default=["scenes", "people", "keypoints", "figures"])
     parser.add_argument("--share", type=float, default=1.0)
+    parser.add_argument("--real", type=Path, metavar="DATA", help="adds real frames")
+    parser.add_argument("--movenet", type=Path, metavar="FILE", help="labels their joints")
     given = parser.parse_args()
-    main(given.folder, given.parts, given.share)
+    if (given.real is None) != (given.movenet is None):
+        parser.error("--real and --movenet go together")
+    real_frames = None if given.real is None else (given.real, given.movenet)
+    main(given.folder, given.parts, given.share, real_frames)

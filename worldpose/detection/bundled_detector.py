@@ -1,7 +1,7 @@
 """The person detector that ships with the project, small and fast on a CPU.
 
-Its training data are rendered matches alone (infra/embedded_detector). On real footage it is a
-fallback; fine-tuned or larger models serve better. Needs torch.
+Its training data are rendered matches and real frames of one stadium (infra/embedded_detector). On
+other real footage fine-tuned or larger models may serve better. Needs torch.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ class BundledDetector:
     """A net that detects the centres of people and the sides of their boxes.
 
     Without a camera, a pass over the reduced frame tells the size of its people: a frame of large
-    people is seen reduced. The detector runs again on enlarged tiles where people are small, then
-    on enlarged crops of groups of people who occlude one another.
+    people is seen reduced. The detector runs again on enlarged tiles where people are small and, if
+    the camera tells so, on the reduced frame where they are large, then on enlarged crops of groups
+    of people who occlude one another.
     """
 
     def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
@@ -61,7 +62,7 @@ class BundledDetector:
         return [self._people(image, None) for image in images]
 
     def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
-        """Return the people in each frame; the caller knows where they are small."""
+        """Return the people in each frame; the caller knows where their size is unusual."""
         return [self._people(image, parts) for image in images]
 
     def _people(self, image: Image, parts: Sequence[Part] | None) -> People:

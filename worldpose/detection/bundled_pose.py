@@ -1,9 +1,9 @@
 """The pose estimator that ships with the project, small and fast on a CPU.
 
-Its training data are rendered matches alone (infra/embedded_detector). On real footage it is a
-fallback; fine-tuned or larger models serve better. The net takes crops with maps of the target box
-and its neighbours. People who occlude one another share out candidate joints, and the estimator
-also finds occluded people in crops shifted to the side of detected ones. Needs torch.
+Its training data are rendered matches and real frames of one stadium (infra/embedded_detector). On
+other real footage fine-tuned or larger models may serve better. The net takes crops with maps of
+the target box and its neighbours. People who occlude one another share out candidate joints, and
+the estimator also finds occluded people in crops shifted to the side of detected ones. Needs torch.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
 A detector finds people best at the heights of its training. Where a calibrated camera shows people
 smaller, or the first pass over a frame finds small people, further passes over enlarged tiles
-replace it for them. A frame of large people is seen reduced instead. Groups of people who occlude
-one another are seen enlarged, too.
+replace it for them. Where a camera shows people larger, passes over the reduced frame do; without
+a camera, a frame of large people is seen reduced instead. Groups of people who occlude one another
+are seen enlarged, too.
 """
 
 from __future__ import annotations
@@ -57,15 +58,15 @@ HEIGHT_RANGE: Final = (0.5, 2.0)
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a frame that is seen enlarged.
+    """A part of a frame that is seen at another size.
 
     Attributes:
         corner: left, upper pixel of the crop.
         end: right, lower pixel, not included.
-        zoom: enlargement [1].
+        zoom: enlargement [1]; less than 1 is a reduction.
         inner: x0, y0, x1, y1 of the region that holds the centres of its people [px].
         heights: of people that count in it, bounds not included [px].
-        replaced: height below which earlier people with centres in `inner` are dropped [px].
+        replaced: heights between which earlier people with centres in `inner` are dropped [px].
     """
 
     corner: tuple[int, int]
@@ -73,10 +74,10 @@ class Part:
     zoom: float
     inner: Floats
     heights: tuple[float, float]
-    replaced: float = 0.0
+    replaced: tuple[float, float] = (0.0, 0.0)
 
     def crop(self, image: Image) -> Image:
-        """Return the enlarged crop of the frame."""
+        """Return the resized crop of the frame."""
         (left, top), (right, bottom) = self.corner, self.end
         return resize(image[top:bottom, left:right], self.zoom)
 
@@ -90,8 +91,8 @@ class Part:
 
     def merge(self, earlier: People, seen: People) -> People:
         """Return earlier people of the frame and those found in `crop`, without those replaced."""
-        kept = ~self._holds(earlier.boxes)
-        kept |= earlier.boxes[:, 3] - earlier.boxes[:, 1] >= self.replaced
+        tall = earlier.boxes[:, 3] - earlier.boxes[:, 1]
+        kept = ~self._holds(earlier.boxes) | (tall < self.replaced[0]) | (tall >= self.replaced[1])
         found = self.to_frame(seen)
         return People(
             np.concatenate([earlier.boxes[kept], found.boxes]),
@@ -106,14 +107,15 @@ class Part:
 
 @runtime_checkable
 class SeesParts(Detector, Protocol):
-    """A detector that looks at parts of frames enlarged, where people are small."""
+    """A detector that looks at parts of frames at another size, where people need it."""
 
     def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
         """Return the people in each image, as `detect`.
 
         Args:
             images: of one size.
-            parts: where people are expected small, from the camera; empty where they are not.
+            parts: where people are expected small or large, from the camera; empty where they are
+                not.
         """
 
 
@@ -173,8 +175,11 @@ def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]
     return _tile(each.boxes[tall < 2.0 * step[0]], shape, step)
 
 
-def expect_small(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Part]:
-    """Return the tiles in which a calibrated camera shows people on the pitch too small.
+def expect_parts(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Part]:
+    """Return the parts in which a calibrated camera shows people on the pitch too small or large.
+
+    Where they are too large, the part is the whole frame: a pass over it costs a quarter of the
+    first.
 
     Args:
         camera: the camera.
@@ -201,6 +206,12 @@ def expect_small(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Pa
         side = 0.5 * tall[asked, None]
         boxes = np.concatenate([middle[asked] - side, middle[asked] + side], axis=1)
         parts += _tile(boxes, (height, width), step)
+    inner = np.array([-0.5, -0.5, width - 0.5, height - 0.5])
+    for limit, zoom in reversed(REDUCTIONS):
+        if np.any(shown & (tall > limit)):
+            taller = (limit / BLEND, float("inf"))
+            replaced = (limit * BLEND, float("inf"))
+            parts.append(Part((0, 0), (width, height), zoom, inner, taller, replaced))
     return parts
 
 
@@ -229,7 +240,7 @@ def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> l
                     zoom=zoom,
                     inner=inner,
                     heights=(0.0, BLEND * limit),
-                    replaced=limit / BLEND,
+                    replaced=(0.0, limit / BLEND),
                 )
             )
     return parts

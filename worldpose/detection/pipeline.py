@@ -11,7 +11,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
-from worldpose.detection.enlargement import Part, SeesParts, expect_small
+from worldpose.detection.enlargement import Part, SeesParts, expect_parts
 from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
 from worldpose.detection.models import load_detectors, load_pose
 from worldpose.detection.settings import DetectionSettings
@@ -183,7 +183,7 @@ class PeopleFinder:
         self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
             margin = self._settings.pitch_margin_m
-            self._parts = expect_small(place.camera, place.pitch, margin)
+            self._parts = expect_parts(place.camera, place.pitch, margin)
         detected_frames = detect_strided(
             frames,
             lambda images: self._people(images, place),

@@ -9,6 +9,7 @@ from worldpose.training.labels import (
     PictureCache,
     read_labels,
     read_picture,
+    read_yolo_labels,
     write_labels,
 )
 from worldpose.training.metrics import average_precision, calibration_error, correct_keypoints
@@ -24,5 +25,6 @@ __all__ = [
     "correct_keypoints",
     "read_labels",
     "read_picture",
+    "read_yolo_labels",
     "write_labels",
 ]

@@ -106,7 +106,8 @@ def train(
 ) -> tuple[Check, ...]:
     """Train a net and return its checks; the net then has the weights of the best one.
 
-    A check also runs before the first step: training that makes the net worse changes nothing.
+    A check also runs before the first step: training that makes the net worse changes nothing,
+    unless the settings keep the last weights.
 
     Args:
         training: net, batches, loss, metric and settings.
@@ -170,17 +171,20 @@ def _check(training: Training[Net, Batch], state: _State) -> _State:
     mean.load_state_dict(state.mean)
     score = training.score(mean)
     best = max((check.score for check in state.checks), default=-math.inf)
+    kept = score > best or training.settings.keep == "last"
     loss = float(np.mean(state.losses)) if state.losses else math.nan
     return replace(
         state,
         checks=(*state.checks, Check(state.step, loss, score)),
-        best=_copy_tensors(state.mean) if score > best else state.best,
+        best=_copy_tensors(state.mean) if kept else state.best,
         losses=(),
     )
 
 
 def _has_settled(state: _State, settings: TrainingSettings) -> bool:
     scores = [check.score for check in state.checks]
+    if settings.keep == "last":
+        return False
     return len(scores) - 1 - scores.index(max(scores)) >= settings.patience
 
 

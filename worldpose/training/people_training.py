@@ -15,7 +15,7 @@ from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
 from worldpose.detection.bundled_crops import cut_crop, frame_from_crop
 from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
-from worldpose.training.augmentation import AugmentationSettings, augment
+from worldpose.training.augmentation import AugmentationSettings, augment, draw_clutter
 from worldpose.training.labels import LabelledPicture, PictureCache
 
 SPREAD: Final = 0.12
@@ -83,8 +83,12 @@ def people_batch(
         picture = cache[labelled.path]
         crop = _window(labelled, picture.shape, settings, rng)
         mapping = frame_from_crop(crop, (side, side), 0.0, bool(rng.random() < 0.5))
-        seen[index] = augment(cut_crop(picture, mapping, (side, side)), settings.looks, rng)
         inside, ignored = boxes_in_window(labelled, picture.shape, mapping, side)
+        cut = cut_crop(picture, mapping, (side, side))
+        cluttered = settings.looks.cluttered
+        if cluttered > 0.0 and rng.random() < cluttered:
+            cut = draw_clutter(cut, np.concatenate([inside, ignored]), rng)
+        seen[index] = augment(cut, settings.looks, rng)
         draw_targets(inside, ignored, target[index], weight[index], boxes[index])
     return PeopleBatch(seen, target, weight, boxes)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from data_contracts.records import Record
@@ -26,6 +28,9 @@ class TrainingSettings(Record):
     """Steps between checks on held-out frames, each with a checkpoint."""
     patience: int = Field(default=6, ge=1, le=1000)
     """Checks without improvement after which training stops."""
+    keep: Literal["best", "last"] = "best"
+    """Which weights result: those of the best check, or those of the last step, where held-out
+    frames do not show what the training is for. `last` ignores `patience`."""
     seed: int = Field(default=0, ge=0, le=2_147_483_647)
     bfloat16: bool = False
     """Compute in bfloat16 where that is safe: twice as fast on processors that support it."""

@@ -5,7 +5,7 @@ import numpy as np
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.enlargement import (
     choose_reduction,
-    expect_small,
+    expect_parts,
     find_groups,
     find_small,
     resize,
@@ -90,26 +90,28 @@ def test_an_enlarged_tile_replaces_small_people_and_keeps_tall_ones():
     np.testing.assert_allclose(merged.boxes, [tall, other, moved], atol=1e-9)
 
 
-def test_a_calibrated_camera_tells_where_people_are_small():
-    def looking(focal):
-        center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
-        forward = (target - center) / np.linalg.norm(target - center)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-        return Camera(
-            focal=np.full(2, focal),
-            principal_point=np.array([959.5, 539.5]),
-            distortion=np.zeros(5),
-            cam_from_world=Rigid(rotation, -rotation @ center),
-            image_size=np.array([1920, 1080]),
-        )
+def looking(focal):
+    center, target = np.array([0.0, -75.0, 22.0]), np.array([0.0, 5.0, 0.0])
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    return Camera(
+        focal=np.full(2, focal),
+        principal_point=np.array([959.5, 539.5]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(rotation, -rotation @ center),
+        image_size=np.array([1920, 1080]),
+    )
 
+
+def test_a_calibrated_camera_tells_where_people_are_small():
     pitch = PitchTemplate.standard()
-    assert expect_small(looking(4000.0), pitch, 2.5) == []
-    assert {tile.zoom for tile in expect_small(looking(1000.0), pitch, 2.5)} == {2.0, 3.0}
+    assert {part.zoom for part in expect_parts(looking(3200.0), pitch, 2.5)} == {0.5}  # 136 px
+    assert {part.zoom for part in expect_parts(looking(12000.0), pitch, 2.5)} == {0.5, 0.25}
+    assert {tile.zoom for tile in expect_parts(looking(1000.0), pitch, 2.5)} == {2.0, 3.0}
     camera = looking(1250.0)
-    tiles = expect_small(camera, pitch, 2.5)
+    tiles = expect_parts(camera, pitch, 2.5)
     assert {tile.zoom for tile in tiles} == {2.0}
     for y, wanted in ((33.0, True), (-33.0, False)):  # 20 and 48 px
         (feet, head) = camera.project(np.array([[5.0, y, 0.0], [5.0, y, 1.8]]))
@@ -117,6 +119,16 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         box = np.array([middle[0] - 4, head[1], middle[0] + 4, feet[1]])
         found = any(len(tile.to_frame(seen(tile, box)).scores) for tile in tiles)
         assert found == wanted
+
+
+def test_a_reduced_view_replaces_large_people_and_keeps_others():
+    near = looking(3200.0)
+    (view,) = expect_parts(near, PitchTemplate.standard(), 2.5)
+    small, large = (300.0, 300.0, 320.0, 360.0), (500.0, 300.0, 560.0, 480.0)
+    half = (500.0, 300.0, 560.0, 390.0)  # the upper body of the large person
+    whole = (501.0, 301.0, 561.0, 481.0)
+    merged = view.merge(people(small, half, large), seen(view, small, whole))
+    np.testing.assert_allclose(merged.boxes, [small, half, whole], atol=1e-9)
 
 
 def test_a_frame_of_large_people_is_seen_reduced():

@@ -90,6 +90,19 @@ def test_the_best_weights_are_kept_and_training_stops_early():
         assert torch.equal(value, best[name]), name
 
 
+def test_the_last_weights_are_kept_where_asked():
+    changes = {"steps": 4, "check_every": 1, "patience": 1, "memory": 0.0, "keep": "last"}
+    training = line_fit(SETTINGS.model_copy(update=changes), scores=[0.9, 0.5, 0.4, 0.3, 0.1])
+    last = {}
+
+    def say(line):
+        last.update({k: v.clone() for k, v in training.net.state_dict().items()})
+
+    assert [check.step for check in train(training, progress=say)] == [0, 1, 2, 3, 4]
+    for name, value in training.net.state_dict().items():
+        assert torch.equal(value, last[name]), name
+
+
 def test_the_mean_of_weights_remembers_more_and_more():
     training = line_fit(SETTINGS.model_copy(update={"steps": 1, "check_every": 1, "memory": 0.5}))
     before = training.net[1].bias.detach().clone()
