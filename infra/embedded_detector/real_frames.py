@@ -36,8 +36,8 @@ SURE_SCORE: Final = 0.25
 SURE_IOU: Final = 0.6
 """Both nets' boxes of a labelled person overlap by this much at least [1]."""
 DOUBT_SCORE: Final = 0.1
-"""Where YOLOX alone sees a person with this score or more, nothing is learned [1]. Where the
-bundled net alone sees one, the net learns that there is none."""
+"""Detections of YOLOX alone with this score or more are ignored in training [1]; detections of the
+bundled net alone are background."""
 SAME_IOU: Final = 0.5
 """Boxes that overlap more are one person's [1]."""
 WIDER: Final = np.array([0.15, 0.08])

@@ -208,7 +208,7 @@ def train_phase(
         phase: steps and rate.
         given: images to learn from, images of the checks, and their cache.
         share: of the steps [1].
-        done: file of the result; the checkpoint is beside it.
+        done: file of the result; the checkpoint lies next to it.
     """
     learned, checked, cache = given
     settings, checkpoint = phase.settings(share), done.with_suffix(".checkpoint")

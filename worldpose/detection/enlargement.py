@@ -2,9 +2,9 @@
 
 A detector finds people best at the heights of its training. Where a calibrated camera shows people
 smaller, or the first pass over a frame finds small people, further passes over enlarged tiles
-replace it for them. Where a camera shows people larger, passes over the reduced frame do; without
-a camera, a frame of large people is seen reduced instead. Groups of people who occlude one another
-are seen enlarged, too.
+replace it for them. Where it shows people larger, passes over the reduced frame do; without
+calibration, a frame of large people is seen reduced instead. Groups of people who occlude one
+another are seen enlarged, too.
 """
 
 from __future__ import annotations

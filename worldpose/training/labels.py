@@ -113,7 +113,7 @@ def read_labels(annotations: Path, pictures: Path | None = None) -> list[Labelle
 
 
 def read_yolo_labels(picture: Path, person: int = 0) -> LabelledPicture:
-    """Return the people of an image whose labels are a YOLO text file of the same name beside it.
+    """Return the people of an image with labels in a YOLO text file of the same name.
 
     A line is `class x_center y_center width height`, or `class x y x y ...` for a polygon, all
     relative to the image's sides. Objects of other classes are left out.
@@ -153,7 +153,7 @@ def _no_yolo_labels(file: Path, found: str) -> InputError:
         str(file),
         expected="YOLO labels: a class, then 4 numbers of a box or 6 and more of a polygon",
         found=found,
-        todo="Export the labels again in YOLO's text form, one file beside each image.",
+        todo="Export the labels again in YOLO's text form, one file next to each image.",
     )
 
 

@@ -68,14 +68,14 @@ def test_people_that_both_nets_see_are_labelled_and_others_are_in_doubt(real_fra
     bundled = people([[1, 0, 11, 20], [200, 0, 210, 20]], [0.9, 0.9])
     boxes, doubtful = real_frames.agree_on_people(yolox, bundled)
     np.testing.assert_allclose(boxes, [[0.5, 0.0, 10.5, 20.0]])
-    # What the bundled net alone sees is neither: it learns that nobody is there.
+    # A detection of the bundled net alone is background.
     np.testing.assert_allclose(sorted(doubtful.tolist()), [faint, missed])
     boxes, doubtful = real_frames.agree_on_people([people([], [])], people([], []))
     assert len(boxes) == len(doubtful) == 0
 
 
 class SlippingPose:
-    """Finds all joints at the middle of a person, the nose where the box says, no left ear."""
+    """Finds all joints in one place, the nose at the corner of the box, no left ear."""
 
     def estimate(self, image, boxes):
         middle = np.tile(np.array([60.0, 50.0]), (len(boxes), 17, 1))
