@@ -44,6 +44,9 @@ MAX_NEW_LOST_S: Final = 0.2
 """Time without a whole detection after which a track ends that has had few so far [s]."""
 MIN_SEEN: Final = 0.4
 """Least share of its frames in which a track is seen [1]."""
+BYSTANDER_M: Final = 1.5
+"""A person always farther outside of the pitch is a bystander [m]: assistants run within a metre of
+the lines; benches and photographers are 2 m away, and a place by feet can be 0.3 m off."""
 TRIANGULATED_STD_M: Final = 0.15
 """Standard deviation of the feet from the mid-hip of a triangulated person, per axis [m]."""
 
@@ -173,7 +176,7 @@ def track_on_plane(
     clock_s: Sequence[float] | Floats | None = None,
     *,
     pitch_size: tuple[float, float],
-    margin_m: float = 2.0,
+    margin_m: float = BYSTANDER_M,
     triangulated: TriangulatedPeople | None = None,
     covering: NDArray[np.integer] | None = None,
 ) -> GroundTracks:

@@ -196,6 +196,14 @@ def test_people_beside_the_pitch_and_glimpses_are_no_tracks():
     assert track_on_plane(positions_at(nobody), FPS, pitch_size=SIZE).xy.shape == (60, 0, 2)
 
 
+@pytest.mark.parametrize(("outside", "kept"), [(1.0, True), (2.0, False)])
+def test_an_assistant_is_tracked_and_a_person_on_a_bench_is_not(outside, kept):
+    rng = np.random.default_rng(6)
+    places = np.tile([[0.0, 34.0 + outside]], (60, 1, 1)) + 0.1 * rng.standard_normal((60, 1, 2))
+    tracks = track_on_plane(positions_at(places[:, None]), FPS, pitch_size=SIZE)
+    assert tracks.xy.shape[1] == kept
+
+
 def test_known_detections_give_the_places_that_tracking_gave():
     rng = np.random.default_rng(4)
     truth = walkers(50, [[0.0, 0.0], [9.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]])
