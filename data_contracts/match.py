@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -21,6 +22,9 @@ from data_contracts.records import (
     PersonId,
     Record,
 )
+
+TEAM_SIZE: Final = 11
+"""Players of a team on the pitch (Laws of the Game, 3)."""
 
 
 class CameraSpec(Record):
@@ -121,6 +125,17 @@ class MatchSpec(Record):
     def static_cameras(self) -> tuple[CameraSpec, ...]:
         """The static cameras in file order, which is the order of every camera dimension."""
         return tuple(camera for camera in self.cameras if camera.kind == "static")
+
+    @property
+    def max_people(self) -> int | None:
+        """The most people on the pitch at once, by the roster: two teams and the officials.
+
+        None for a smaller roster, which may leave out people.
+        """
+        teams = Counter(person.team for person in self.roster if person.role != "official")
+        officials = sum(person.role == "official" for person in self.roster)
+        complete = len(teams) == 2 and min(teams.values()) >= TEAM_SIZE and officials > 0
+        return 2 * TEAM_SIZE + officials if complete else None
 
     def camera(self, camera_id: str) -> CameraSpec:
         """The camera with this id.

@@ -21,6 +21,7 @@ from tasks.detection import footage_index, require_weights
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.detection import DetectionSettings, Place, load_pose
+from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering import (
     BodyViews,
     Spread,
@@ -39,7 +40,6 @@ from worldpose.pitch import PitchTemplate
 from worldpose.redetection import (
     Expected,
     MissingPeople,
-    RedetectionSettings,
     Verdicts,
     find_detected_people,
     judge_search_results,

@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from data_contracts.detection import detection_unit
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection, refitting
-from worldpose.redetection import RedetectionSettings
+from worldpose.detection.settings import RedetectionSettings
 
 
 @once_a_match

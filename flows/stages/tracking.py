@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from flows.stage import Match, Stage
 from flows.stages import detection
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.tracking import TrackingSettings, roster_limit
+from worldpose.tracking import TrackingSettings
 
 MIN_CAMERAS: Final = 2
 """Minimum number of static cameras for triangulation [1]."""
@@ -65,7 +65,7 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "pitch": None
         if pitch is None
         else pitch.model_dump(include={"length", "width", "crown", "end_fall"}),
-        "people": roster_limit(match.folder.spec.roster),
+        "people": match.folder.spec.max_people,
     }
 
 

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
-    from worldpose.camera_consistency.comparison import ConsistencySettings
     from worldpose.camera_consistency.consistency import (
         check_consistency,
         describe_faults,
         faulty_cameras,
     )
     from worldpose.camera_consistency.diagnosis import Consistency, Fault
+    from worldpose.camera_consistency.settings import ConsistencySettings
 
 __all__ = [
     "Consistency",
@@ -25,7 +25,6 @@ __all__ = [
 __getattr__ = import_on_use(
     __name__,
     {
-        "worldpose.camera_consistency.comparison": ("ConsistencySettings",),
         "worldpose.camera_consistency.consistency": (
             "check_consistency",
             "describe_faults",
@@ -35,5 +34,6 @@ __getattr__ = import_on_use(
             "Consistency",
             "Fault",
         ),
+        "worldpose.camera_consistency.settings": ("ConsistencySettings",),
     },
 )

@@ -9,30 +9,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from data_contracts.arrays import Floats
-from data_contracts.records import Record
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
+from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
-
-
-class ConsistencySettings(Record):
-    """Number of compared frames, and evidence required for a fault."""
-
-    leave_out: bool = True
-    """Exclude faulty cameras; else the run continues with them and warns."""
-    sample_frames: int = Field(default=48, ge=4, le=10000)
-    """Frames at which cameras are compared [frame]."""
-    max_chunk_frames: int = Field(default=500, ge=2, le=100_000)
-    """Longest chunk of frames in which clocks are compared [frame]."""
-    pixel_noise_px: float = Field(default=1.5, ge=1e-6, le=1000)
-    """Standard deviation of a keypoint, independent of people's size [px]."""
-
 
 Ints = NDArray[np.int64]
 

@@ -11,8 +11,9 @@ import numpy as np
 from data_contracts.arrays import ClipArray, Floats
 from data_contracts.camera_consistency import CameraFault
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency.comparison import Comparison, ConsistencySettings
+from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
+from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian

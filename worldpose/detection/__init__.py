@@ -4,10 +4,15 @@ Inputs: frames in order, detectors and a pose estimator, the calibrated camera a
 Outputs: `KeypointDetections` in chunks of frames, without the crowd.
 """
 
-from worldpose.detection.interfaces import Detector, People, PoseEstimator
-from worldpose.detection.models import load_detectors, load_pose, weights_of
-from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place, detect_people
-from worldpose.detection.settings import DetectionSettings
+from typing import TYPE_CHECKING
+
+from worldpose.lazy_names import import_on_use
+
+if TYPE_CHECKING:
+    from worldpose.detection.interfaces import Detector, People, PoseEstimator
+    from worldpose.detection.models import load_detectors, load_pose, weights_of
+    from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place, detect_people
+    from worldpose.detection.settings import DetectionSettings
 
 __all__ = [
     "DetectionReport",
@@ -22,3 +27,26 @@ __all__ = [
     "load_pose",
     "weights_of",
 ]
+
+__getattr__ = import_on_use(
+    __name__,
+    {
+        "worldpose.detection.interfaces": (
+            "Detector",
+            "People",
+            "PoseEstimator",
+        ),
+        "worldpose.detection.models": (
+            "load_detectors",
+            "load_pose",
+            "weights_of",
+        ),
+        "worldpose.detection.pipeline": (
+            "DetectionReport",
+            "PeopleFinder",
+            "Place",
+            "detect_people",
+        ),
+        "worldpose.detection.settings": ("DetectionSettings",),
+    },
+)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         triangulated_places,
     )
     from worldpose.tracking.joins import describe_doubts
-    from worldpose.tracking.people_selection import roster_limit
     from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
     from worldpose.tracking.settings import TrackingSettings
     from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
@@ -39,7 +38,6 @@ __all__ = [
     "estimate_plane_clocks",
     "locate_feet",
     "locate_tracks",
-    "roster_limit",
     "track_on_plane",
     "track_people",
     "triangulated_places",
@@ -65,7 +63,6 @@ __getattr__ = import_on_use(
             "triangulated_places",
         ),
         "worldpose.tracking.joins": ("describe_doubts",),
-        "worldpose.tracking.people_selection": ("roster_limit",),
         "worldpose.tracking.plane_clocks": (
             "PlaneClocks",
             "estimate_plane_clocks",

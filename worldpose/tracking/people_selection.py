@@ -15,15 +15,12 @@ of the cameras that see a person also see a real person so near; they do not see
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from data_contracts.match import PlayerSpec
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, choose_joins, join_costs
 from worldpose.tracking.person import Person
@@ -32,8 +29,6 @@ MAX_VIEW_SHARE: Final = 0.4
 """A shadow is seen by at most this share of the cameras that see the other person [1]."""
 MIN_SHADOW_SHARE: Final = 0.7
 """In at least this share of its frames, a shadow has another person so near [1]."""
-TEAM_SIZE: Final = 11
-"""Players of a team on the pitch (Laws of the Game, 3)."""
 
 Chains = list[list[Person]]
 
@@ -226,18 +221,6 @@ def limit_people(people: list[Person], limit: int | None) -> list[Person]:
         for person in still[limit:]:
             kept.remove(person)
     return kept
-
-
-def roster_limit(roster: Sequence[PlayerSpec]) -> int | None:
-    """Return the most people on the pitch at once in a match with this roster.
-
-    Eleven of each of two teams and the officials; None for a smaller roster, which may leave out
-    people.
-    """
-    teams = Counter(person.team for person in roster if person.role != "official")
-    officials = sum(person.role == "official" for person in roster)
-    complete = len(teams) == 2 and min(teams.values()) >= TEAM_SIZE and officials > 0
-    return 2 * TEAM_SIZE + officials if complete else None
 
 
 def join_tracks(

@@ -6,8 +6,9 @@ from bystander import SIZE, camera, expected
 
 from data_contracts.pitch import PitchSpec
 from worldpose.detection import Place
+from worldpose.detection.settings import RedetectionSettings
 from worldpose.pitch import PitchTemplate
-from worldpose.redetection import RedetectionSettings, find_detected_people, select_missing_people
+from worldpose.redetection import find_detected_people, select_missing_people
 
 SETTINGS = RedetectionSettings()
 

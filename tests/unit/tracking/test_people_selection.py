@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.match import PlayerSpec
 from worldpose.geometry import Camera, Rigid
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
@@ -13,7 +12,6 @@ from worldpose.tracking.people_selection import (
     drop_shadows,
     join_people,
     limit_people,
-    roster_limit,
 )
 from worldpose.tracking.person import Person, Sighting
 
@@ -133,22 +131,6 @@ def test_only_frames_and_joints_of_both_are_compared():
 def test_a_track_without_positions_is_no_shadow():
     assert kept(shadow_track(0, 10, 0.0), shadow_track(1, 1, 0.0, joints=0)) == [0, 1]
     assert kept() == []
-
-
-def roster(red, blue, officials):
-    return [
-        *(PlayerSpec(id=f"r{n}", team="red") for n in range(red)),
-        *(PlayerSpec(id=f"b{n}", team="blue") for n in range(blue)),
-        *(PlayerSpec(id=f"o{n}", role="official") for n in range(officials)),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("people", "limit"),
-    [((11, 11, 3), 25), ((16, 18, 1), 23), ((11, 11, 0), None), ((11, 5, 3), None)],
-)
-def test_eleven_of_each_team_and_the_officials_are_allowed_if_all_are_named(people, limit):
-    assert roster_limit(roster(*people)) == limit
 
 
 def person(number, first, last, evidence):
