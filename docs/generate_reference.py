@@ -25,11 +25,17 @@ INTERNAL = {"worldpose.simulation"}
 
 
 def write_reference(folder: Path) -> None:
-    """Write `settings.md`, `command_line.md`, `api.md` and a page for each package."""
+    """Write `settings.md`, `command_line.md`, `api.md` and a page for each package.
+
+    Pages of packages that no longer exist are removed: Sphinx warns of them.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write(folder / "settings.md", settings_page())
     write(folder / "command_line.md", command_page())
     packages = ["worldpose", *sorted(public_packages())]
+    for page in folder.glob("worldpose*.md"):
+        if page.stem not in packages:
+            page.unlink()
     for name in packages:
         write(folder / f"{name}.md", package_page(name))
     write(folder / "api.md", api_page(packages))
