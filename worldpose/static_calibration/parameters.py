@@ -82,14 +82,14 @@ def step_camera(camera: Camera, step: ArrayLike) -> Camera:
     )
 
 
-def step_jacobian(gone: NDArray[np.float64]) -> NDArray[np.float64]:
+def step_jacobian(step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the derivative (n, n) of a step by a further step after it.
 
     Args:
-        gone: (n,) the step: of a camera, or of a camera and the surface of the pitch.
+        step: (n,) of a camera, or of a camera and the surface of the pitch.
     """
-    chain = np.eye(len(gone))
-    x, y, z = gone[3:6]
+    chain = np.eye(len(step))
+    x, y, z = step[3:6]
     # A further rotation also rotates the translation so far.
     chain[3:6, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return chain

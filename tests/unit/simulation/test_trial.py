@@ -50,6 +50,5 @@ def test_the_trial_starts_where_the_papers_does_and_true_cameras_show_what_can_b
     # true cameras, is pinned at 62 to 72 mm (docs/explanation/simulation.md).
     assert 62.0 < mean(each.g_mpjpe_mm for each in true) < 72.0
     assert 54.0 < mean(each.pa_mpjpe_mm for each in true) < 66.0
-    # Within 5 %: 79.6 mm, since calibration from clicks estimates more than it did.
-    assert mean(each.g_mpjpe_mm for each in plain) == pytest.approx(83.5, rel=0.05)
+    assert 80.0 < mean(each.g_mpjpe_mm for each in plain) < 90.0
     assert 65.0 < mean(each.pa_mpjpe_mm for each in plain) < 78.0
