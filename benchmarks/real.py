@@ -220,8 +220,12 @@ def score_shelf(folder: Path, frames: int | None) -> Metrics:
         given = Path(shutil.copytree(folder / "import", Path(temporary) / "import"))
         if frames is not None:
             _shorten_detections(given / "detections", frames)
-        joints, bodies = shelf.scores(folder, given, Path(temporary))
-    return {"joints_pcp3d_percent": joints, "bodies_pcp3d_percent": bodies}
+        joints, bodies, seen = shelf.scores(folder, given, Path(temporary))
+    return {
+        "joints_pcp3d_percent": joints,
+        "bodies_pcp3d_percent": bodies,
+        "bodies_as_detected_pcp3d_percent": seen,
+    }
 
 
 def _shorten_detections(folder: Path, frames: int) -> None:

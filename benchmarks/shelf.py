@@ -4,7 +4,8 @@
 
 DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`, the
 sequence's own evaluator. Every line is an import and a run by the command line; scored are the
-joints of `retriangulation` and the fitted bodies, actors 1 and 3, alpha 0.5.
+joints of `retriangulation` and the fitted bodies, in the definition of the body model and of the
+detector, actors 1 and 3, alpha 0.5.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def without(given: Path, camera: str, folder: Path) -> Path:
 
 
 def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]:
-    """Return PCP3D of retriangulated joints and of bodies [%]."""
+    """Return PCP3D of retriangulated joints and of bodies in both definitions [%]."""
     scorer, truth = load_scorer(data), np.load(data / "gt.npz")
     match, project = folder / "shelf", folder / "project"
     calibration, detections = given / "calibration.toml", given / "detections"
@@ -56,11 +57,15 @@ def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]
     )
     run_worldpose("run", match, "--project", project, *settings)
     values = []
-    for stage in ("retriangulation", "body_fitting"):
-        out = folder / stage
+    for stage, definition in (
+        ("retriangulation", "detector"),
+        ("body_fitting", "body"),
+        ("body_fitting", "detector"),
+    ):
+        out = folder / stage / definition
         run_worldpose(
             *("export", "shelf", "--format", "joints", "--stage", stage),
-            *("--out", out, "--project", project),
+            *("--definition", definition, "--out", out, "--project", project),
         )
         tracks = read_joints(out / "joints.npz")
         poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
@@ -80,14 +85,14 @@ def main() -> None:
         "causal": (None, ("--set", "tracking.causal=true")),
         **{f"without {camera}": (camera, ()) for camera in cameras},
     }
-    print("PCP3D: joints, bodies [%]")
+    print("PCP3D: joints, bodies by the body model and by the detector [%]")
     for label, (left_out, settings) in runs.items():
         with tempfile.TemporaryDirectory() as temporary:
             folder, given = Path(temporary), data / "import"
             if left_out is not None:
                 given = without(given, left_out, folder)
-            joints, bodies = scores(data, given, folder, *settings)
-        print(f"{label:16s} {joints:6.2f} {bodies:6.2f}", flush=True)
+            values = scores(data, given, folder, *settings)
+        print(f"{label:16s}", *(f"{value:6.2f}" for value in values), flush=True)
 
 
 if __name__ == "__main__":

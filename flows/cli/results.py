@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -36,6 +36,13 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="Output folder.")],
     run: RunOption = "latest",
     stage: StageOption = None,
+    definition: Annotated[
+        Literal["body", "detector"],
+        typer.Option(
+            "--definition",
+            help="Joints of bodies where the body model has them, or where the detector sees them.",
+        ),
+    ] = "body",
     release: Annotated[
         str | None,
         typer.Option("--release", metavar="NAME", help="Freeze the run under this name."),
@@ -67,11 +74,12 @@ def export(
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
-    if release is not None and (licence is None or filled):
+    changed = "--filled" if filled else "--definition detector"
+    if release is not None and (licence is None or filled or definition != "body"):
         raise UsageError(
             "worldpose export --release",
-            expected="--licence FILE, and no --filled: a release holds joints as computed",
-            found="no licence" if licence is None else "--filled",
+            expected="--licence FILE, no --filled, no other --definition: joints as computed",
+            found="no licence" if licence is None else changed,
             todo="Give the text of the data licence, or export without --release.",
         )
     store = Store.open(project)
@@ -82,6 +90,7 @@ def export(
         stage,
         filled=filled,
         surface=surface,
+        definition=definition,
         licence=None if licence is None else licence.read_text(encoding="utf-8").strip(),
     )
     if release is None or origin.licence is None:

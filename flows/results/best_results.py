@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.filtering import perceived_covariance, perceived_joints
 from worldpose.formats import JointTracks
 from worldpose.formats.joints_file import fill_gaps
 from worldpose.formats.tables import Positions
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
     from worldpose.reports.bodies import BodyTracks
 
+JointDefinition = Literal["body", "detector"]
+"""Where a joint of a fitted body is: where the body model has it, or where the detector sees it."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
 MID_HIP = [11, 12]
@@ -55,10 +58,13 @@ def clip_title(clip: str) -> str:
     return "The clip" if clip == "clip" else f"Clip {clip}"
 
 
-def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
+def joint_tracks(
+    run: Run, clip: str, stage: str | None = None, definition: JointDefinition = "body"
+) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
-    All joints are NaN of people that only a broadcast camera films.
+    All joints are NaN of people that only a broadcast camera films. Triangulated joints have the
+    detector's definition always.
 
     Raises:
         UsageError: the run has no such result.
@@ -83,11 +89,15 @@ def joint_tracks(run: Run, clip: str, stage: str | None = None) -> JointTracks:
         )
     result = run[f"{stages[0]}/{clip}"]
     seen = placed_joints(run, clip) if stages[0] in BODY_STAGES else result
+    joints, covariance = result["joints"].values, result["covariance"].values
+    if stages[0] in BODY_STAGES and definition == "detector":
+        joints = perceived_joints(joints, result["joint_offsets"].values)
+        covariance = perceived_covariance(covariance, seen["common_bias"].values)
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),
-        joints=result["joints"].values,
-        covariance=result["covariance"].values,
+        joints=joints,
+        covariance=covariance,
         views=seen["views"].values.astype(np.int64),
     )
 
@@ -152,6 +162,8 @@ class Origin:
     """Text of the data's licence; None = not stated."""
     surface: bool = False
     """Write also the surface of a body model that has terms of its own."""
+    definition: JointDefinition = "body"
+    """Definition of the joints of bodies."""
 
     @property
     def spec(self) -> MatchSpec:
@@ -165,7 +177,7 @@ class Origin:
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""
-        tracks = joint_tracks(self.run, clip, self.stage)
+        tracks = joint_tracks(self.run, clip, self.stage, self.definition)
         return fill_gaps(tracks) if self.filled else tracks
 
 

@@ -85,7 +85,8 @@ def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
 def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
     if stage in BODY_STAGES:
         model = origin.run[f"{stage}/{clip}"].attrs["body_model"]
-        return f"COCO-17 keypoints of the fitted body {model}, as the detector places them"
+        owner = "detector sees" if origin.definition == "detector" else "model has"
+        return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them"
     return "COCO-17 keypoints of the detector, triangulated"
 
 

@@ -54,6 +54,24 @@ def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
 
 
+def test_joints_of_bodies_are_exported_where_the_detector_sees_them_on_request(tiny_run, tmp_path):
+    succeed(
+        *("export", TINY, "--format", "joints", "--definition", "detector"),
+        *("--out", tmp_path, "--project", tiny_run),
+    )
+    tracks = read_joints(tmp_path / "joints.npz")
+    result = open_run(tiny_run, TINY)["body_fitting/clip"]
+    offsets = result["joint_offsets"].values
+    moved = np.linalg.norm(tracks.joints - result["joints"].values, axis=-1)
+    assert np.abs(offsets).max() > 1e-3
+    np.testing.assert_allclose(
+        np.nanmax(moved, axis=(0, 1)), np.linalg.norm(offsets, axis=-1), rtol=1e-6
+    )
+    # The offsets follow the detector, so its common bias is no error of these joints.
+    assert (tracks.covariance[0, 0].trace(axis1=1, axis2=2) > 0).all()
+    assert (np.nanmax(tracks.covariance - result["covariance"].values, axis=(0, 1)) <= 1e-12).all()
+
+
 def test_exported_coco_lies_on_the_detections(tiny, tiny_run, tmp_path):
     succeed(*("export", TINY, "--format", "coco", "--out", tmp_path, "--project", tiny_run))
     spec = yaml.safe_load((tiny / "match.yaml").read_text())

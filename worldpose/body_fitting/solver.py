@@ -182,8 +182,8 @@ Joints = tuple[Floats, Floats]
 
 PIECE: Final = 1.0
 """Length of the intervals sampled from long tracks [s]."""
-BIAS_PRIOR_WEIGHT: Final = 8.0
-"""Weight of `bias_std_m` as a prior, in squared offsets [1]."""
+BIAS_PRIOR_WEIGHT: Final = 200.0
+"""Weight of `bias_std_m` as a prior, in squared offsets [1]; a clip has 26 offsets."""
 
 
 @dataclass(frozen=True, eq=False)

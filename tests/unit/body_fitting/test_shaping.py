@@ -78,7 +78,7 @@ def test_without_people_there_are_no_offsets():
 def test_what_few_seconds_say_of_offsets_is_held_back_by_how_often_errors_repeat():
     _, joints = people(1, 100, 0.01)
     for _, (places, _) in joints.items():
-        places[:, [15, 16], 2] += 0.04
+        places[:, [15, 16], 2] += 0.06
     sizes, spreads = [], []
     for repeat in (1e6, 40.0, 0.02):
         settings = SETTINGS.model_copy(update={"bias_time_s": repeat})
