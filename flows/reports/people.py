@@ -1,4 +1,4 @@
-"""Report section about adjusted cameras and fitted bodies."""
+"""Report sections about people, adjusted cameras and fitted bodies."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.conventions import COCO17
-from flows.results.best_results import ADJUSTED, bodies_unit, clip_title
+from flows.results.best_results import (
+    ADJUSTED,
+    bodies_unit,
+    clip_positions,
+    clip_title,
+    person_kinds,
+)
+from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number
 from worldpose.store import Run
@@ -22,6 +29,25 @@ _BODIES = {
     "jerk_m_s3": ("jerk m/s³", 1.0, 0),
 }
 """Title of each body metric, its display factor, and decimals."""
+
+
+def people_tables(run: Run, clips: tuple[str, ...], fps: float) -> list[Table]:
+    """Tabulate kind, time, distance and top speed of every person, by clip."""
+    tables = []
+    for clip in clips:
+        positions, kinds = clip_positions(run, clip), person_kinds(run, clip)
+        named = any(positions.names)
+        rows = []
+        for person, own in people_table(positions, fps).groupby("person"):
+            cells = [str(person), str(own["name"].iloc[0])] if named else [str(person)]
+            cells += [kinds[int(str(person))], f"{len(own) / fps:.1f}"]
+            cells += [f"{own['distance_m'].iloc[-1]:.1f}", _number(float(own["speed_m_s"].max()))]
+            rows.append(tuple(cells))
+        columns = (">person", *(("name",) if named else ()), "kind", ">seconds")
+        tables.append(
+            Table(clip_title(clip), (*columns, ">distance m", ">top speed m/s"), tuple(rows))
+        )
+    return tables
 
 
 def adjustment_tables(run: Run) -> list[Table]:

@@ -19,7 +19,7 @@ from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictu
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, clip_scene, detection_pictures
 from flows.reports.disagreements import disagreement_pictures
-from flows.reports.people import adjustment_tables, body_tables
+from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, when
@@ -117,6 +117,12 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Sample images",
             tuple(p for clip in filmed for p in clip_pictures(store, run, match, clip, truth)),
+        ),
+        Section(
+            "People",
+            tuple(people_tables(run, clips, match.folder.spec.fps)),
+            "Triangulated: joints and body in 3D. Plane: placed on the pitch by the feet, where "
+            "too few cameras see the person. Mixed: both, in different frames.",
         ),
         extent_section(run, match),
         Section(

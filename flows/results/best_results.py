@@ -102,11 +102,22 @@ def joint_tracks(
     )
 
 
+def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:
+    """Return the tracking of one clip, and its people by id."""
+    plane = f"{PLANE}/{clip}"
+    tracking = run[plane if plane in run else f"tracking/{clip}"]
+    tracks = map(Track.model_validate, tracking.attrs["tracks"])
+    return tracking, {track.person: track for track in tracks}
+
+
+def person_kinds(run: Run, clip: str) -> dict[int, str]:
+    """Return the kind of every person of a clip, by id: triangulated, mixed or plane."""
+    return {person: track.kind for person, track in tracked_people(run, clip)[1].items()}
+
+
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet."""
-    plane = f"{PLANE}/{clip}"
-    tracks, tracking = joint_tracks(run, clip), run[plane if plane in run else f"tracking/{clip}"]
-    known = {track.person: track for track in map(Track.model_validate, tracking.attrs["tracks"])}
+    tracks, (tracking, known) = joint_tracks(run, clip), tracked_people(run, clip)
     person = tracking["person"].values.astype(np.int64)
     xy = np.full((len(tracks.frames), len(person), 2), np.nan)
     covariance = np.full((*xy.shape, 2), np.nan)

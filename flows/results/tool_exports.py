@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
-from data_contracts.tracking import Track
 from flows.results.best_results import (
     PLANE,
     Origin,
@@ -18,6 +17,7 @@ from flows.results.best_results import (
     broadcast_camera,
     clip_positions,
     fitted_bodies,
+    person_kinds,
     static_cameras,
 )
 from worldpose.errors import UsageError
@@ -45,14 +45,6 @@ if TYPE_CHECKING:
 
 OPEN_BODY = "open-neutral"
 """Names of the body model that ships begin so."""
-
-
-def person_kinds(origin: Origin, clip: str) -> dict[int, str]:
-    """Return the kind of every person of a clip, by id: triangulated, mixed or plane."""
-    plane = f"{PLANE}/{clip}"
-    tracking = origin.run[plane if plane in origin.run else f"tracking/{clip}"]
-    tracks = map(Track.model_validate, tracking.attrs["tracks"])
-    return {track.person: track.kind for track in tracks}
 
 
 def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
@@ -106,7 +98,7 @@ def export_c3d(origin: Origin, out: Path) -> list[Path]:
     """Write `markers/<clip>/person_<id>.c3d` for every person with a joint."""
     written = []
     for clip in origin.clips:
-        tracks, kinds = origin.tracks(clip), person_kinds(origin, clip)
+        tracks, kinds = origin.tracks(clip), person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip)
         for person, person_id in enumerate(tracks.person_ids.tolist()):
             if np.isfinite(tracks.joints[:, person]).any():
@@ -140,7 +132,7 @@ def export_opensim(origin: Origin, out: Path) -> list[Path]:
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
         frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
-        kinds = person_kinds(origin, clip)
+        kinds = person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip) | {
             "world": "x as in the world of the match, y up, z = minus its y",
             "joints": OPENSIM_CONVENTION,
@@ -184,7 +176,7 @@ def export_gltf(origin: Origin, out: Path) -> list[Path]:
         cameras = static_cameras(origin.run, origin.spec, origin.stage)
         if f"broadcast_calibration/{clip}" in origin.run:
             cameras["broadcast"] = broadcast_camera(origin.run, clip)
-        kinds = person_kinds(origin, clip)
+        kinds = person_kinds(origin.run, clip)
         people = [
             AnimatedBody(
                 f"person_{person_id:03d}",
@@ -238,7 +230,7 @@ def _tables(origin: Origin, clip: str) -> dict[str, pd.DataFrame]:
     """Return joints, people and strides of a clip."""
     tracks, fps = origin.tracks(clip), origin.spec.fps
     return {
-        "joints": joints_table(tracks, fps, person_kinds(origin, clip)),
+        "joints": joints_table(tracks, fps, person_kinds(origin.run, clip)),
         "people": people_table(clip_positions(origin.run, clip), fps),
         "strides": strides_table(tracks, fps),
     }

@@ -22,6 +22,9 @@ def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, 
     with (tmp_path / "out/positions/clip.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["kind"] for row in rows} == {"plane"}
+    page = tmp_path / "report.html"
+    succeed("report", match, "--out", page, "--no-videos", *project)
+    assert page.read_text().count("<td>plane</td>") == len({row["person"] for row in rows})
     truth = library.read_joints(tmp_path / "one/reference/joints.npz")
     hips = truth.joints[:, :, 11:13, :2].mean(axis=2)
     errors, inside = [], []

@@ -160,6 +160,10 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     assert page.count('<div class="scene">') == 1
     assert "Mean joint error" in page
     assert "expected ground error" in page
+    people = re.search(r"<h2[^>]*>People</h2>.*?</table>", page, re.DOTALL)
+    assert people is not None
+    assert people[0].count("triangulated</td>") == 5
+    assert "top speed m/s" in people[0]
     assert "triangulation/clip" in page
 
 
