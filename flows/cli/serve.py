@@ -220,7 +220,7 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
                         "part": each.part,
                         "well": each.is_well,
                         "state": each.state,
-                        "mend": each.mend,
+                        "mend": each.remedy,
                     }
                     for each in findings
                 ],
@@ -229,6 +229,6 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
     for finding in [] if as_json else findings:
         line(f"{'ok' if finding.is_well else 'UNHEALTHY':<10}{finding.part}: {finding.state}")
         if not finding.is_well:
-            line(f"          fix: {finding.mend}")
+            line(f"          fix: {finding.remedy}")
     if not all(finding.is_well for finding in findings):
         raise typer.Exit(1)

@@ -48,7 +48,7 @@ OPEN_BODY = "open-neutral"
 
 
 def person_kinds(origin: Origin, clip: str) -> dict[int, str]:
-    """Return the kind of every person of a clip, by id: triangulated, mixed or plane."""
+    """Return the kind of every person in a clip, by id: triangulated, mixed or plane."""
     plane = f"{PLANE}/{clip}"
     tracking = origin.run[plane if plane in origin.run else f"tracking/{clip}"]
     tracks = map(Track.model_validate, tracking.attrs["tracks"])

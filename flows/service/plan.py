@@ -13,7 +13,7 @@ METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """Flows that the Prefect server offers, known without importing Prefect."""
 TITLES = {"ingest": "inbox", "reprocess": "stale matches", "finetune": "fine-tuning"}
-"""Flow to what its runs are named by, if not a match."""
+"""Flow to the name of its runs; the runs of all other flows have the name of their match."""
 
 
 def deployment_name(name: str, flow: str) -> str:

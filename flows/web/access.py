@@ -53,7 +53,7 @@ class User(Record):
 
 
 class UserFile(Record):
-    """The file users.toml: who may log in. Without the file, the access token admits everybody."""
+    """The file users.toml: who may log in. Without the file, the access token admits every user."""
 
     users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User]
     """Name to role and token."""

@@ -100,8 +100,8 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
 
     Each joint of each person is interpolated between its first and its last frame by monotone
     cubic pieces, which do not overshoot; nothing is extrapolated. `views` is 0 at an interpolated
-    joint, as at every joint that no camera contributes to, and its covariance is NaN: how far a
-    person goes astray in a gap is unknown. Frames that all people lack are added.
+    joint, as at every joint that no camera contributes to, and its covariance is NaN: the
+    error of an interpolated position is unknown. Frames that all people lack are added.
     """
     if not len(tracks.frames):
         return tracks

@@ -1,4 +1,4 @@
-"""Exports of joints and poses: TRC markers, BVH and OpenSim motion, COCO keypoints in a camera."""
+"""Exports: TRC markers, BVH and OpenSim motion, and COCO keypoints in the images of a camera."""
 
 from __future__ import annotations
 

@@ -355,7 +355,8 @@ def _update(
 ) -> None:
     """Match the detections of one camera with people; the others start people.
 
-    Parts of people come last, and start none: most are second boxes of a person.
+    Detections of parts of people come last and start no track: most are a second box of the same
+    person.
     """
     seen = np.isfinite(positions.xy[frame, camera, :, 0])
     whole = seen if positions.is_whole is None else seen & positions.is_whole[frame, camera]

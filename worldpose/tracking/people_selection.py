@@ -4,9 +4,9 @@ A track ends after a moment unseen, so one person usually has several. A fragmen
 look like a bystander, while fetching the ball, or like a shadow, if few cameras see the player in a
 duel; the player's other tracks show neither.
 
-Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot to
-a metre, and given 2D poses may show any person. Several cameras locate a track to centimetres, and
-so distinguish people waiting behind the lines from players.
+Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot
+with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
+track to centimetres, and so distinguish people waiting behind the lines from players.
 
 A shadow is a false track that follows a person in a few of the cameras that see the person. If a
 detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
