@@ -228,7 +228,7 @@ UNTIL_BEST = "auto"
 
 
 def parse_iterations(text: str) -> int | None:
-    """Return the number of iterations; None = until one is no better.
+    """Return the number of iterations; None = iterate until an iteration brings no improvement.
 
     Raises:
         UsageError: neither a number from 1 nor `auto`.

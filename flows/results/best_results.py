@@ -150,7 +150,7 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 @dataclass(frozen=True)
 class Origin:
-    """Source of an export."""
+    """Run whose results an export writes, with the options of the export."""
 
     run: Run
     registration: Registration

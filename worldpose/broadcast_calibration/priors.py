@@ -169,7 +169,8 @@ def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
 def correlation_time(camera: MovingCamera, fps: float) -> float:
     """Return the correlation time of second differences of a tracked clip's zoom [frame].
 
-    The sum of their autocorrelation: so many frames are worth one independent frame.
+    The correlation time is the sum of the autocorrelation: this number of consecutive frames has
+    the information of one independent frame.
 
     Args:
         camera: all frames, as tracked.

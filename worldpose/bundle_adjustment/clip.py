@@ -84,7 +84,7 @@ class Clip:
 
     @cached_property
     def given(self) -> Flags:
-        """Whether each camera (cameras,) comes from a file that states no covariance."""
+        """Return whether each camera (cameras,) comes from a file that states no covariance."""
         return np.asarray(~self.covariance.any(axis=(1, 2)))
 
     @cached_property

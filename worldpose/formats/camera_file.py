@@ -151,7 +151,8 @@ def read_camera_rows(path: Path) -> CameraRows:
     """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras.
 
     Raises:
-        InputError: names file and member: absent, members missing or unknown, wrong shapes.
+        InputError: the file is absent, or one of its members is missing, unknown or of the wrong
+            shape; the error names file and member.
     """
     arrays = read_archive(path, _ROW_MEMBERS)
     count, poses = len(arrays["K"]), len(arrays["R"])

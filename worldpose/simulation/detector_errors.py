@@ -409,13 +409,15 @@ POSTURES: Final = 12.0
 def draw_false_positives(
     scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
 ) -> Bodies:
-    """Return still false people that appear and vanish at random places on and around the area.
+    """Return motionless false positives that appear and vanish at random places.
+
+    The places are on and around the area of the scenario.
 
     Args:
         scenario: area and the rates of false positives.
         pitch: the ground under them.
         frames: number of frames.
-        rng: this camera's own: false positives of cameras are independent.
+        rng: generator of this camera alone, so that false positives of cameras are independent.
     """
     noise, crowd = scenario.noise, scenario.crowd
     share = noise.false_people / MAX_FALSE_POSITIVES
