@@ -84,8 +84,8 @@ class UnitStatus:
     Attributes:
         planned: the unit with its current recipe, its key and its iteration.
         state: its state relative to the run.
-        run_id: the run that has a result of the unit; None if it has none.
-        reasons: causes of the state; differences of the recipe if it is stale.
+        run_id: the run that has a result of the unit; None if no run has one.
+        reasons: causes of the state; if the unit is stale, differences of the recipe.
     """
 
     planned: PlannedUnit

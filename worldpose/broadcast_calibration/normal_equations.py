@@ -204,14 +204,14 @@ def add_points(
     paint_offsets: Floats,
     equations: NormalEquations,
 ) -> float:
-    """Add points to the normal equations and return their cost, half a sum of losses.
+    """Add points to the normal equations and return their cost, half the sum of their losses.
 
     Args:
-        cameras: of all frames.
-        bounds: (frames + 1,) of the points.
-        points: sorted by frame.
+        cameras: the cameras of all frames.
+        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` belong to frame t.
+        points: all points, sorted by frame.
         paint_offsets: (painted, 3) paint errors of the template's points [standard deviations].
-        equations: added to.
+        equations: the normal equations that the function extends.
     """
     center, rotation = cameras.center, cameras.rotation
     image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss

@@ -50,7 +50,7 @@ def build_prior(
     """Return the prior of frames with given approximate focal lengths.
 
     Args:
-        settings: middles and spreads.
+        settings: means and standard deviations.
         focal: (frames,) [px], approximate.
         image_size: (2,) width, height [px].
     """

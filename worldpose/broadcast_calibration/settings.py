@@ -15,10 +15,10 @@ _Offset = Annotated[float, Field(ge=-1, le=1)]
 
 
 class BroadcastPrior(Record):
-    """Gaussian prior of a main camera: middles and spreads.
+    """Gaussian prior of a main camera: means and standard deviations.
 
-    From 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), widened for lenses and
-    stadiums of other broadcasters.
+    They come from 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), and are
+    widened for lenses and stadiums of other broadcasters.
     """
 
     principal_point: tuple[_Offset, _Offset] = (0.0, -0.018)
@@ -38,7 +38,7 @@ class BroadcastPrior(Record):
     k2_std: float = Field(default=0.8, ge=1e-6, le=100)
     """As `k2`, with the same growth [1]; 2022: 0.5 to 0.8."""
     k3_std: float = Field(default=0.5, ge=1e-6, le=100)
-    """As `k2_std`, about zero [1]: the released cameras have none (trap 3)."""
+    """As `k2_std`, about zero [1]: the released cameras have no k3."""
     center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
     """World [m]: on the main stand, at the halfway line."""
     center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)

@@ -52,7 +52,7 @@ class Uncertainty:
 
     @property
     def clip(self) -> Floats:
-        """(5, 5) of center [m] and principal point [px]."""
+        """Return the covariance (5, 5) of center [m] and principal point [px]."""
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
 
 

@@ -115,7 +115,7 @@ def adjust_cameras(
         settings: evidence, weights, acceptance.
 
     Note:
-        B1-B3, trap 1; paper section "Bundle Adjustment".
+        B1-B3; paper section "Bundle Adjustment".
     """
     proposed = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views

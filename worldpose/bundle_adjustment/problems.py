@@ -110,7 +110,7 @@ def estimate_variance_factor(problem: Problem, adjusted: Solution) -> Floats:
 
 
 def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSettings) -> Problem:
-    """Return the adjustment of cameras to clicks alone, all parameters free, no prior (trap 1).
+    """Return the adjustment of cameras to clicks alone, all parameters free, without a prior.
 
     Args:
         clip: cameras and clicks.

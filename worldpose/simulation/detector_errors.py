@@ -192,7 +192,7 @@ class Detections:
 
 
 def draw_systematic_errors(rng: np.random.Generator) -> SystematicErrors:
-    """Return a detector, drawn once per match for all cameras and people."""
+    """Return a detector's systematic errors, drawn once per match for all cameras and people."""
     joint_bias = rng.standard_normal((17, 3))
     for joint, mirror in enumerate(MIRRORED):
         if _SIDE[joint] < 0.0:

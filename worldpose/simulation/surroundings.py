@@ -30,11 +30,13 @@ _HALF = 0.5 * LINE_WIDTH
 
 
 def paint_rows(pitch: PitchTemplate) -> Floats:
-    """Return the painted markings, a row (8,) each for `paint_cover`.
+    """Return the painted markings, one row (8,) per marking, for `paint_cover` [m, rad].
 
-    Kind, then for a line x y of its start, its direction, length, and both ends' heights above the
-    crown; for an arc center x y, radius, start angle, span, height; for a spot x y, radius, and
-    height last but one, as for an arc [m, rad].
+    The first number of a row is the kind; heights are above the crown. The rest of a row is
+
+    - for a line: x and y of its start, x and y of its direction, length, height of start and end;
+    - for an arc: x and y of its center, radius, start angle, span, height, 0;
+    - for a spot: x and y of its center, radius, 0, 0, height, 0.
     """
 
     def above(name: str) -> tuple[float, float, float]:

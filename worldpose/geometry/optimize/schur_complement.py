@@ -30,7 +30,7 @@ class Evidence(NamedTuple):
     anchors: Floats
     """(points, 3) [m], world; means of the priors."""
     information: Floats
-    """(points,) [1/m^2] of the priors; 0 = none, infinite = the point is fixed."""
+    """(points,) [1/m^2], inverse variance of the prior; 0 = no prior, infinite = fixed point."""
     first_of: Integers
     """(points + 1,); observations of point p are `first_of[p]` to `first_of[p + 1]`."""
     camera_of: Integers
@@ -40,7 +40,7 @@ class Evidence(NamedTuple):
     weight: Floats
     """(n,) [1/px^2]."""
     scale: Floats
-    """(n,) of Cauchy's loss, in standard deviations; infinite = plain squares."""
+    """(n,) scale of Cauchy's loss, in standard deviations; infinite = squared loss."""
 
 
 class CameraEquations(NamedTuple):
