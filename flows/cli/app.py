@@ -167,4 +167,4 @@ def worldpose(
         ),
     ] = False,
 ) -> None:
-    """Metric 3D poses of every player from many cameras: a data factory."""
+    """Reconstruct metric 3D poses of every player from many cameras."""

@@ -76,8 +76,8 @@ def run(
         typer.Option(
             metavar="N",
             help="Number of iterations. Each one leaves out the keypoints that the bodies of the "
-            "previous one contradict. auto: until the error in held-out cameras stops "
-            "decreasing.",
+            "previous one contradict. With auto, the run iterates until the error in held-out "
+            "cameras stops decreasing.",
         ),
     ] = "1",
     verbose: VerboseOption = False,

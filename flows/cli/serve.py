@@ -41,7 +41,7 @@ def serve(
     ] = None,
     bucket: Annotated[
         str | None,
-        typer.Option("--bucket", help="s3:// URL of further arrivals; copied to the inbox."),
+        typer.Option("--bucket", help="s3:// URL of matches to copy to the inbox."),
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
