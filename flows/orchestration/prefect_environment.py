@@ -97,7 +97,7 @@ def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) ->
     """Return an environment without the variables that hold secrets, selected by name.
 
     Args:
-        environment: of a process.
+        environment: environment of a process.
         keep: variables that its child needs; a name that ends with `*` is a prefix.
     """
     kept = tuple(keep)

@@ -171,7 +171,7 @@ class Drafts:
         """Begin a file, or return the same one that was begun before: its transfer continues.
 
         Args:
-            draft_id: of the draft.
+            draft_id: id of the draft.
             file: its id and name in the match folder are chosen here.
 
         Raises:

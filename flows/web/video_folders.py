@@ -28,7 +28,7 @@ def list_videos(folders: Sequence[Path], number: int, path: str) -> dict[str, An
     Args:
         folders: as the operator named them.
         number: index of one of them.
-        path: of a folder inside it, with forward slashes; empty for itself.
+        path: path of a folder inside it, with forward slashes; empty for itself.
 
     Raises:
         InputError: there is no such folder, or the path is unsafe.

@@ -122,7 +122,7 @@ def point_row(
     Args:
         r: (3, 3) rotation.
         center: (3,) [m], world.
-        lens: of the frame.
+        lens: lens of the frame.
         world: (3,) [m].
         image: (2,), written.
         jacobian: (2, 12), written: by a frame's step, then by the clip's.
@@ -391,7 +391,7 @@ def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEq
     """Add followed points to the normal equations and return their cost; see `add_points`.
 
     Args:
-        cameras: of all frames.
+        cameras: cameras of all frames.
         bounds: (frames + 1,) of the points by their first frame.
         flow: followed points, sorted by frame.
         equations: added to.

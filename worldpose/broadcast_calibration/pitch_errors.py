@@ -34,7 +34,7 @@ class PitchErrors:
         paint_m: of any other point, each axis [m].
         size_m: (3,) of length, width, crown [m]; 0 = known.
         by_size: (points, 2) change of x by the length, and of y by the width [1].
-        half_width: of the pitch [m].
+        half_width: half of the width of the pitch [m].
     """
 
     surveyed: NDArray[np.bool_]

@@ -205,7 +205,7 @@ def estimate_flow_share(
     Args:
         links: a tracked clip; without a gap between key frames, `drift` applies.
         key_frames: their numbers, rising.
-        deviation: of a followed point's motion [px].
+        deviation: deviation of a followed point's motion [px].
         drift: tracking error after one frame, growing with the square root of frames [px].
     """
     points = np.array([kept.sum() for kept in links.kept])

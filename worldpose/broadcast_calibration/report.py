@@ -58,7 +58,7 @@ class BroadcastReport:
         wrong: outliers among a key frame's clicks and markings, by frame.
         drift: (gaps,) tracking error from one key frame to the next [px].
         feed_offset: the clip's clock offset, from people; None without people.
-        weights: of the terms.
+        weights: weights of the terms.
         pitch: the pitch and the noise that the fit shows.
         pick_next: frames whose clicks would help most, the best first.
         markings_off: median distance of painted lines from their projection [px], before players
@@ -114,7 +114,7 @@ class JointFit:
         uncertainty: covariance of `camera`.
         points: evidence of the fit.
         matches: players; None without.
-        weights: of the terms.
+        weights: weights of the terms.
         feed_offset: the clip's clock offset; None without people.
         pitch: the pitch and the noise that the fit shows.
     """

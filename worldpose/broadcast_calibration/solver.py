@@ -37,7 +37,7 @@ class Problem:
     Attributes:
         points: clicks, lines and players.
         flow: followed points.
-        prior: of center and lenses.
+        prior: prior of center and lenses.
         smoothness: (7,) standard deviation of second differences of a frame's parameters; infinite
             = free.
         flow_weight: factor on the loss of followed points [1].

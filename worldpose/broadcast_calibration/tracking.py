@@ -134,8 +134,8 @@ class Turned:
 
     Attributes:
         camera: two frames: the given one, and the next.
-        residual: (n, 2) of the followed points, predicted minus observed [px]; NaN where there is
-            no prediction.
+        residual: (n, 2) residual of the followed points, predicted minus observed [px]; NaN where
+            there is no prediction.
         determined: whether the points determine the motion.
     """
 

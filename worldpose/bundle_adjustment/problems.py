@@ -210,7 +210,7 @@ def estimate_noise(
         cameras: (cameras,) batch, adjusted.
         points: (points, 3) [m], world, adjusted.
         observed: keypoints of these points.
-        robust_scale: of Cauchy's loss [standard deviations].
+        robust_scale: robust scale of Cauchy's loss [standard deviations].
     """
     off = residuals(cameras, points, observed)
     views = np.bincount(observed.point_of, minlength=len(points))[observed.point_of]

@@ -167,7 +167,7 @@ def read_clip(
         clip: one of `clips`.
         clips: all of the data set; a camera with none of their names is static.
         body: returns the body model for a name, or for a file without one.
-        manifest: of the release, if it is one.
+        manifest: manifest of the release, if it is one.
         fps: frames per second.
         pitch: whether the ground is z = 0.
 

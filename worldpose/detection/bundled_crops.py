@@ -105,8 +105,8 @@ def surroundings(box: Floats, others: Floats, mapping: Floats, size: tuple[int, 
     The person whose box ends lower in the frame stands nearer to the camera.
 
     Args:
-        box: (4,) of the target person x0, y0, x1, y1 [px].
-        others: (people, 4) of others [px].
+        box: (4,) box of the target person x0, y0, x1, y1 [px].
+        others: (people, 4) boxes of others [px].
         mapping: (2, 3) from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
     """

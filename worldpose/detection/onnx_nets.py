@@ -43,7 +43,7 @@ class OnnxNet:
         where: the file, for messages.
         size: width, height of its input [px].
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
-        dtype: of its input.
+        dtype: dtype of its input.
         batch: images per call; None for any number.
         metadata: what the exporter wrote into the file.
         outputs: shape of each output, with None for dynamic sizes.

@@ -53,7 +53,7 @@ def measure_held_out(
         cameras: batch (cameras,).
         used: detections for triangulation; NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        settings: of triangulation.
+        settings: settings of triangulation.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
     count = cameras.batch_shape[0]

@@ -79,7 +79,7 @@ class _File:
         """Append an array (rows, ...); return the index of its accessor.
 
         Args:
-            array: of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
+            array: array of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
             target: use of the data, for vertices and indices.
             bounds: state the extreme values.
         """

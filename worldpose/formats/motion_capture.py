@@ -186,7 +186,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     Args:
         path: the file.
         model: body model of the parameters.
-        poses: (frames,) of one person, complete; the betas are those of the first frame.
+        poses: (frames,) poses of one person, complete; the betas are those of the first frame.
         fps: frames per second.
 
     Raises:

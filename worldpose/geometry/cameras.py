@@ -126,7 +126,7 @@ class Camera:
         Args:
             matrix: (..., 3, 3), `K` [px], without skew.
             distortion: (..., 5) k1 k2 p1 p2 k3.
-            rotation: (..., 3, 3) of `x_cam = rotation x_world + translation`.
+            rotation: (..., 3, 3) rotation of `x_cam = rotation x_world + translation`.
             translation: (..., 3) [m].
             image_size: (..., 2) width, height [px].
 

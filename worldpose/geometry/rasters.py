@@ -195,7 +195,7 @@ def resolve(
 
     Args:
         who: (height, width, 4) of `Samples`.
-        color: (height, width, 4, 3) of `Samples`.
+        color: (height, width, 4, 3) color of `Samples`.
         picture: (height, width, 3) RGB, changed in place.
         persons: (height, width), written where half of the samples show a person; objects from
             len(seen) on are no people.

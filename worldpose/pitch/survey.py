@@ -44,7 +44,7 @@ class Survey:
 
     Attributes:
         where: the file, for messages.
-        names: of the pitch template's points, each once.
+        names: names of the pitch template's points, each once.
         places: (n, 3) [m]; z is up, NaN without a height.
     """
 
@@ -261,7 +261,7 @@ def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: Surve
 
     Args:
         survey: for its names and messages.
-        offsets: (n, 2) of the aligned survey from the Laws [m].
+        offsets: (n, 2) offsets of the aligned survey from the Laws [m].
         settings: largest plausible error of the markings.
 
     Raises:
@@ -288,7 +288,7 @@ class SurveyFit:
 
     Attributes:
         pitch: length, width, crown and the surveyed points in the world frame.
-        names: of the points, as in the survey.
+        names: names of the points, as in the survey.
         offset_plan: (n,) distance in plan between survey and law [m].
         offset_height: (n,) height of the survey above the crowned surface [m]; NaN without height.
         scale: survey lengths over true ones, from markings of prescribed size [1].

@@ -168,7 +168,7 @@ class Table:
     Attributes:
         heading: title of the table.
         columns: titles; the prefix ">" marks numeric columns.
-        rows: of text.
+        rows: rows of text.
     """
 
     heading: str

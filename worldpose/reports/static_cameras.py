@@ -39,7 +39,7 @@ class Click:
     """A clicked point, as inlier or outlier of its camera.
 
     Attributes:
-        name: of the pitch template.
+        name: name of the pitch template.
         place: (2,) the click [px].
         inlier: whether the fit includes the click.
     """

@@ -46,7 +46,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
 
     Args:
         found: detected or given observations; not modified.
-        edits: of this camera, in the order they were made.
+        edits: edits of this camera, in the order they were made.
     """
     changed = KeypointDetections(
         frame=found.frame,

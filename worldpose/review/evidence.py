@@ -57,8 +57,8 @@ def open_detections(
     Args:
         frame: (frames,) match frames, rising without gaps.
         score: (frames, detections) without corrections; NaN = no detection.
-        acceptances: of this result.
-        edits: of this camera; a corrected detection counts as reviewed.
+        acceptances: acceptances of this result.
+        edits: edits of this camera; a corrected detection counts as reviewed.
     """
     there = np.isfinite(score)
     waits = there.copy()
@@ -104,7 +104,7 @@ def clip_curves(
 
     Args:
         bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
-        covariance: (frames, persons, 17, 3, 3) of these keypoints [m^2].
+        covariance: (frames, persons, 17, 3, 3) covariance of these keypoints [m^2].
         filled: (frames, persons) bodies from the motion model alone.
         placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
             missing.

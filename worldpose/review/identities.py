@@ -171,7 +171,7 @@ def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> Ident
 
     Args:
         found: identities from the tracker.
-        edits: of this clip, in the order they were made.
+        edits: edits of this clip, in the order they were made.
     """
     objections = []
     for edit in edits:

@@ -246,7 +246,7 @@ def click_key_frames(
         people: joints (frames, persons, 17, 3) [m], world, of possible occluders.
         settings: accuracy; lines and arcs are always drawn.
         count: number of key frames.
-        rng: of the clicks.
+        rng: random generator of the clicks.
     """
     frames = len(people)
     drawing = settings.model_copy(update={"enough": len(pitch.points) + 1})
@@ -285,7 +285,7 @@ def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchS
 
     Args:
         painted: the true pitch.
-        error: of a point, standard deviation along each axis [m].
+        error: error of a point, standard deviation along each axis [m].
         rng: the surveyor's own.
     """
     points = {}

@@ -200,7 +200,7 @@ def dress_people(
     """Return a cast; a person's looks depend on the seed and the person's number alone.
 
     Args:
-        betas: (persons, 10) of the open body.
+        betas: (persons, 10) betas of the open body.
         roles: of each.
         seed: draws kits and looks.
         patterns: shirt patterns to draw from.

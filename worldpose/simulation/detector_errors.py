@@ -355,7 +355,7 @@ def report(
     """Return detections in shuffled order, and the body of each.
 
     Args:
-        detections: of all bodies, including false positives.
+        detections: detections of all bodies, including false positives.
         size: (frames, bodies) [px]; scales the margins of boxes.
         dropped: (frames,), frames without any detection.
         rng: shuffles every frame independently.
@@ -483,7 +483,7 @@ def estimate_bodies(
         bodies: (frames, persons), world; NaN where missing.
         camera: batch (frames,).
         fps: [1/s].
-        errors: of the method.
+        errors: errors of the method.
         rng: draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
@@ -540,7 +540,7 @@ def write_estimates(
         poses: (persons, frames), world.
         camera: batch (frames,).
         fps: [1/s].
-        seed: of the scene.
+        seed: seed of the scene.
     """
     given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
     bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))

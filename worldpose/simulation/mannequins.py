@@ -109,8 +109,8 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
 
     Args:
         mannequin: common model of the people.
-        shaped: (persons, vertices, 3) of `shape_people`.
-        poses: of the same people, a batch (persons,); NaN = missing.
+        shaped: (persons, vertices, 3) vertices of `shape_people`.
+        poses: poses of the same people, a batch (persons,); NaN = missing.
     """
     posed = mannequin.body.articulate(poses)
     motions = np.concatenate(

@@ -86,7 +86,7 @@ def open_view(
     Args:
         camera: a single camera.
         pitch: the painted pitch.
-        seed: of the stadium's look and the sensor's noise.
+        seed: seed of the stadium's look and the sensor's noise.
         settings: the defaults if None.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
@@ -165,8 +165,8 @@ def film_scene(
     Args:
         scene: the scene to film.
         scenario: its look, and its frame rate.
-        seed: of the stadium, kits and noise.
-        folder: of the match.
+        seed: seed of the stadium, kits and noise.
+        folder: folder of the match.
         clip_id: names the broadcast camera's files.
         stills: write stills, too.
         masks: write masks, too.
@@ -491,7 +491,7 @@ def write_references(
 
     Args:
         folder: reference/ of the match.
-        scenario: of the scene.
+        scenario: scenario of the scene.
         scene: the ground truth.
         detected: whether the match includes the scene's detections.
     """

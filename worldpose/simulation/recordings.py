@@ -32,7 +32,7 @@ class Capture:
     """A captured motion.
 
     Attributes:
-        names: of the joints; the end of a terminal joint's bone is called "<joint>_end".
+        names: names of the joints; the end of a terminal joint's bone is called "<joint>_end".
         parents: (joints,) index of each joint's parent, -1 for the root; parents come first.
         positions: (frames, joints, 3), in the file's axes and unit.
         frame_time: [s].

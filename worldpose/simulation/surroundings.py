@@ -104,7 +104,7 @@ def paint_cover(paint: Floats, place: Floats) -> float:
     """Return the painted share of a pixel.
 
     Args:
-        paint: (n, 8) of `paint_rows`.
+        paint: (n, 8) rows of `paint_rows`.
         place: (8,) x y on the surface, their changes by a pixel to the right and one down, and by
             a metre of height.
     """
@@ -177,10 +177,10 @@ def grass(
     """Return brightness (1 on average) and yellowness of the grass.
 
     Args:
-        table: (64, 64) of numbers about 0 with spread 1.
+        table: (64, 64) table of numbers about 0 with spread 1.
         place: as in `paint_cover`.
-        length: of the pitch [m].
-        width: of the pitch [m].
+        length: length of the pitch [m].
+        width: width of the pitch [m].
         stripes: brightness of a stripe against its neighbour [1].
     """
     x, y = place[0], place[1]
@@ -304,7 +304,7 @@ def scenery(
         dy: direction along y.
         dz: direction upwards.
         half: (2,) half the distances between the boards along x and y [m].
-        bend: (2,) of the surface, see `surface_hit`.
+        bend: (2,) bend of the surface, see `surface_hit`.
         look: seed of the stadium's look.
     """
     nearest = surface_hit(o, dx, dy, dz, bend)

@@ -430,7 +430,7 @@ def _start_on_pitch(
 
     Args:
         problem: clicks, noise and prior.
-        size: of the other pitch.
+        size: size of the other pitch.
         settings: with the prior of cameras.
 
     Returns:

@@ -82,8 +82,8 @@ class InlierFit:
 
     Attributes:
         row: (22,) camera.
-        covariance: (12, 12) of a step, to second order.
-        tangent_covariance: (12, 12) of a step, to first order.
+        covariance: (12, 12) covariance of a step, to second order.
+        tangent_covariance: (12, 12) covariance of a step, to first order.
         evidence_information: (12, 12) of the inliers, at the estimated noise.
         inliers: (n,) bool.
         markings: (m,) bool, inliers among the drawn markings.

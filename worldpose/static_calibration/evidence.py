@@ -105,7 +105,7 @@ def gather_evidence(
         pitch: template that defines the names.
         clicked: points and drawn markings.
         image_size: width, height [px].
-        spacing: of the samples along markings [m].
+        spacing: spacing of the samples along markings [m].
         where: file or camera, for messages.
 
     Raises:

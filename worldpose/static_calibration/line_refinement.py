@@ -60,7 +60,7 @@ class MarkingFit:
     """Detection result of one marking.
 
     Attributes:
-        name: of the line or arc.
+        name: name of the line or arc.
         samples: count in the image.
         found: count of inliers among them.
         rms: of the inliers, measured minus projected across the line [px]; NaN without inliers.
@@ -82,10 +82,11 @@ class LineRefinement:
         reason: why it failed; empty on success.
         markings: markings in the image.
         rms: of all inliers, measured minus projected across the line [px]; NaN without inliers.
-        correlation: of neighbouring residuals along a marking, mean over the samples [1].
+        correlation: correlation of neighbouring residuals along a marking, mean over the samples
+            [1].
         effective_samples: equivalent number of independent inliers [1].
         bars: bars of the fit; None if refinement failed.
-        noise: of paint and detection, learned from the residuals; None if refinement failed.
+        noise: noise of paint and detection, learned from the residuals; None if refinement failed.
         venue: what the camera tells about the pitch; None before the final fit.
     """
 
@@ -121,8 +122,8 @@ def refine_on_lines(
         pitch: the template; its surface is where to linearize.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.
-        survey_error: of the template's points from the painted ones, each axis, standard
-            deviation [m].
+        survey_error: survey error of the template's points from the painted ones, each axis,
+            standard deviation [m].
         begin: camera to begin the search at, if more accurate than the prior; the start if None.
 
     Raises:

@@ -56,7 +56,7 @@ class PaintNoise:
         Args:
             least: the minimum, and the prior.
             paint: unknowns of a fit with this noise.
-            residuals: (n,) of this fit, in standard deviations of the present reading.
+            residuals: (n,) residuals of this fit, in standard deviations of the present reading.
         """
         mine = paint.numbers <= FIRST_KNOT
         squares = float(np.minimum(paint.values[mine] ** 2, _MAX_UNKNOWN**2).sum())
@@ -93,7 +93,8 @@ def stated_noise(survey_error: float, shift: float) -> PaintNoise:
     """Return the noise of a surveyed pitch without unevenness: the minimum.
 
     Args:
-        survey_error: of the points that define markings, each axis, standard deviation [m].
-        shift: of a whole marking in the image, standard deviation [px].
+        survey_error: survey error of the points that define markings, each axis, standard deviation
+            [m].
+        shift: shift of a whole marking in the image, standard deviation [px].
     """
     return PaintNoise(max(survey_error, 1e-6), _MIN_UNEVENNESS_M, max(shift, 1e-6), 1.0)

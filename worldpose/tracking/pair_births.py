@@ -322,7 +322,7 @@ def group_pairs(pairs: Pairs, weights: Floats, settings: TrackingSettings) -> li
     """Return the pairs that are likelier than their rivals, the likeliest first.
 
     Args:
-        pairs: of one frame.
+        pairs: pairs of one frame.
         weights: (cameras, detections, 17); 0 for matched detections.
         settings: least number of joints.
 

@@ -87,7 +87,7 @@ class Training(Generic[Net, Batch]):
     Attributes:
         net: changed in place.
         batch: draws a batch.
-        loss: of the net on a batch.
+        loss: loss of the net on a batch.
         score: metric of the net on held-out frames; higher is better.
         settings: rate, steps and seed.
     """

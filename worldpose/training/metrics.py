@@ -34,7 +34,8 @@ class KeypointMetrics:
         people: number of people.
         pck: share of visible keypoints within a fifth of the torso [1].
         hidden_pck: the same of occluded ones within the image [1]; NaN without.
-        median_error: of visible keypoints, as a share of the longer side of the box [1].
+        median_error: median error of visible keypoints, as a share of the longer side of the box
+            [1].
         calibration: mean gap between confidence and share of correct keypoints [1].
     """
 
@@ -198,7 +199,7 @@ def correct_keypoints(found: AnyFloats, true: Floats, share: float = TORSO_SHARE
     Args:
         found: (people, 17, 2) [px]; a missing one is not correct.
         true: (people, 17, 2) [px]; NaN where unknown.
-        share: of the torso [1].
+        share: share of the torso [1].
     """
     error = np.linalg.norm(found - true, axis=-1)
     torso = torso_sizes(true)

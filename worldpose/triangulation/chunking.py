@@ -87,9 +87,9 @@ def learn_clip(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip.
+        detections: detections of the clip.
         fps: frames per second [1/s].
-        settings: of the stage.
+        settings: settings of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
     """
     clocks = estimate_clocks(cameras, detections, fps, settings)
@@ -138,10 +138,10 @@ def reconstruct_chunks(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip, as detected.
-        model: of the clip, from `learn_clip`.
+        detections: detections of the clip, as detected.
+        model: model of the clip, from `learn_clip`.
         fps: frames per second [1/s].
-        settings: of the stage.
+        settings: settings of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
         length: frames per chunk; rounded up to the margin and whole tiles of the solver.
     """
@@ -227,9 +227,9 @@ def reconstruct_joints(
 
     Args:
         cameras: batch (cameras,).
-        detections: of all tracked people.
+        detections: detections of all tracked people.
         fps: frames per second [1/s].
-        settings: of the stage.
+        settings: settings of the stage.
         camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
 
     Raises:

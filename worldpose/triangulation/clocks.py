@@ -89,7 +89,7 @@ def estimate_clocks(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip, as detected.
+        detections: detections of the clip, as detected.
         fps: frames per second [1/s].
         settings: noise, and the standard error below which an offset is determined.
     """
@@ -242,7 +242,7 @@ def read_frames(
     """Return the detections of some frames of a clip, on the common clock.
 
     Args:
-        detections: of the clip, as detected.
+        detections: detections of the clip, as detected.
         frames: from a first frame to before a last one, or single frames.
         late: (cameras,) [frame], clock offsets to correct; None = no correction.
     """

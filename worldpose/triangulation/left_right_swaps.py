@@ -51,7 +51,7 @@ def find_swaps(
     at least two outlier keypoints are tested.
 
     Args:
-        observations: of all tracked people.
+        observations: observations of all tracked people.
         noise: [px], [m].
         limit: largest squared error of an inlier [variances].
         found: the joints from the unchanged detections.

@@ -139,8 +139,8 @@ def observe_person(
     """Return one person's observations.
 
     Args:
-        detections: of all people.
-        precision: (frames, cameras, detections, joints) of the keypoints.
+        detections: detections of all people.
+        precision: (frames, cameras, detections, joints) precision of the keypoints.
         offsets: (frames, cameras, persons, 2) [px] to subtract.
         joints: (frames, persons, joints, 3) [m], triangulated.
         person: index of the person.
@@ -164,7 +164,7 @@ def gather(observations: Observations, first: int, tiles: Floats) -> None:
     """Write pixels, precision and additional variance of 64 joints.
 
     Args:
-        observations: of all joints.
+        observations: observations of all joints.
         first: the first joint, counted over frames, persons, joints.
         tiles: (cameras, ROWS x LANES); pixels go to the first rows of `A` and `B`.
     """

@@ -30,7 +30,7 @@ def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[n
     """Return an image (height, width, 3) RGB, or (height, width) grey.
 
     Args:
-        content: (bytes,) of a PNG or JPEG file.
+        content: (bytes,) content of a PNG or JPEG file.
         grey: without colour.
 
     Returns:

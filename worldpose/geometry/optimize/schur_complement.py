@@ -71,11 +71,11 @@ def eliminate(
     Args:
         cameras: (cameras, 22).
         points: (points, 3) [m], world.
-        evidence: of all points.
+        evidence: evidence of all points.
         damping: Marquardt damping of the points.
         first: first point.
         last: last point, exclusive.
-        equations: of the cameras; `rows` is written, for these points alone, `blocks` and
+        equations: equations of the cameras; `rows` is written, for these points alone, `blocks` and
             `gradient` are added to.
     """
     columns, rows = equations.columns, equations.rows
@@ -137,7 +137,7 @@ def substitute(
     Args:
         cameras: (cameras, 22), before the step.
         points: (points, 3) [m], world, before it.
-        evidence: of all points.
+        evidence: evidence of all points.
         damping: as in the elimination.
         steps: (cameras, 12).
         trial: (points, 3) [m], written.
@@ -177,7 +177,7 @@ def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
     Args:
         cameras: (cameras, 22).
         points: (points, 3) [m], world.
-        evidence: of all points.
+        evidence: evidence of all points.
     """
     total = 0.0
     for p in range(len(points)):

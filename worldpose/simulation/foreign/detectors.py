@@ -245,7 +245,7 @@ def detect_people(
     """Return the detections in a camera's images.
 
     Args:
-        detector: of the match.
+        detector: detector of the match.
         view: people in the camera's images.
         defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
         image_size: width and height [px].

@@ -60,7 +60,7 @@ class Manner:
         splay: of the arms, outward [rad].
         stride: length of steps relative to the usual [1].
         sway: turning of pelvis and shoulders relative to the usual [1].
-        width: of the steps, as a share of the hips' width [1].
+        width: width of the steps, as a share of the hips' width [1].
     """
 
     lean: float
@@ -78,7 +78,7 @@ class Gesture:
 
     Attributes:
         kind: one of `GESTURES`.
-        time: of its peak [s].
+        time: time of its peak [s].
         length: from begin to end [s].
         strength: 1 = fully.
         side: the arm, 0 left, 1 right.

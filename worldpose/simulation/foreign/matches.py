@@ -95,7 +95,7 @@ class ForeignScene:
         clicked: by id of a camera without calibration.
         misnamed: by camera, by wrong name, the name of the point under it.
         reports: detections, by camera.
-        offsets: of the cameras' frame numbers, as stated [frame].
+        offsets: offsets of the cameras' frame numbers, as stated [frame].
         clock_offsets: clock offset of a camera's exposure, by id [frame].
         pitch: None in a hall.
         record: all other drawn values, for world.json.
@@ -262,8 +262,8 @@ class _Space:
     """Where people move.
 
     Attributes:
-        center: (2,) of their area [m].
-        size: (2,) of their area [m].
+        center: (2,) center of their area [m].
+        size: (2,) size of their area [m].
         pitch: None in a hall.
         ground: height of the ground.
     """

@@ -112,8 +112,8 @@ class Posture:
         head_up, gaze: axis of the head, and direction of the face.
         upper_arm, forearm, thigh, shank: (frames, 2, 3), left and right, towards the end of the
             limb.
-        height: (frames,) of the middle of the hips above the ankles' level on the ground, as a
-            share of the leg's length [1].
+        height: (frames,) height of the middle of the hips above the ankles' level on the ground, as
+            a share of the leg's length [1].
         planted: (frames, 2), left and right: the ankle does not move.
     """
 
