@@ -181,7 +181,7 @@ class RunStatus:
     """The stages that a match's latest run would recompute.
 
     Attributes:
-        match: with all current corrections and verdicts.
+        match: match with all current corrections and verdicts.
         latest: the current run.
         settings: settings of that run, and further requested ones.
         until_stage: last stage of that run; None = the method's last.

@@ -129,7 +129,7 @@ class ClipInputs:
     """Static cameras of a clip and their detections, which are read on access.
 
     Attributes:
-        camera_ids: in the order of every camera dimension.
+        camera_ids: ids in the order of every camera dimension.
         cameras: (cameras,) batch.
         camera_covariance: (cameras, 12, 12) covariance of the parameters; None unless known for
             all.

@@ -210,11 +210,11 @@ class Verdicts:
     """Classification of results; each is of one kind.
 
     Attributes:
-        found: (n,) it is the person's.
-        unsure: (n,) of low confidence, or there was no frame.
-        elsewhere: (n,) it is not where the body is.
-        another: (n,) it is another person's, or a duplicate.
-        rejected: (n, 17) its keypoints that are not where the body is.
+        found: (n,) the pose is the person's.
+        unsure: (n,) the pose has low confidence, or there was no frame.
+        elsewhere: (n,) the pose is not where the body is.
+        another: (n,) the pose is another person's, or a duplicate.
+        rejected: (n, 17) keypoints of the pose that are not where the body is.
     """
 
     found: Flags

@@ -71,7 +71,7 @@ class RunTime:
 
     Attributes:
         run_id: its number.
-        seconds: from its start to its record [s].
+        seconds: time from its start to its record [s].
         stages: stages with computed units, in the method's order.
         start: until its first unit ran: planning, and the start of workers [s].
         between: after that, time without a running unit: planning, submitting, recording [s].

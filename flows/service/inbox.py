@@ -40,7 +40,7 @@ class Entry:
     Attributes:
         path: its path.
         name: path below the inbox for display and storage.
-        priority: from the folder that contains it.
+        priority: priority that the containing folder states.
     """
 
     path: Path

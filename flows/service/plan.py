@@ -59,9 +59,9 @@ class ServePlan(Record):
     names: tuple[str, ...] = ()
     """Further names of this machine in browsers and scrapers."""
     pages_port: int = 8571
-    """Of the review and status pages."""
+    """Port of the review and status pages."""
     metrics_port: int = METRICS_PORT
-    """Of the metrics for Prometheus."""
+    """Port of the metrics for Prometheus."""
     certificate: Path | None = None
     """PEM file of the pages' certificate."""
     key: Path | None = None

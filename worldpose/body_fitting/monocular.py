@@ -174,7 +174,7 @@ def place_monocular_poses(
     frame by frame.
 
     Args:
-        estimates: in images of the camera.
+        estimates: poses estimated in images of the camera.
         camera: batch (frames,).
         frame: (frames,), frame numbers.
         joints: (frames, persons, 17, 3) [m], world; gaps are interpolated.

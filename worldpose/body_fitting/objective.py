@@ -94,7 +94,7 @@ Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
 
 ANKLES: Final = (15, 16)
-"""Of COCO-17."""
+"""Ankles in COCO-17."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ class Track:
         Args:
             pose: where to linearise.
             offsets: (17, 3) [m] forward, left, up, from a body's joints to the detector's.
-            bordered: with betas and offsets; else the border is empty.
+            bordered: whether the equations have a border for betas and offsets.
         """
         frames, settings = len(pose.transl), self.settings
         body = self.chained.differentiate(pose.parameters())

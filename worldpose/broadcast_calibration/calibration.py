@@ -276,7 +276,7 @@ class _Learned:
     Attributes:
         errors: errors of the pitch.
         lines: deviation of a line's sample over its assumed one, at least 1 [1].
-        clicks: the same of clicks [1].
+        clicks: the same ratio for clicks [1].
         lasting: samples of lines that count as one, since the errors of a piece of a marking last
             for the whole clip [1].
     """

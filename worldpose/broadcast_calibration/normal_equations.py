@@ -392,9 +392,9 @@ def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEq
 
     Args:
         cameras: cameras of all frames.
-        bounds: (frames + 1,) of the points by their first frame.
+        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` begin in frame t.
         flow: followed points, sorted by frame.
-        equations: added to.
+        equations: the normal equations that the function extends.
     """
     principal, focal = cameras.principal_point, cameras.focal
     rotation, distortion = cameras.rotation, cameras.distortion

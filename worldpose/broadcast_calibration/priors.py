@@ -133,9 +133,10 @@ class Weights(Record):
     """Deviation of second differences: their root mean square in the logarithm of the tracked focal
     lengths, smoothed over 0.2 s."""
     smooth_k1: float
-    """As the focal length's, times 1.6 and k1: a zoom lens's distortion changes with its zoom."""
+    """The same deviation for k1: that of the focal length times 1.6 and k1, because a zoom lens's
+    distortion changes with its zoom."""
     smooth_k2: float
-    """As the focal length's, times k2."""
+    """The same deviation for k2: that of the focal length times k2."""
     smooth_frames: float
     """Correlation time of these second differences: the sum of their autocorrelation [frame]."""
     player_share: float

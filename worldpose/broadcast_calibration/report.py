@@ -48,8 +48,9 @@ class BroadcastReport:
         status: (frames,) main evidence of each frame, an index into FRAME_STATUS.
         reprojection_error: (frames,) expected image error of places on the pitch, root mean square
             over the visible places [px].
-        marking_rms: (frames,) of the samples of painted lines, across them [px]; NaN without any.
-        player_rms: (frames,) of matched keypoints [px]; NaN without any.
+        marking_rms: (frames,) root mean square residual of the samples of painted lines, across the
+            lines [px]; NaN without any.
+        player_rms: (frames,) root mean square residual of matched keypoints [px]; NaN without any.
         marking_count: (frames,) samples of painted lines.
         player_count: (frames,) matched players.
         flow_count: (frames,) followed points from the frame to the next.
@@ -63,7 +64,7 @@ class BroadcastReport:
         pick_next: frames whose clicks would help most, the best first.
         markings_off: median distance of painted lines from their projection [px], before players
             and the joint fit, and after; NaN without any.
-        players_off: the same of people, by the mean over a person's keypoints.
+        players_off: the same distances of people, by the mean over a person's keypoints.
         decisions: choices and the metrics behind them.
         reasons: why a person must review the clip; empty if not necessary.
     """

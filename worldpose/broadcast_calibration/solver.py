@@ -187,7 +187,7 @@ def displace(points: PointEvidence, problem: Problem, paint_offsets: Floats) -> 
 
     Args:
         points: evidence of the problem.
-        problem: with the rows of the paint errors.
+        problem: problem with the rows of the paint errors.
         paint_offsets: (painted, 3) [standard deviations].
     """
     padded = np.concatenate([paint_offsets, np.zeros((1, 3))])

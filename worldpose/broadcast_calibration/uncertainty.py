@@ -92,7 +92,8 @@ def compute_uncertainty(
     Args:
         solution: the camera and the paint errors.
         problem: evidence, smoothness and priors of the solution.
-        line_shift: of all painted lines in the image, each axis, standard deviation [px].
+        line_shift: standard deviation of a common shift of all painted lines in the image, each
+            axis [px].
         player_shift: of all keypoints in all frames, each axis, standard deviation [standard
             deviations of a keypoint].
         smooth_frames: correlation time of the lens's second differences [frame].

@@ -65,7 +65,7 @@ class Clip:
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) inlier cameras.
         triangulation: settings that made the joints.
-        pitch: as surveyed; None = not known.
+        pitch: the pitch as surveyed; None = not known.
         on_lines: (cameras,) bool, whether it was calibrated on painted lines; None = no camera.
         names: names of the cameras, for messages; empty = not known.
     """

@@ -105,7 +105,7 @@ class Comparison:
     """Cameras, their detections, and the agreement between them.
 
     Attributes:
-        cameras: as stated, batch (cameras,).
+        cameras: batch (cameras,), as stated.
         count: number of cameras.
         frames: number of frames.
         sample: (n,) frames at which cameras are compared.

@@ -133,7 +133,7 @@ def restore_size(people: People, size: Sequence[int] | NDArray[np.integer], zoom
     """Return people of a resized image in the pixels of the original.
 
     Args:
-        people: in the image that `resize` returned.
+        people: people in the image that `resize` returned.
         size: width, height of the original [px].
         zoom: its factor.
     """

@@ -100,7 +100,7 @@ def recognize_form(where: str, outputs: Outputs, size: tuple[int, int]) -> str:
 
     Args:
         where: the file, for messages.
-        outputs: for one image, without the batch dimension.
+        outputs: outputs for one image, without the batch dimension.
         size: width, height of the net's input [px].
 
     Raises:

@@ -168,7 +168,7 @@ def cut_crops(image: Image, frames: Floats, size: tuple[int, int], fill: int = 0
 
     Args:
         image: the whole frame.
-        frames: (boxes, 3) from `fit_crops`.
+        frames: (boxes, 3) crops from `fit_crops`.
         size: width, height of a crop [px].
         fill: grey level beyond the frame's border.
     """
@@ -218,7 +218,7 @@ def points_in_frame(points: Floats, frames: Floats) -> Floats:
 
     Args:
         points: (boxes, points, 2) [px of the crop].
-        frames: (boxes, 3) from `fit_crops`.
+        frames: (boxes, 3) crops from `fit_crops`.
     """
     return np.asarray(points * frames[:, None, 2:] + frames[:, None, :2])
 

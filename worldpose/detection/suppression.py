@@ -55,7 +55,7 @@ def combine_boxes(people: People, poses: KeypointDetections) -> KeypointDetectio
     """Return the poses with the estimator's boxes, where it gives any, else the detector's.
 
     Args:
-        people: as a detector found them.
+        people: people as a detector found them.
         poses: the estimate for each person. Its score, the expected fit of its box, becomes the
             geometric mean of the detector's score, the fit and the mean confidence of the surest
             keypoints; without a fit the detector's score stays.

@@ -54,7 +54,7 @@ def measure_held_out(
         used: detections for triangulation; NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
         settings: settings of triangulation.
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
     """
     count = cameras.batch_shape[0]
     if count - max(1, count // FOLDS) < settings.min_views:

@@ -31,9 +31,9 @@ class Spread:
     """Factors on the stated variance of keypoints about their bodies.
 
     Attributes:
-        joint: (17,)
+        joint: (17,) factor per joint.
         knots: (bins - 1,) confidences that separate the classes.
-        confidence: (bins,) by class.
+        confidence: (bins,) factor per class of confidence.
     """
 
     joint: Floats
@@ -354,7 +354,7 @@ class _BestBodies:
         detection: index among the camera's detections.
         fits: index of the person.
         similarity: similarity of bones [1].
-        distance: (n, 17) in standard deviations.
+        distance: (n, 17) distances in standard deviations.
     """
 
     camera: Places

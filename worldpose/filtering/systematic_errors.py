@@ -131,7 +131,7 @@ class SystematicErrors:
     """Systematic errors of a clip's detector and clocks.
 
     Attributes:
-        view_bias: by viewing direction.
+        view_bias: bias by viewing direction.
         late: (cameras,) clock offset of each camera relative to the cameras' mean [frame]; positive
             = the camera shows a later time.
     """
@@ -173,7 +173,7 @@ class BodyMotion:
     """Azimuth and image motion of bodies in all images."""
 
     azimuth: Floats
-    """(frames, cameras, persons) of the camera, seen from the body [rad]."""
+    """(frames, cameras, persons) azimuth of the camera, seen from the body [rad]."""
     image_motion: Floats
     """(frames, cameras, persons, 17, 2) motion of joints per frame [px]."""
 

@@ -230,7 +230,7 @@ def _require_orientation(
     """Reject a survey whose mirror image fits far better than the survey.
 
     Args:
-        survey: for its names and messages.
+        survey: survey, which the messages name.
         places: (n, 2) [m], in a right-handed frame if the settings are correct.
         settings: stated handedness of the frame.
 
@@ -260,7 +260,7 @@ def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: Surve
     """Reject points that are far from the positions of their names.
 
     Args:
-        survey: for its names and messages.
+        survey: survey, which the messages name.
         offsets: (n, 2) offsets of the aligned survey from the Laws [m].
         settings: largest plausible error of the markings.
 

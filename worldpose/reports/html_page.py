@@ -182,7 +182,7 @@ class Section:
 
     Attributes:
         heading: also in the navigation bar.
-        blocks: in this order.
+        blocks: blocks in this order.
         lead: introduction.
     """
 

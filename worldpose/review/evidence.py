@@ -178,7 +178,7 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     Args:
         source: one camera.
         target: another camera.
-        pixel: (2,) in the image of `source` [px].
+        pixel: (2,) pixel in the image of `source` [px].
 
     Returns:
         Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
@@ -364,7 +364,7 @@ def preview(
         image_size: width, height [px].
         picture: (height, width, 3); if given, the calibration refines the camera on the painted
             lines, which takes seconds and not milliseconds.
-        settings: as for the stage `static_calibration`.
+        settings: settings as for the stage `static_calibration`.
         lens: the given lens of a static camera, if there is one.
 
     Raises:

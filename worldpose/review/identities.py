@@ -76,7 +76,7 @@ class IdentityReplay:
     """Identities with corrections applied.
 
     Attributes:
-        identities: with corrections.
+        identities: identities with corrections.
         objections: per edit the reason why it does not apply; None if it does.
     """
 

@@ -43,8 +43,8 @@ class Clicks:
 
     Attributes:
         markings: annotations/static_calibration/<camera>.json.
-        wrong: by the name of every wrong click, the name of the point under it or, for the same
-            name, of the intended point.
+        wrong: maps the name of every wrong click to the name of the point under the click or, for
+            the same name, of the intended point.
         clustered: all points come from one part of the image.
     """
 

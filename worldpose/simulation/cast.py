@@ -201,7 +201,7 @@ def dress_people(
 
     Args:
         betas: (persons, 10) betas of the open body.
-        roles: of each.
+        roles: role of each person.
         seed: draws kits and looks.
         patterns: shirt patterns to draw from.
     """

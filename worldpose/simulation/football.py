@@ -54,7 +54,7 @@ class Ball:
 
     Attributes:
         position: (samples, 2) [m], every `STEP`.
-        touches: in temporal order.
+        touches: touches in temporal order.
     """
 
     position: Floats

@@ -65,7 +65,7 @@ class View:
         venue: the stadium.
         camera: a single camera.
         sharp: (height, width, 3) RGB, before the lens; without goals.
-        blurred: the same through the lens.
+        blurred: the same image through the lens.
         grain: noise of the sensor.
         props: the goals.
     """
@@ -339,7 +339,7 @@ def simulate_match(
 
     Args:
         scenario: the scenario to simulate.
-        seed: from 0.
+        seed: seed from 0.
         out: absent or an empty folder; the write is atomic.
         options: changes of the scenario, and which files to write; the defaults if None.
         advance: receives the filming's progress.

@@ -178,7 +178,7 @@ def grass(
 
     Args:
         table: (64, 64) table of numbers about 0 with spread 1.
-        place: as in `paint_cover`.
+        place: place as in `paint_cover`.
         length: length of the pitch [m].
         width: width of the pitch [m].
         stripes: brightness of a stripe against its neighbour [1].
@@ -208,7 +208,7 @@ def wear(table: Floats, place: Floats) -> float:
 
 
 BOARD_SETBACK: Final = (5.0, 4.0)
-"""From the goal lines and from the touch lines [m]."""
+"""Distance of the boards from the goal lines and from the touch lines [m]."""
 BOARD_HEIGHT: Final = 0.95
 """[m]"""
 _PANEL = 7.0

@@ -95,7 +95,7 @@ def paint_scene(
         stadium: pitch, boards and look.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
-        distance: (height, width) from the camera [m], written; infinite in the sky.
+        distance: (height, width) distance from the camera [m], written; infinite in the sky.
     """
     paint, table, scene, half, look = stadium
     place = np.empty(8)

@@ -431,7 +431,7 @@ def _start_on_pitch(
     Args:
         problem: clicks, noise and prior.
         size: size of the other pitch.
-        settings: with the prior of cameras.
+        settings: settings with the prior of cameras.
 
     Returns:
         None if a point is not in the Laws, or the points determine no camera.

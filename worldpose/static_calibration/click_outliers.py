@@ -84,7 +84,7 @@ class InlierFit:
         row: (22,) camera.
         covariance: (12, 12) covariance of a step, to second order.
         tangent_covariance: (12, 12) covariance of a step, to first order.
-        evidence_information: (12, 12) of the inliers, at the estimated noise.
+        evidence_information: (12, 12) information of the inliers, at the estimated noise.
         inliers: (n,) bool.
         markings: (m,) bool, inliers among the drawn markings.
         mahalanobis: (n,) distance of each click from its prediction by the other evidence.

@@ -63,7 +63,8 @@ class MarkingFit:
         name: name of the line or arc.
         samples: count in the image.
         found: count of inliers among them.
-        rms: of the inliers, measured minus projected across the line [px]; NaN without inliers.
+        rms: root mean square residual of the inliers, measured minus projected across the line
+            [px]; NaN without inliers.
     """
 
     name: str
@@ -81,7 +82,8 @@ class LineRefinement:
         refined: whether refinement succeeded.
         reason: why it failed; empty on success.
         markings: markings in the image.
-        rms: of all inliers, measured minus projected across the line [px]; NaN without inliers.
+        rms: root mean square residual of all inliers, measured minus projected across the line
+            [px]; NaN without inliers.
         correlation: correlation of neighbouring residuals along a marking, mean over the samples
             [1].
         effective_samples: equivalent number of independent inliers [1].
@@ -117,8 +119,8 @@ def refine_on_lines(
     projected uncertainty, which reduce the uncertainty of the others.
 
     Args:
-        start: from clicks; its covariance is the Gaussian prior, and parameters without variance
-            stay fixed.
+        start: camera from clicks; its covariance is the Gaussian prior, and parameters without
+            variance stay fixed.
         pitch: the template; its surface is where to linearize.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.

@@ -35,9 +35,10 @@ class PaintNoise:
     """Standard deviations of the paint from the template, and of its detection.
 
     Attributes:
-        points_m: of the points that define markings, each axis [m].
-        unevenness_m: of paint and ground at knots along a marking, across it and in height [m].
-        shift_px: of a whole marking in the image [px].
+        points_m: standard deviation of the points that define markings, each axis [m].
+        unevenness_m: standard deviation of paint and ground at knots along a marking, across it and
+            in height [m].
+        shift_px: standard deviation of the shift of a whole marking in the image [px].
         reading: factor on the standard deviation of a fitted bar [1].
     """
 
@@ -80,7 +81,7 @@ class PaintUnknowns:
 
     Attributes:
         numbers: (k,) rising, see `ProjectedLines`.
-        values: (k,) in standard deviations of their prior.
+        values: (k,) values in standard deviations of their prior.
         freedom: (k,) degrees of freedom that the samples determine of each, 0 to 1.
     """
 

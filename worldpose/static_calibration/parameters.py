@@ -68,7 +68,7 @@ def step_camera(camera: Camera, step: ArrayLike) -> Camera:
 
     Args:
         camera: cameras (...) with square pixels.
-        step: (..., 12) in the order of `PARAMETERS`.
+        step: (..., 12) step in the order of `PARAMETERS`.
     """
     step = np.asarray(step, dtype=np.float64)
     distortion = camera.distortion.copy()

@@ -54,7 +54,7 @@ class MarkingResidual:
     Attributes:
         name: name of the template.
         pixels: number of drawn pixels [1].
-        rms: of their distances to the projected marking [px].
+        rms: root mean square of their distances to the projected marking [px].
         worst: largest distance [px].
         inlier: whether the fit includes the marking.
     """

@@ -290,7 +290,7 @@ def write_group(
     Args:
         folder: an empty folder.
         layout: required form of the arrays.
-        arrays: by name; those in `layout.optional` can be absent.
+        arrays: arrays by name; those in `layout.optional` can be absent.
         coordinates: one-dimensional arrays by name.
         attributes: the attributes that `layout.attributes` requires.
 

@@ -34,7 +34,7 @@ class Import(NamedTuple):
     """One imported module, or names imported from one.
 
     Attributes:
-        module: as written; empty in `from . import name`.
+        module: name as written; empty in `from . import name`.
         level: number of leading dots.
         names: what is imported from it; empty in `import module`.
     """

@@ -326,7 +326,7 @@ def _explain_missing_detections(
     Args:
         present: (frames, cameras), whether the camera has a usable detection.
         detected: usable detections by camera.
-        detections: as given.
+        detections: detections as given.
         settings: settings of tracking.
     """
     seeing = [name for name, count in detected.items() if count > 0]

@@ -57,8 +57,8 @@ class Candidate:
     Attributes:
         before: number of the track that ends.
         after: number of the track that begins.
-        last_frame: last frame of the first.
-        first_frame: first frame of the second.
+        last_frame: last frame of the earlier track.
+        first_frame: first frame of the later track.
         cost: minus the logarithm of the odds that they are one person rather than two strangers.
         margin: additional cost of the best alternative without this join [nat].
         decided: whether they were joined.
@@ -299,7 +299,7 @@ def lasting_takeovers(
     """Return takeovers after which a real person was never located again, by final numbers.
 
     Args:
-        takeovers: by numbers of tracks.
+        takeovers: takeovers, by numbers of tracks.
         lasting: tracks with enough evidence.
         chains: each final person's tracks.
     """
@@ -327,7 +327,7 @@ def describe_doubts(
     Args:
         frames: (frames,) numbers of the clip's frames.
         people: number of people.
-        takeovers: by indices of frames in the clip.
+        takeovers: takeovers, by indices of frames in the clip.
         joins: joins of the clip, decided or not.
     """
     parts = []

@@ -374,7 +374,7 @@ def fine_tune(
 
     Args:
         kind: which net.
-        pictures: with reviewed labels, in the order of recording.
+        pictures: images with reviewed labels, in the order of recording.
         weights: the file to write; with the checkpoint next to it a killed training resumes.
         settings: the defaults if None.
         start: initial weights; the shipped ones if None.

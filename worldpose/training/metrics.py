@@ -33,7 +33,7 @@ class KeypointMetrics:
     Attributes:
         people: number of people.
         pck: share of visible keypoints within a fifth of the torso [1].
-        hidden_pck: the same of occluded ones within the image [1]; NaN without.
+        hidden_pck: the same share of occluded keypoints within the image [1]; NaN without any.
         median_error: median error of visible keypoints, as a share of the longer side of the box
             [1].
         calibration: mean gap between confidence and share of correct keypoints [1].

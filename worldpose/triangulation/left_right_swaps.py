@@ -66,7 +66,7 @@ def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDete
     """Return detections with left-right swaps undone.
 
     Args:
-        detections: as detected; not changed.
+        detections: detections before any correction; not changed.
         exchanged: (frames, cameras, persons, parts).
     """
     if not exchanged.any():

@@ -89,9 +89,9 @@ def learn_noise(
 
     Args:
         rig: the cameras.
-        detections: in the sample.
+        detections: detections in the sample.
         shift: shift of the observations, as in `Observations`.
-        noise: stated, [px] and [m].
+        noise: stated noise, [px] and [m].
         limit: largest squared error of an inlier [variances].
     """
     confidence, index = detections.confidence, detections.detection_index

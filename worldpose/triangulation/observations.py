@@ -35,7 +35,7 @@ class Rig:
     """Cameras in the memory layout of the kernels.
 
     Attributes:
-        cameras: (cameras, 22) as in `worldpose.geometry.projection`.
+        cameras: (cameras, 22) parameters as in `worldpose.geometry.projection`.
         depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """
@@ -79,9 +79,9 @@ class Observations(NamedTuple):
         detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
             [px^2]; no frames = no shift.
-        cameras: (cameras, 22) as in `Rig`.
-        depths: (cameras, 4) as in `Rig`.
-        centers: (cameras, 3) as in `Rig`.
+        cameras: (cameras, 22) parameters as in `Rig`.
+        depths: (cameras, 4) rows as in `Rig`.
+        centers: (cameras, 3) centers as in `Rig`.
     """
 
     keypoints: AnyFloats
@@ -119,7 +119,7 @@ class PersonTrack:
 
     Attributes:
         pixels: (joints, cameras, frames, 2) [px], offsets subtracted.
-        precision: (joints, cameras, frames) as in `Observations`.
+        precision: (joints, cameras, frames) precision as in `Observations`.
         joints: (frames, joints, 3) [m], triangulated; NaN where unknown.
     """
 

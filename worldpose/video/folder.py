@@ -80,7 +80,7 @@ class ImageFolder:
 
         Args:
             folder: holds the images.
-            index: of the images, if known; else it is computed.
+            index: index of the images; if None, it is computed.
 
         Raises:
             InputError: no images, or names without a number or with the same one.

@@ -56,7 +56,7 @@ class AnnotatedImage:
     Attributes:
         name: file name; `/` between folders.
         size: width, height [px].
-        people: in arbitrary order.
+        people: people in arbitrary order.
     """
 
     name: str

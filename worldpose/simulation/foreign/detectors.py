@@ -25,8 +25,8 @@ class DetectorProfile(Record):
 
     name: str
     definition: float = 0.025
-    """From the anatomical joint to the detector's, along each axis of its limb [m]; the same for
-    all people and cameras."""
+    """Offset from the anatomical joint to the detector's joint, along each axis of its limb [m];
+    the same for all people and cameras."""
     personal: float = 0.006
     """The same, for each person [m]."""
     low_hips: float = 0.0

@@ -90,10 +90,10 @@ class ForeignScene:
         truth: anatomical joints; `views` counts the cameras that see the joint.
         defined: joints as the detector defines them.
         people: bones, motion and joints of each person.
-        cameras: by id.
+        cameras: true cameras, by id.
         given: cameras of calibration.toml, by id; empty if they are to be clicked.
-        clicked: by id of a camera without calibration.
-        misnamed: by camera, by wrong name, the name of the point under it.
+        clicked: clicks, by id of a camera without calibration.
+        misnamed: name of the point under a wrongly named click, by camera and wrong name.
         reports: detections, by camera.
         offsets: offsets of the cameras' frame numbers, as stated [frame].
         clock_offsets: clock offset of a camera's exposure, by id [frame].
@@ -130,7 +130,7 @@ def simulate_foreign_scene(
 
     Args:
         scenario: ranges.
-        seed: from 0.
+        seed: seed from 0.
         duration: [s], instead of the scenario's.
         cameras: number of them, instead of the scenario's.
         people: number of them, instead of the scenario's.
@@ -390,7 +390,7 @@ def simulate_foreign_match(
 
     Args:
         scenario: ranges.
-        seed: from 0.
+        seed: seed from 0.
         out: absent or an empty folder; the write is atomic.
         duration: [s], instead of the scenario's.
         cameras: number of them, instead of the scenario's.

@@ -50,7 +50,7 @@ class Motion:
     Attributes:
         name: name of the file.
         fps: frame rate [1/s].
-        joints: by the names of `JOINTS` (frames, 3) [m], z up.
+        joints: joints (frames, 3) [m] by the names of `JOINTS`, z up.
     """
 
     name: str

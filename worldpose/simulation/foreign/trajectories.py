@@ -69,7 +69,7 @@ def follow_tracks(
         clock: (rows,) clock of the tracking data [s].
         xy: (rows, 2) [m].
         scale: (2,) scale of this pitch to the pitch of the data [1].
-        source: for the reference.
+        source: source of the data, for the reference.
     """
     step = times[1] - times[0]
     place = np.stack(
