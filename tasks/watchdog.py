@@ -44,8 +44,8 @@ def kill_on_timeout(work: Work) -> Iterator[None]:
     Outside Dask workers there is no limit: the process belongs to the caller.
 
     Raises:
-        TaskTimeoutError: it reached the maximum number of timeouts.
-        WorkerCrashError: it reached the maximum number of process deaths.
+        TaskTimeoutError: the unit reached the maximum number of timeouts.
+        WorkerCrashError: the unit reached the maximum number of process deaths.
     """
     mark = _mark_of(work)
     if mark is None:

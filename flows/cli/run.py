@@ -231,7 +231,7 @@ def parse_iterations(text: str) -> int | None:
     """Return the number of iterations; None = iterate until an iteration brings no improvement.
 
     Raises:
-        UsageError: neither a number from 1 nor `auto`.
+        UsageError: the text is neither a number from 1 nor `auto`.
     """
     if text == UNTIL_BEST:
         return None

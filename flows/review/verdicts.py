@@ -281,7 +281,7 @@ def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str
         why: the reviewer's comment.
 
     Raises:
-        InputError: one of them is not in force.
+        InputError: one of the corrections is not in force.
     """
     say(
         store,

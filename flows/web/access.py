@@ -63,7 +63,7 @@ def read_users(file: Path) -> Mapping[str, User]:
     """Return the people of a file, by name.
 
     Raises:
-        UsageError: it is missing or malformed, other users of the machine can read it, or two
+        UsageError: the file is missing or malformed, other users of the machine can read it, or two
             people have the same token.
     """
     problem = ""

@@ -217,7 +217,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
         frames: number of frames; the first image is frame 0.
 
     Raises:
-        InputError: it is not a COCO keypoints file.
+        InputError: the file is not a COCO keypoints file.
     """
     pixels = np.full((frames, len(ids), len(COCO17), 2), np.nan)
     person_of = {person: place for place, person in enumerate(ids)}

@@ -44,7 +44,7 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
     """Read the manifest of a release; None if the folder has none.
 
     Raises:
-        InputError: it is not a manifest, or has another contract version.
+        InputError: the file is not a manifest, or has another contract version.
     """
     path = folder / MANIFEST
     if not path.is_file():

@@ -94,7 +94,7 @@ class Camera:
         """Return one batch of cameras, stacked along a new first dimension.
 
         Raises:
-            InputError: there are none, or their batch shapes differ.
+            InputError: there are no cameras, or their batch shapes differ.
         """
         if len({camera.batch_shape for camera in cameras}) != 1:
             raise InputError(

@@ -61,8 +61,8 @@ def read_survey(path: Path) -> Survey:
     tabs.
 
     Raises:
-        InputError: it names file and row: unreadable, a missing or unknown column, an unknown or
-            repeated name, or text that is no number.
+        InputError: the error names file and row: the file is unreadable, or has a missing or
+            unknown column, an unknown or repeated name, or text that is no number.
     """
     rows = _rows(path)
     if not rows:
@@ -209,7 +209,7 @@ def _require_spread(survey: Survey) -> None:
     """Reject fewer than four points, or points near one line.
 
     Raises:
-        InputError: it names the points.
+        InputError: the survey is rejected; the error names the points.
     """
     enough = len(survey.names) >= 4
     for places in (survey.places[:, :2], _nominal_places(survey)) if enough else ():
@@ -235,7 +235,7 @@ def _require_orientation(
         settings: stated handedness of the frame.
 
     Raises:
-        InputError: it names possible causes.
+        InputError: the survey is rejected; the error names possible causes.
     """
     nominal = _nominal_places(survey)
     target = nominal - nominal.mean(axis=0)
@@ -265,7 +265,7 @@ def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: Surve
         settings: largest plausible error of the markings.
 
     Raises:
-        InputError: it names the points.
+        InputError: the survey is rejected; the error names the points.
     """
     offset = np.linalg.norm(offsets, axis=-1)
     far = [

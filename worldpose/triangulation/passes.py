@@ -293,7 +293,7 @@ def check_shapes(
     """Require arrays of matching shapes, and valid indices.
 
     Raises:
-        InputError: they do not match.
+        InputError: shapes do not match, or an index is invalid.
     """
     keypoints, confidence = detections.keypoints, detections.confidence
     detection_index = detections.detection_index

@@ -202,7 +202,7 @@ def index_video(path: Path) -> FrameIndex:
     """Return the index of a video file or of a folder of images.
 
     Raises:
-        InputError: neither.
+        InputError: the path is neither a video nor a folder of images.
     """
     return index_images(path) if path.is_dir() else index_frames(path)
 

@@ -49,7 +49,7 @@ def read_hybrik(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResul
         model: body model to pose.
 
     Raises:
-        InputError: it is neither.
+        InputError: the file has neither of the two layouts.
     """
     content = read_pickled(path)
     single = isinstance(content, dict) and "pred_thetas" in content

@@ -144,7 +144,7 @@ def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
         model: body model to pose.
 
     Raises:
-        InputError: it is neither.
+        InputError: the path is neither such a file nor such a folder.
     """
     files = [path] if path.is_file() else sorted(path.rglob("*.pt"))
     # The method keeps other torch files in preprocess/.
