@@ -77,7 +77,7 @@ def read_monocular(path: Path) -> MonocularEstimates:
 
 
 def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
-    """Return the bodies of arrays in the layout of such a file.
+    """Return the bodies of arrays in the layout of a file that `read_monocular` reads.
 
     Raises:
         InputError: arrays are missing or have wrong shapes; the error names `where`.

@@ -217,7 +217,7 @@ _FLOW_PARTS = ("frame", "start", "end", "deviation")
 
 
 def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
-    """Return evidence in which so many samples of lines count as one; losses keep their pixels."""
+    """Return evidence in which `lasting` samples of lines count as one; losses stay in pixels."""
     root = np.where(points.kind == MARKING, np.sqrt(lasting), 1.0)
     return replace(
         points, whitening=points.whitening / root[:, None, None], loss=points.loss / root

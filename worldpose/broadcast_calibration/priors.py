@@ -28,8 +28,8 @@ class Prior:
         center_information: (3, 3) [1/m^2].
         principal_point: (2,) [px].
         principal_std: (2,) [px].
-        log_focal: (frames,); with `log_focal_std`.
-        log_focal_std: standard deviation of the logarithm.
+        log_focal: (frames,) mean of the logarithm of the focal length [px].
+        log_focal_std: standard deviation of this logarithm.
         distortion: (frames, 3).
         distortion_std: (frames, 3).
     """

@@ -156,7 +156,9 @@ NEAR: Final = 12.0
 
 
 def detect_paint(still: Image) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of pixels as bright as paint against both sides.
+    """Return the mask (height, width) of pixels that look like paint.
+
+    They are colourless, bright, brighter than both sides, and part of a long region.
 
     Args:
         still: (height, width, 3), RGB.

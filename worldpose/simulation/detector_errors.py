@@ -444,7 +444,7 @@ def draw_false_positives(
 
 
 class MonocularErrors(Record):
-    """Errors of such methods; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
+    """Errors of monocular methods: a PA-MPJPE of 80 mm in total (mean distance after alignment)."""
 
     turn: float = Field(default=0.135, ge=0, le=100)
     """Error of every joint's rotation, standard deviation about each axis [rad]."""
@@ -479,7 +479,7 @@ def estimate_bodies(
     identify persons.
 
     Args:
-        model: the bodies'.
+        model: the bodies' model.
         bodies: (frames, persons), world; NaN where missing.
         camera: batch (frames,).
         fps: [1/s].

@@ -96,7 +96,7 @@ class ObservationNoise(Record):
     person_missed: float = Field(default=0.03, ge=0, lt=1)
     """Share of frames in which a visible person is not found at all [1]."""
     person_missed_time_s: float = Field(default=0.2, gt=0, le=100)
-    """Mean length of such a gap [s]: misses come in bursts, because the image hardly changes."""
+    """Mean length of a gap [s]: misses come in bursts, because the image hardly changes."""
     hidden_std: float = Field(default=1.0, ge=0, le=100)
     """Additional error of a joint hidden behind a person, in units of its usual one [1]: the
     detector guesses from the rest of the body; 1 doubles the error."""

@@ -46,7 +46,7 @@ _AddedSpread = Annotated[float, Field(ge=0, le=10)]
 class CameraPrior(Record):
     """Gaussian prior of a stadium camera.
 
-    Every entry has a middle and a spread (one standard deviation); spreads of logarithms are
+    Every entry has a mean and a standard deviation; standard deviations of logarithms are
     factors. They are wide: they decide only directions that a view does not observe.
     """
 

@@ -62,7 +62,7 @@ class VenueEvidence:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[Any, ArrayLike]) -> VenueEvidence | None:
-        """Return the evidence of a stored camera; None of one that was not refined on lines."""
+        """Return the evidence of a stored camera; None if it was not refined on lines."""
         if f"venue_{ARRAYS[0]}" not in arrays:
             return None
         return cls(**{name: np.asarray(arrays[f"venue_{name}"]) for name in ARRAYS})

@@ -194,7 +194,7 @@ def estimate_offsets(
 def estimate_midhip_shift(
     rig: Rig, detections: KeypointDetections, settings: TriangulationSettings
 ) -> Floats:
-    """Return the mid-hip residual of each person in each image, and a zero.
+    """Return the mid-hip residual of each person in each image, with zero as third component.
 
     With the shift subtracted, reprojection residuals are those of the paper's second stage,
     relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without

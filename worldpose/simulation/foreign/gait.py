@@ -146,7 +146,7 @@ def walk_posture(
         root: (frames, 2) middle of the hips in plan [m], world.
         heading: (frames,) direction that the body faces [rad].
         leg: its length [m].
-        manner: the person's.
+        manner: the person's style.
         gestures: the person's gestures.
         rng: draws the first step and the gaze.
     """
