@@ -60,7 +60,7 @@ class ProjectMetrics(Collector):
             ended = self._overview.poses()
             size = self._store_size()
         yield _counts("worldpose_matches", "Matches by state", "state", STATES, matches)
-        yield from _unit_figures(matches)
+        yield from _unit_metrics(matches)
         yield from _quality(matches)
         total = sum(count for _, count in ended)
         yield CounterMetricFamily("worldpose_poses", "Bodies fitted by all runs", value=total)
@@ -169,7 +169,7 @@ def _counts(
     return family
 
 
-def _unit_figures(matches: list[MatchStatus]) -> Iterator[Metric]:
+def _unit_metrics(matches: list[MatchStatus]) -> Iterator[Metric]:
     units = GaugeMetricFamily(
         "worldpose_units", "Units of latest runs by stage and state", labels=["stage", "state"]
     )
