@@ -69,8 +69,8 @@ class Match:
 def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     """Cache a table per match, because planning needs the table for every unit.
 
-    Hundreds of clips of many cameras make thousands of units. Building the table again for each unit
-    has cubic cost.
+    Hundreds of clips of many cameras make thousands of units. Building the table for each unit
+    again has cubic cost.
     """
 
     @wraps(table)

@@ -94,8 +94,8 @@ def compute_uncertainty(
         problem: evidence, smoothness and priors of the solution.
         line_shift: standard deviation of a common shift of all painted lines in the image, each
             axis [px].
-        player_shift: of all keypoints in all frames, each axis, standard deviation [standard
-            deviations of a keypoint].
+        player_shift: standard deviation of a common shift of all keypoints in all frames, each axis
+            [standard deviations of a keypoint].
         smooth_frames: correlation time of the lens's second differences [frame].
 
     Raises:

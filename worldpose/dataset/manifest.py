@@ -161,7 +161,7 @@ def read_origins(path: Path) -> NDArray[np.int64]:
     """Read the origins (frames, persons, 17) of a file.
 
     Raises:
-        InputError: names file and member.
+        InputError: the file is invalid; the error names file and member.
     """
     origin: NDArray[np.int64] = read_archive(path, MEMBERS)["origin"]
     return origin

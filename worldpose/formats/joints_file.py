@@ -157,8 +157,8 @@ def read_joints(path: str | os.PathLike[str]) -> JointTracks:
     """Read the tracks of a joints file.
 
     Raises:
-        InputError: names file and place: absent, truncated, members missing or unknown, wrong
-            shapes, infinite values.
+        InputError: the file is absent or truncated, or has missing or unknown members, wrong shapes
+            or infinite values; the error names file and place.
     """
     arrays = read_archive(Path(path), MEMBERS)
     try:
@@ -211,8 +211,8 @@ def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
         The poses, and the name of their body model if the file has it.
 
     Raises:
-        InputError: names file and member: absent, truncated, members missing or unknown, wrong
-            shapes.
+        InputError: the file is absent or truncated, or has missing or unknown members or wrong
+            shapes; the error names file and member.
     """
     errors: list[InputError] = []
     for renamed in ({}, PLURALS):

@@ -94,7 +94,10 @@ def click(
 
 
 def every(share: float, index: int, start: float) -> bool:
-    """Return whether the item with this number is in an even share of all, spaced from `start`."""
+    """Return whether item `index` is chosen if a `share` of all items is chosen at equal distances.
+
+    `start` in [0, 1) shifts the choice.
+    """
     return bool(np.floor((index + 1) * share + start) > np.floor(index * share + start))
 
 

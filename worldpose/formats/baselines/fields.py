@@ -57,7 +57,7 @@ def get_part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
     """Return the value at a path of keys in nested dictionaries.
 
     Raises:
-        InputError: names the first missing key.
+        InputError: a key is missing; the error names the first missing key.
     """
     for key in keys:
         if not isinstance(content, Mapping) or key not in content:
