@@ -215,7 +215,7 @@ def report_calibration(
 def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: PitchTemplate) -> Floats:
     """Return the expected image error of places on the pitch per frame (frames,) [px].
 
-    Root mean square over the visible places; NaN if the frame shows none.
+    Each error is the root mean square over the visible places; NaN if the frame shows none.
     """
     half = 0.5 * np.array([pitch.length, pitch.width])
     x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, _GRID) for h in half))

@@ -94,7 +94,7 @@ def score_keypoints(
     cache: PictureCache,
     heights: tuple[float, float] = (0.0, np.inf),
 ) -> KeypointMetrics:
-    """Return metrics of the people of some heights [px], each in the true box."""
+    """Return keypoint metrics of people in their true boxes, within a range of heights [px]."""
     correct, visible, error, confidence, right = [], [], [], [], []
     for picture in pictures:
         tall = picture.boxes[:, 3] - picture.boxes[:, 1]
