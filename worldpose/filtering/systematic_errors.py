@@ -147,7 +147,7 @@ class SystematicErrors:
     def shift(self, motion: BodyMotion, views: BodyViews) -> Floats:
         """Return the systematic error of keypoints (frames, cameras, persons, 17, 2) [px].
 
-        NaN where a body, or its motion, is unknown.
+        The shift is NaN where a body, or its motion, is unknown.
         """
         sides = self.view_bias.shift(motion.azimuth, _scale(views))
         return np.asarray(sides + self.late[:, None, None, None] * motion.image_motion)

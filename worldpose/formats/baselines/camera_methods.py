@@ -121,7 +121,7 @@ _Row = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of 4DHumans' result in the images with a detection.
 
-    4DHumans (HMR2 with PHALP's tracks): `results/demo_<clip>.pkl`, poses relative to the
+    4DHumans (HMR2 with PHALP's tracks) writes `results/demo_<clip>.pkl`, with poses relative to the
     camera.
 
     The layout is that of brjathu/PHALP at commit 96f7e6c, phalp/trackers/PHALP.py (`track`),

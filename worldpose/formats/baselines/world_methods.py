@@ -40,7 +40,7 @@ from worldpose.formats.joints_file import read_poses
 def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of GLAMR's result, in the frames that contain them.
 
-    GLAMR: `grecon/<clip>_seed<n>.pkl`, a pickle of arrays by person, all in one world.
+    The file is `grecon/<clip>_seed<n>.pkl`, a pickle of arrays by person, all in one world.
 
     The layout is that of NVlabs/GLAMR at commit 44f820c, global_recon/run_demo.py and
     global_recon/models/global_recon_model.py (`init_data`, `optimize`): `person_data[id]` with
@@ -86,7 +86,7 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
 def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
     """Return the people of WHAM's result.
 
-    WHAM: `wham_output.pkl`, joblib's file by person, each in its own world.
+    The file is `wham_output.pkl`, a joblib file by person. Each person has a separate world.
 
     The layout is that of yohanshin/WHAM at commit 2b54f77, demo.py: `pose_world` and `pose` (n,
     72), `trans_world` and `trans` (n, 3), `betas` (n, 10), `frame_ids` (n,). `trans_world` is
@@ -131,7 +131,8 @@ def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> Meth
 def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of GVHMR's results, one for each file in order of their names.
 
-    GVHMR: `hmr4d_results.pt`, torch's file of one person; a folder of such files for several.
+    The file `hmr4d_results.pt` is a torch file of one person; several people have a folder of such
+    files.
 
     The layout is that of zju3dv/GVHMR at commit 44fbc19, tools/demo/demo.py and
     hmr4d/model/gvhmr/gvhmr_pl_demo.py: `smpl_params_global` and `smpl_params_incam`, SMPL-X
@@ -184,7 +185,7 @@ def _read_gvhmr_track(file: Path, parameters: object) -> Track:
 def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of TRAM's result.
 
-    TRAM: a folder with `camera.npy` and `hps/hps_track_<n>.npy`, all people in one world.
+    The folder has `camera.npy` and `hps/hps_track_<n>.npy`, with all people in one world.
 
     The layout is that of yufu-wang/tram at commit 4861c11, scripts/estimate_camera.py,
     scripts/estimate_humans.py and lib/models/hmr_vimo.py: numpy files that hold a dictionary;
@@ -245,7 +246,7 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
 def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of PromptHMR's result.
 
-    PromptHMR: `results.pkl`, joblib's file, all people in one world.
+    The file is `results.pkl`, a joblib file with all people in one world.
 
     The layout is that of yufu-wang/PromptHMR at commit ea85d0a, pipeline/pipeline.py and
     pipeline/world.py: `people[id]` with `frames` (n,), `bboxes` (n, 4) x0 y0 x1 y1 px and
