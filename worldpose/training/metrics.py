@@ -136,9 +136,9 @@ def average_precision(
     """Return the area under the curve of precision over recall [1]; NaN without wanted people.
 
     As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
-    People who are ignored or of other heights, and boxes on them, count neither as true nor as
-    false positives; nor do boxes of other heights that match no person. Precision is made to fall
-    with recall, and integrated at every step of recall instead of at COCO's 101 points.
+    Ignored people, people of other heights, and boxes on them count neither as true nor as false
+    positives. The same applies to boxes of other heights that match no person. Precision is made to
+    fall with recall, and integrated at every step of recall instead of at COCO's 101 points.
 
     Args:
         found: detections in each image.
