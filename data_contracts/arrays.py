@@ -16,7 +16,7 @@ from data_contracts.records import CONTRACT_VERSION, Name, Record
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 AnyFloats = NDArray[np.floating]
-"""Of single or double precision."""
+"""Floating-point numbers of single or double precision."""
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]

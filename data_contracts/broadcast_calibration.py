@@ -27,7 +27,7 @@ class KeyFrames(Record):
 
     contract: Literal[1] = CONTRACT_VERSION
     key_frames: tuple[KeyFrame, ...] = Field(min_length=1)
-    """In rising order, each frame once."""
+    """Key frames in rising order, each frame once."""
 
 
 FRAME_STEP = ("rx", "ry", "rz", "log_focal", "k1", "k2", "k3")

@@ -11,7 +11,7 @@ from data_contracts.conventions import DISTORTION
 from data_contracts.records import ImageLength, Name, Record
 
 Entry = Annotated[float, Field(ge=-1.01, le=1.01)]
-"""Of a rotation matrix, rounded."""
+"""Entry of a rotation matrix, which may be rounded."""
 Vector3 = tuple[Entry, Entry, Entry]
 
 _Pixels = Annotated[float, Field(ge=-1e7, le=1e7)]
@@ -47,7 +47,7 @@ class LensCalibration(Record):
     image_size: tuple[ImageLength, ImageLength]
     """Width and height [px]."""
     focal_px: _Focal
-    """Of square pixels [px]."""
+    """Focal length for square pixels [px]."""
     principal_point_px: tuple[_Pixels, _Pixels]
     """cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
     distortion: tuple[_Coefficient, _Coefficient, _Coefficient, _Coefficient, _Coefficient] = (
@@ -57,10 +57,10 @@ class LensCalibration(Record):
     focal_std_px: Annotated[float, Field(gt=0, le=1e6)]
     """Standard deviation of the focal length [px]."""
     principal_point_std_px: Annotated[float, Field(gt=0, le=1e6)]
-    """Of the principal point, each axis [px]."""
+    """Standard deviation of the principal point, each axis [px]."""
     distortion_std: Annotated[float, Field(gt=0, le=1)]
-    """Of the displacement of the image corner by each of k1, k2 and k3, relative to its distance
-    from the centre [1]."""
+    """Standard deviation of the displacement of the image corner by each of k1, k2 and k3, relative
+    to the corner's distance from the centre [1]."""
 
 
 CAMERA_LABELS: dict[str, tuple[str, ...]] = {

@@ -37,7 +37,7 @@ class Checkpoint(Record):
     kind: str = Field(pattern=r"^(transformers|onnx(-[a-z0-9]+)*)$")
     """How it is loaded: the part before the colon of the settings' names."""
     licence: str = Field(min_length=1, max_length=200)
-    """Of the weights, as their authors state it."""
+    """Licence of the weights, as their authors state it."""
     files: tuple[CheckpointFile, ...] = Field(min_length=1, max_length=100)
 
     @model_validator(mode="after")

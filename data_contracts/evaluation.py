@@ -17,7 +17,7 @@ class CameraErrors(Record):
     ground_error_p95_m: Amount | None = None
     """The same; 95 % of the points are better [m]."""
     reprojection_error_median_px: Amount | None = None
-    """In the image, over the pitch at player height [px]."""
+    """Median error in the image, over the pitch at player height [px]."""
     reprojection_error_p95_px: Amount | None = None
     """The same; 95 % of the points are better [px]."""
     center_error_m: Amount | None = None

@@ -109,7 +109,7 @@ class KeypointDetections(Generic[Array]):
         """Return the detections of several cameras as (frames, cameras, detections).
 
         Args:
-            cameras: (frames, detections) of each camera. The result has every frame that a camera
+            cameras: (frames, detections) for each camera. The result has every frame that a camera
                 has; a camera's missing frames and detections are NaN.
         """
         frame = np.unique(np.concatenate([each.frame for each in cameras]))

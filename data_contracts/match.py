@@ -68,7 +68,7 @@ class PlayerSpec(Record):
 
     id: Name
     name: str = ""
-    """As displayed."""
+    """Name to display."""
     team: str = ""
     """Name of the team; empty for officials."""
     role: Literal["player", "goalkeeper", "official"] = "player"

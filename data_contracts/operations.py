@@ -63,7 +63,7 @@ class Serving(Record):
     prefect: str
     """Address of Prefect's API."""
     owns_prefect: bool
-    """Whether the Prefect server ends with it."""
+    """Whether the Prefect server ends with `worldpose serve`."""
     services: dict[str, Service]
     """Name to process."""
     started_at: datetime

@@ -20,5 +20,5 @@ class Pin(Record):
     who: str
     """Name of the person who pinned it."""
     why: str
-    """In the person's words; may be empty."""
+    """Reason in the person's words; may be empty."""
     pinned_at: datetime

@@ -125,9 +125,10 @@ class ClipFigures(Record):
     compared: Count
     """2D points that were compared with 3D points."""
     reprojection_median_px: Amount | None = None
-    """Of the worst pair of a source and a camera; None without visible 2D points."""
+    """Median reprojection error of the worst pair of a source and a camera; None without visible 2D
+    points."""
     plausible_share: Share | None = None
-    """Of bodies near the ground, head up, within the pitch's bounds."""
+    """Share of bodies that are near the ground, head up, and within the pitch's bounds."""
 
 
 class CheckReport(Record):

@@ -170,7 +170,7 @@ class MergedTracks(Record):
     the correction does not apply."""
     merged: PersonId
     merged_seen: Sighting | None = None
-    """As `kept_seen`."""
+    """The same detection for the person `merged`."""
 
 
 class SplitTrack(Record):

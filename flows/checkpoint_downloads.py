@@ -282,7 +282,8 @@ def resolve_address(url: str) -> str:
     """Return the http address of a file; HF_ENDPOINT names another hub than huggingface.co.
 
     Raises:
-        UsageError: it is neither https, http of this machine, nor hf: with a whole commit id.
+        UsageError: the address is neither https, http of this machine, nor hf: with a whole commit
+            id.
     """
     if url.startswith("hf:"):
         found = HUB.fullmatch(url)

@@ -83,7 +83,7 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
         store: the store.
         match: the match.
         request: settings and machines, for every iteration.
-        most: number of iterations; None = until one is no better than the best before it.
+        most: number of iterations; None = until an iteration is no better than the best before it.
 
     Raises:
         UsageError: only a part of the method was requested.

@@ -20,7 +20,7 @@ class UnitChange:
     """Change of one unit between two runs.
 
     Attributes:
-        unit: as `stage/unit`.
+        unit: name as `stage/unit`.
         state: same, changed, only in A, only in B.
         reasons: differences between the recipes.
         figures: name, value in A, value in B of the metrics that differ.
@@ -90,7 +90,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
 
     Args:
         store: the store.
-        name: as `match/stage/unit`.
+        name: unit as `match/stage/unit`.
         overrides: requested settings; empty = those of the latest run.
 
     Raises:

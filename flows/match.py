@@ -107,7 +107,7 @@ def require_complete(record: RunRecord) -> str:
     """Return the number of a complete run.
 
     Raises:
-        IncompleteRunError: it is not complete.
+        IncompleteRunError: the run is not complete.
     """
     if record.state != "complete":
         raise IncompleteRunError(record)

@@ -70,7 +70,7 @@ class RunPlan:
         stages: stages of the run, in order.
         iteration: iteration number, from 1.
         results: `stage/unit` to key of the results that the run has, or will have.
-        before: the same for the previous iteration; None in the first.
+        before: the same plan for the previous iteration; None in the first.
         gatekeeper: decides which results need review; None = every result passes.
         units: the units planned so far whose inputs are known.
         waiting: results that need review; later stages cannot use them.
@@ -108,7 +108,7 @@ class RunPlan:
         not, and the previous iteration that they were computed from.
 
         Args:
-            gatekeeper: with the store and the match.
+            gatekeeper: gatekeeper with the store and the match.
             stages: stages of the run.
             overrides: settings that differ from their defaults.
             latest: the match's latest run.
@@ -249,7 +249,7 @@ def plan_ahead(
     The plan assumes that every unit succeeds and that every missing result passes its gate.
 
     Args:
-        gatekeeper: with the store and the match.
+        gatekeeper: gatekeeper with the store and the match.
         stages: stages of the run.
         overrides: settings that differ from their defaults.
         latest: the match's latest run.

@@ -141,7 +141,7 @@ class RunLog:
         run_id: the run's number.
         latest: the match's latest run before this one.
         started_at: start of the run.
-        started: the same by the monotonic clock [s].
+        started: the same time by the monotonic clock [s].
         executed: units that the run computed, as `stage/unit`.
         reused: units whose results existed.
         failed: units that failed.

@@ -84,8 +84,8 @@ class UnitStatus:
     Attributes:
         planned: the unit with its current recipe, its key and its iteration.
         state: its state relative to the run.
-        run_id: the run that has a result of the unit; None if it has none.
-        reasons: causes of the state; differences of the recipe if it is stale.
+        run_id: the run that has a result of the unit; None if no run has one.
+        reasons: causes of the state; if the unit is stale, differences of the recipe.
     """
 
     planned: PlannedUnit
@@ -181,7 +181,7 @@ class RunStatus:
     """The stages that a match's latest run would recompute.
 
     Attributes:
-        match: with all current corrections and verdicts.
+        match: match with all current corrections and verdicts.
         latest: the current run.
         settings: settings of that run, and further requested ones.
         until_stage: last stage of that run; None = the method's last.

@@ -77,7 +77,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     Raises:
         UsageError: an unknown stage, or no results to start `from_stage` from.
         InputError: the given Dask scheduler or Prefect server does not answer.
-        LostWorkersError: it stopped answering during the run.
+        LostWorkersError: the Prefect server or Dask scheduler stopped answering during the run.
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)

@@ -67,10 +67,10 @@ class Match:
 
 
 def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
-    """Cache a table per match: planning needs it for every unit.
+    """Cache a table per match, because planning needs the table for every unit.
 
-    Hundreds of clips of many cameras make thousands of units: scanning all of them for each unit
-    has cubic cost.
+    Hundreds of clips of many cameras make thousands of units. Building the table for each unit
+    again has cubic cost.
     """
 
     @wraps(table)

@@ -52,7 +52,7 @@ class ClipPeople:
 
     Attributes:
         clip: cameras, frames and clock.
-        detections: of these people, as triangulated: left-right swaps are undone.
+        detections: detections of these people, as triangulated: left-right swaps are undone.
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
@@ -95,7 +95,7 @@ def fit_people(
 
     Args:
         people: people of the clip.
-        recipe: of this stage: its settings, body model and pitch.
+        recipe: recipe of this stage: its settings, body model and pitch.
         views: ray constraints of further cameras.
         monocular_poses: monocular poses (S4).
         known: shapes from other clips, by person index.

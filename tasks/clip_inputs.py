@@ -102,7 +102,7 @@ def _align_results(
     Args:
         clips: detections of each camera.
         results: (frames, cameras, previous detections, ...).
-        shape: (rows, cameras, detections, ...) of the result.
+        shape: (rows, cameras, detections, ...) shape of the result.
         rows: slice of the frames.
     """
     before = results[rows].values
@@ -129,10 +129,11 @@ class ClipInputs:
     """Static cameras of a clip and their detections, which are read on access.
 
     Attributes:
-        camera_ids: in the order of every camera dimension.
+        camera_ids: ids in the order of every camera dimension.
         cameras: (cameras,) batch.
-        camera_covariance: (cameras, 12, 12) of the parameters; None unless known for all.
-        detections: (frames, cameras, detections) of all cameras, with match frames.
+        camera_covariance: (cameras, 12, 12) covariance of the parameters; None unless known for
+            all.
+        detections: (frames, cameras, detections) detections of all cameras, with match frames.
         fps: frames per second of match time.
         surface: (2,) crown and end fall of the pitch that the cameras show [m]; None = as in
             pitch.json.

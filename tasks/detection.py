@@ -176,7 +176,7 @@ def require_weights(settings: DetectionSettings, planned: dict[str, str | None])
     """Refuse weights or libraries that differ from the run plan.
 
     Raises:
-        InputError: they differ.
+        InputError: weights or libraries differ.
     """
     found = weights_of(settings)
     if found != planned:

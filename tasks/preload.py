@@ -34,6 +34,6 @@ def dask_setup(node: Worker | Scheduler) -> None:
 
 
 def dask_teardown(node: Worker | Scheduler) -> None:
-    """Send the last spans; leave all memory to the end of the process, which saves a second."""
+    """Send the last spans; leave all memory to the end of the process, which saves one second."""
     flush_spans()
     gc.freeze()

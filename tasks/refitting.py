@@ -31,8 +31,8 @@ from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.store import Store
 
 KNOWN: Final = 2.0
-"""Frames with a larger expected reprojection error of players are left out [px]: keypoint errors
-are as large, but vary within a person."""
+"""Frames with a larger expected reprojection error of players are left out [px]. Keypoint errors
+are as large, but they differ between the keypoints of one person."""
 
 
 @unit_task

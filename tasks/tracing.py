@@ -1,8 +1,8 @@
 """OpenTelemetry traces of runs, exported as the usual OTEL_* variables say.
 
 Prefect makes a span of each flow and task, and carries the trace from the flow to the workers. Our
-spans lie below the flow's: one for each stage, and one for each computed unit. Tracing is off, and
-nothing of it is imported, unless a variable names an exporter.
+spans lie below the flow's: one for each stage, and one for each computed unit. Unless one of
+these variables names an exporter, tracing is disabled and its packages are not imported.
 """
 
 from __future__ import annotations

@@ -21,9 +21,10 @@ from data_contracts.work import Work
 from worldpose.errors import WorldposeError
 
 MOST_STOPPED: Final = 2
-"""After so many timeouts, a unit is given up."""
+"""Number of timeouts after which a unit is given up."""
 MOST_DEATHS: Final = 3
-"""Likewise after so many process deaths: fewer than Dask tolerates for units on the same worker."""
+"""Number of process deaths after which a unit is given up: fewer than Dask tolerates for units on
+the same worker."""
 FRAMES_SHOWN: Final = 3
 """Stack frames of a hung unit in its message."""
 BEGUN: Final = "begun"
@@ -44,8 +45,8 @@ def kill_on_timeout(work: Work) -> Iterator[None]:
     Outside Dask workers there is no limit: the process belongs to the caller.
 
     Raises:
-        TaskTimeoutError: it reached the maximum number of timeouts.
-        WorkerCrashError: it reached the maximum number of process deaths.
+        TaskTimeoutError: the unit reached the maximum number of timeouts.
+        WorkerCrashError: the unit reached the maximum number of process deaths.
     """
     mark = _mark_of(work)
     if mark is None:

@@ -105,12 +105,12 @@ class Served:
         return fetch(f"http://127.0.0.1:{self.ports['prefect']}/api{path}", body, headers)
 
     def figures(self):
-        """What Prometheus scrapes."""
+        """Return the metrics that Prometheus scrapes."""
         headers = {"authorization": f"Bearer {self.secret('metrics')}"}
         return fetch(f"http://127.0.0.1:{self.ports['metrics']}/metrics", headers=headers)
 
     def runs(self, name):
-        """Prefect's runs of a match, or of what else their names begin with."""
+        """Return Prefect's runs whose names begin with `name`, usually a match."""
         return self.ask("/flow_runs/filter", {"flow_runs": {"name": {"like_": f"{name}, "}}})
 
     def check(self):

@@ -354,7 +354,7 @@ def read_notes(path: Path) -> Any:  # noqa: ANN401
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is damaged, too large, or names a class that is not allowed.
+        ValueError: the file is damaged, too large, or names a class that is not allowed.
     """
     try:
         if zipfile.is_zipfile(path):
@@ -386,7 +386,7 @@ def _number_type(note: object) -> np.dtype[Any]:
     """Return the numpy type of a note, for numbers and text only.
 
     Raises:
-        ValueError: it is another type.
+        ValueError: the note describes another type.
     """
     if not isinstance(note, _Dtype) or not note.args:
         raise ValueError("an array without a type")

@@ -63,7 +63,7 @@ class Expected:
 
     Attributes:
         image: (..., 2) expected detections of joints [px].
-        variance: of `image` per axis [px^2], from the uncertainty of the bodies.
+        variance: variance of `image` per axis [px^2], from the uncertainty of the bodies.
         scale: pixels per metre there [px/m].
         depth: along the camera's optical axis [m].
     """
@@ -80,7 +80,7 @@ class Expected:
         Args:
             views: bodies in the frames of one camera.
             offset: (frames, persons, 17, 2) [px] expected offset of keypoints from the joints.
-            focal: of the camera [px].
+            focal: focal length of the camera [px].
         """
         scale = views.scale[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -210,11 +210,11 @@ class Verdicts:
     """Classification of results; each is of one kind.
 
     Attributes:
-        found: (n,) it is the person's.
-        unsure: (n,) of low confidence, or there was no frame.
-        elsewhere: (n,) it is not where the body is.
-        another: (n,) it is another person's, or a duplicate.
-        rejected: (n, 17) its keypoints that are not where the body is.
+        found: (n,) the pose is the person's.
+        unsure: (n,) the pose has low confidence, or there was no frame.
+        elsewhere: (n,) the pose is not where the body is.
+        another: (n,) the pose is another person's, or a duplicate.
+        rejected: (n, 17) keypoints of the pose that are not where the body is.
     """
 
     found: Flags
@@ -239,7 +239,7 @@ def search_missing_people(
     Args:
         pictures: images by index of the frame, rising, at least the frames to search in.
         sought: people and boxes.
-        estimator: of poses.
+        estimator: estimator of poses.
         least_keypoint: a keypoint below this confidence was not found [1].
         detected: (frames, detections, 4) boxes of detections [px]: an estimator may separate people
             by the boxes of their neighbours.
@@ -286,11 +286,11 @@ def judge_search_results(
     neither a detection in the frame nor a better result has that pose already.
 
     Args:
-        results: of the estimator.
+        results: results of the estimator.
         sought: the people of these results.
         expected: all bodies in view of the camera.
         detected: the detections (frames, detections) in all frames of the camera.
-        spread: of keypoints around bodies.
+        spread: spread of keypoints around bodies.
         noise: stated standard deviation of keypoints, [px] and [m].
         settings: acceptance thresholds.
     """

@@ -131,7 +131,7 @@ class Commands(TyperGroup):
 
 
 def summary(command: str) -> str:
-    """Return the first paragraph of a command's docstring, read without importing it."""
+    """Return the first paragraph of a command's docstring, without importing its module."""
     module, _, function = COMMANDS[command].partition(":")
     place = find_spec(f"flows.cli.{module}")
     assert place is not None and place.origin is not None
@@ -167,4 +167,4 @@ def worldpose(
         ),
     ] = False,
 ) -> None:
-    """Metric 3D poses of every player from many cameras: a data factory."""
+    """Reconstruct metric 3D poses of every player from many cameras."""

@@ -74,7 +74,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
 
 
 UNIT_WIDTH = 25
-"""Of a unit's name in the progress [characters]: with it a line has at most 80."""
+"""Width of a unit's name in the progress [characters]: with it a line has at most 80."""
 
 
 class ConsoleReporter(Reporter):

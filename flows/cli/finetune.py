@@ -85,7 +85,7 @@ def finetune(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Train on labels; a version that is not better on held-out frames is not adopted.
+    """Train nets on labels; adopt a version only if it is better on held-out frames.
 
     Example: worldpose finetune labels/labels.json --project worldpose-data
     """

@@ -65,7 +65,7 @@ def diff(
         )
         for change in changes
     ]
-    print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "figures"), rows)
+    print_table(f"{run_a} to {run_b}", ("unit", "result", "why", "metrics"), rows)
     _print_compared(compared)
     if pictures:
         print_table(
@@ -95,7 +95,7 @@ def _print_compared(compared: list[SubjectChange]) -> None:
         if change.mark != "unchanged"
     ]
     if rows:
-        print_table("better and worse", ("kind", "which", "is", "figures"), rows)
+        print_table("better and worse", ("kind", "which", "is", "metrics"), rows)
     for kind in KINDS:
         marks = count_marks(compared, kind)
         if marks:

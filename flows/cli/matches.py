@@ -38,13 +38,13 @@ from worldpose.store import Store
 
 def simulate(
     scenario: Annotated[
-        str, typer.Option("--scenario", help="Name of a scenario, or `list` to see them.")
+        str, typer.Option("--scenario", help="Name of a scenario; `list` shows all.")
     ],
     out: Annotated[Path | None, typer.Option("--out", help="Match folder to create.")] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Random seed; equal seeds give equal bytes.")
     ] = 0,
-    duration: Annotated[float | None, typer.Option(min=0.2, help="Length [s].")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.2, help="Duration [s].")] = None,
     cameras: Annotated[int | None, typer.Option(min=1, help="Number of static cameras.")] = None,
     players: Annotated[int | None, typer.Option(min=0, help="Number of people.")] = None,
     trajectories: Annotated[
@@ -68,7 +68,7 @@ def simulate(
         typer.Option("--render", help="Render videos of all cameras instead of detections."),
     ] = False,
     masks: Annotated[
-        bool, typer.Option("--masks", help="With --render, add the person of each pixel.")
+        bool, typer.Option("--masks", help="With --render, also write each pixel's person.")
     ] = False,
     recordings: Annotated[
         Path | None,
@@ -195,10 +195,10 @@ def import_command(
         typer.Option(help="Cameras: Anipose, Pose2Sim or caliscope TOML, or Qualisys XML."),
     ] = None,
     detections: Annotated[
-        Path | None, typer.Option(help="COCO keypoint results, <camera>.json.")
+        Path | None, typer.Option(help="Folder of COCO keypoint results, <camera>.json.")
     ] = None,
     videos: Annotated[
-        Path | None, typer.Option(help="Videos instead of 2D poses, <camera>.mp4.")
+        Path | None, typer.Option(help="Folder of videos in place of 2D poses, <camera>.mp4.")
     ] = None,
     pose2sim: Annotated[
         Path | None,
@@ -218,8 +218,8 @@ def import_command(
     clicks: Annotated[
         Path | None,
         typer.Option(
-            help="Clicked markings of CVAT (XML), Label Studio or COCO (JSON); labels are names of "
-            "the pitch or places in metres."
+            help="Clicks from CVAT (XML), Label Studio or COCO (JSON). A label is the name of a "
+            "point or marking of the pitch, or a position in metres."
         ),
     ] = None,
     camera: Annotated[
@@ -241,7 +241,7 @@ def import_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring calibration and 2D poses or videos, clicks, lenses or a pitch into a match folder.
+    """Import calibration and 2D poses or videos, clicks, lenses or a pitch into a match folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """

@@ -1,4 +1,4 @@
-"""Checkpoints of detectors and pose nets: list, pull and verify them by name."""
+"""List, pull and verify checkpoints of detectors and pose nets by name."""
 
 from __future__ import annotations
 
@@ -135,7 +135,8 @@ def pull_model(
 @commands.command(name="verify")
 def verify_models(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="All pulled ones by default.")
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="All pulled checkpoints by default."),
     ] = None,
     folder: FolderOption = None,
     as_json: JsonOption = False,

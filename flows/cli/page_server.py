@@ -12,21 +12,25 @@ from worldpose.errors import UsageError
 PAGES_PORT = 8571
 
 PortOption = Annotated[int, typer.Option(min=1, max=65535, help="Port of the pages.")]
-HostOption = Annotated[str, typer.Option(help="Address to listen at; by default, this machine.")]
+HostOption = Annotated[
+    str, typer.Option(help="Address to listen on; by default, only this machine can connect.")
+]
 NamesOption = Annotated[
     list[str] | None,
-    typer.Option("--host-name", help="Name of this machine in browsers elsewhere; repeatable."),
+    typer.Option("--host-name", help="Name of this machine for other machines; repeatable."),
 ]
 CertificateOption = Annotated[
     Path | None, typer.Option("--certificate", help="PEM file of the certificate for TLS.")
 ]
-KeyOption = Annotated[Path | None, typer.Option("--key", help="PEM file of its private key.")]
+KeyOption = Annotated[
+    Path | None, typer.Option("--key", help="PEM file of the certificate's private key.")
+]
 TokenOption = Annotated[
     str | None,
     typer.Option(
         envvar="WORLDPOSE_REVIEW_TOKEN",
         show_envvar=True,
-        help="Token with which people log in; a new one by default.",
+        help="Token with which people log in; by default, the server creates a new token.",
     ),
 ]
 UsersOption = Annotated[

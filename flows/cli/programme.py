@@ -15,7 +15,7 @@ from flows.cli.console import JsonOption, errors, line, print_json, print_table
 from worldpose.errors import UsageError
 
 WIDTH = 320
-"""Of the analysed images [px]."""
+"""Width of the analysed images [px]."""
 
 
 def clips(

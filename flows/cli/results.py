@@ -53,13 +53,13 @@ def export(
     ] = None,
     filled: Annotated[
         bool,
-        typer.Option("--filled", help="Interpolate joints that are missing for a while; flagged."),
+        typer.Option("--filled", help="Interpolate and flag joints that are missing for a while."),
     ] = False,
     surface: Annotated[
         bool,
         typer.Option(
             "--surface",
-            help="With gltf: also the surface of a body model with terms of its own (--licence).",
+            help="With gltf, also write the surface of a licensed body model (needs --licence).",
         ),
     ] = False,
     project: ProjectOption = DEFAULT_PROJECT,

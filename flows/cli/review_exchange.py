@@ -177,7 +177,7 @@ def _places(
 
 
 def add_to(commands: typer.Typer) -> None:
-    """Register these commands."""
+    """Register the commands `export`, `import` and `convert`."""
     commands.command("export")(export_annotations)
     commands.command("import")(import_annotations)
     commands.command("convert")(convert_annotations)

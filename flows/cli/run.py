@@ -76,8 +76,8 @@ def run(
         typer.Option(
             metavar="N",
             help="Number of iterations. Each one leaves out the keypoints that the bodies of the "
-            "previous one contradict. auto: until the error in held-out cameras stops "
-            "decreasing.",
+            "previous one contradict. With auto, the run iterates until the error in held-out "
+            "cameras stops decreasing.",
         ),
     ] = "1",
     verbose: VerboseOption = False,
@@ -228,10 +228,10 @@ UNTIL_BEST = "auto"
 
 
 def parse_iterations(text: str) -> int | None:
-    """Return the number of iterations; None = until one is no better.
+    """Return the number of iterations; None = iterate until an iteration brings no improvement.
 
     Raises:
-        UsageError: neither a number from 1 nor `auto`.
+        UsageError: the text is neither a number from 1 nor `auto`.
     """
     if text == UNTIL_BEST:
         return None

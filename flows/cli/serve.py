@@ -41,7 +41,7 @@ def serve(
     ] = None,
     bucket: Annotated[
         str | None,
-        typer.Option("--bucket", help="s3:// URL of further arrivals; copied to the inbox."),
+        typer.Option("--bucket", help="s3:// URL of matches to copy to the inbox."),
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Report problems and their remedies, and exit.")
@@ -220,7 +220,7 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
                         "part": each.part,
                         "well": each.is_well,
                         "state": each.state,
-                        "mend": each.mend,
+                        "mend": each.remedy,
                     }
                     for each in findings
                 ],
@@ -229,6 +229,6 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
     for finding in [] if as_json else findings:
         line(f"{'ok' if finding.is_well else 'UNHEALTHY':<10}{finding.part}: {finding.state}")
         if not finding.is_well:
-            line(f"          fix: {finding.mend}")
+            line(f"          fix: {finding.remedy}")
     if not all(finding.is_well for finding in findings):
         raise typer.Exit(1)

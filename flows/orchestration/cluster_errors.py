@@ -24,7 +24,7 @@ def require_room(failure: BaseException, project: str) -> None:
         project: folder or URL of the store; Prefect's database is there, or in a temporary folder.
 
     Raises:
-        StoreError: the disk of one of them is full.
+        StoreError: the disk of the store or of Prefect's database is full.
     """
     if isinstance(failure, StoreError):
         return

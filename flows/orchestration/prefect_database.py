@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 DATABASE = "prefect.db"
-"""In PREFECT_HOME."""
+"""Name of the database file in PREFECT_HOME."""
 
 
 def begin_database(home: Path) -> bool:

@@ -97,7 +97,7 @@ def without_secrets(environment: Mapping[str, str], keep: Iterable[str] = ()) ->
     """Return an environment without the variables that hold secrets, selected by name.
 
     Args:
-        environment: of a process.
+        environment: environment of a process.
         keep: variables that its child needs; a name that ends with `*` is a prefix.
     """
     kept = tuple(keep)
@@ -300,7 +300,7 @@ def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path
     """Return when the embedded server answers.
 
     Raises:
-        WorldposeError: it ended, or does not answer in time.
+        WorldposeError: the server ended, or does not answer in time.
     """
     deadline = time.monotonic() + START_SECONDS
     while server.poll() is None and time.monotonic() < deadline:
@@ -326,7 +326,7 @@ def require_login(address: str) -> None:
     """Check that a Prefect server accepts this process's login.
 
     Raises:
-        InputError: it requires another login.
+        InputError: the server requires another login.
     """
     login, key = os.environ.get(CLIENT_LOGIN), os.environ.get(CLOUD_LOGIN)
     headers = {"authorization": f"Bearer {key}"} if key else {}

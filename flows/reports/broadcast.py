@@ -143,8 +143,8 @@ def write_broadcast_videos(
 ) -> list[Path]:
     """Write each clip's broadcast video with markings and people overlaid; return the files.
 
-    Half size, at most 25 frames per second. A longer clip is cut to the 30 s around the frame with
-    the largest camera uncertainty.
+    Videos have half the size and at most 25 frames per second. A clip of more than 30 s is cut to
+    the 30 s around the frame with the largest camera uncertainty.
 
     Args:
         run: the run.

@@ -61,9 +61,9 @@ def frame_pictures(
     """Yield the images of several match frames, decoded once and in order.
 
     Args:
-        store: as above.
-        match: as above.
-        owner: as above.
+        store: its latest run maps match frames to video frames.
+        match: the match, which names the videos.
+        owner: a static camera, or the clip of a broadcast camera.
         frames: ascending match frames.
 
     Raises:

@@ -41,7 +41,7 @@ def clips_of(record: RunRecord) -> tuple[str, ...]:
     """Return the clips for which a run has joints, or people on the pitch.
 
     Raises:
-        WorldposeError: there are none.
+        WorldposeError: there are no such clips.
     """
     units = [unit.partition("/") for unit in record.results]
     clips = tuple(sorted({unit for stage, _, unit in units if stage in (*JOINT_STAGES, PLANE)}))
@@ -161,7 +161,7 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 @dataclass(frozen=True)
 class Origin:
-    """Source of an export."""
+    """Run whose results an export writes, with the options of the export."""
 
     run: Run
     registration: Registration
@@ -234,7 +234,7 @@ def require_result(run: Run, unit: str, todo: str) -> str:
     """Return the name of a result that the run has.
 
     Raises:
-        InputError: it has none.
+        InputError: the run has no such result.
     """
     if unit not in run:
         raise InputError(

@@ -282,7 +282,7 @@ def largest_pose_changes(
     Each run's bodies are projected with its own cameras.
 
     Args:
-        store: with both runs.
+        store: store with both runs.
         a: the first run.
         b: the second run, of the same match.
         most: maximum number of images.

@@ -19,7 +19,7 @@ class StageTime:
         stage: its name.
         units: number of units that the run computed.
         work: sum over its units, on all workers [s].
-        longest: of one unit [s].
+        longest: longest time of one unit [s].
         elapsed: time with at least one running unit [s].
     """
 
@@ -71,11 +71,11 @@ class RunTime:
 
     Attributes:
         run_id: its number.
-        seconds: from its start to its record [s].
+        seconds: time from its start to its record [s].
         stages: stages with computed units, in the method's order.
         start: until its first unit ran: planning, and the start of workers [s].
         between: after that, time without a running unit: planning, submitting, recording [s].
-        cost: of all results of the run, also of those that earlier runs computed.
+        cost: cost of all results of the run, also of those that earlier runs computed.
     """
 
     run_id: str

@@ -17,19 +17,19 @@ MIN_STANDARD_ERRORS: Final = 4.0
 """Minimum difference from the stated noise in standard errors."""
 
 
-def click_advice(figures: Mapping[str, Mapping[str, float]], stated: float) -> list[str]:
+def click_advice(metrics: Mapping[str, Mapping[str, float]], stated: float) -> list[str]:
     """Return advice if the click noise is significantly larger than stated.
 
     The clicks of all cameras are pooled: a single camera with few clicks cannot determine its
     noise.
 
     Args:
-        figures: metrics of a run, by unit and name.
+        metrics: those of a run, by unit and name.
         stated: `static_calibration.click_noise_px` of that run [px].
     """
     told = [
         (each["click_noise_px"], each["click_freedom"])
-        for name, each in figures.items()
+        for name, each in metrics.items()
         if name.startswith("static_calibration/") and "click_noise_px" in each
     ]
     freedom = sum(worth for _, worth in told)
@@ -55,16 +55,16 @@ MIN_OFFSET: Final = 0.5
 """Minimum difference for advice: from here another integer offset is nearer [frame]."""
 
 
-def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) -> list[str]:
+def clock_advice(metrics: Mapping[str, Mapping[str, float]], spec: MatchSpec) -> list[str]:
     """Return one line of advice per camera with a significant clock offset.
 
     Args:
-        figures: metrics of a run, by unit and name.
+        metrics: those of a run, by unit and name.
         spec: match.yaml as of that run.
     """
     said = []
     for camera in spec.static_cameras:
-        found = [_difference(figures, clip.id, camera.id) for clip in spec.clips]
+        found = [_difference(metrics, clip.id, camera.id) for clip in spec.clips]
         known = [each for each in found if each is not None]
         if not known:
             continue
@@ -83,14 +83,14 @@ def clock_advice(figures: Mapping[str, Mapping[str, float]], spec: MatchSpec) ->
 
 
 def _difference(
-    figures: Mapping[str, Mapping[str, float]], clip: str, camera: str
+    metrics: Mapping[str, Mapping[str, float]], clip: str, camera: str
 ) -> tuple[float, float] | None:
     """Return a camera's clock offset relative to the median camera, and its standard error [frame].
 
     Metrics are relative to the mean, which an outlier camera shifts; the median is robust. Of two
     cameras the earlier one counts as correct, so that only one is corrected.
     """
-    stages = [figures.get(f"{stage}/{clip}", {}) for stage in STAGES]
+    stages = [metrics.get(f"{stage}/{clip}", {}) for stage in STAGES]
     for stage in stages:
         late = {name: value for name, value in stage.items() if name.startswith(LATE)}
         error = next((each[ERROR + camera] for each in stages if ERROR + camera in each), None)

@@ -71,9 +71,9 @@ def new_corrections(
     """Turn edits into corrections, each based on those before it.
 
     Args:
-        match: as it was opened; its folder has the corrections that were in force then.
-        journal: as it is now.
-        edits: in the order of application.
+        match: match as it was opened; its folder has the corrections that were in force then.
+        journal: journal as it is now.
+        edits: edits in the order of application.
         who: name of the reviewer.
         note: the reviewer's comment.
         results: `stage/unit` to key of the results that the reviewer saw.

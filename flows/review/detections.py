@@ -97,7 +97,7 @@ def results_of(
         frame: only clips with this match frame; None = all clips.
 
     Raises:
-        InputError: there are none.
+        InputError: there are no such results.
     """
     spec = match.folder.spec
     clips = [

@@ -18,11 +18,11 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate_camera
 
 NAMED: Final = 1.0
-"""A place nearer to a point of the pitch than this is told by its name [m]."""
+"""Maximum distance to a point of the pitch at which a place has the point's name [m]."""
 FAR: Final = 2.0
-"""A click is another place's only if it shows one farther from its label than this [m]."""
+"""Minimum distance from its label at which a click is assigned to another place [m]."""
 FARTHER: Final = 3.0
-"""And so many times as far as the other click [1]."""
+"""Minimum ratio of this distance to that of the other click for the assignment [1]."""
 
 
 def explain_repeated(folder: Path, file: Path, repeated: list[RepeatedClick]) -> list[str]:

@@ -74,8 +74,8 @@ def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Rev
     """Return all of a match's review requests, first to last.
 
     Args:
-        store: with the results that they refer to.
-        match: with its journal.
+        store: store with the results that the requests refer to.
+        match: match with its journal.
         latest: its latest run.
     """
     return _reviews(match.journal, latest, corrected_units(store, match, latest))
@@ -88,8 +88,8 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
     unit or one of its inputs was computed from. Other code or libraries do not count.
 
     Args:
-        store: with the results.
-        match: with all corrections applied.
+        store: store with the results.
+        match: match with all corrections applied.
         latest: the match's latest run.
     """
     if latest is None or not latest.waiting:
@@ -148,8 +148,8 @@ def still_waiting(store: Store, match: Match, latest: RunRecord | None) -> list[
     """Return the units for which the latest run waits, without those approved or corrected since.
 
     Args:
-        store: with the results.
-        match: with its journal.
+        store: store with the results.
+        match: match with its journal.
         latest: its latest run.
     """
     said = match.journal.questions
@@ -179,7 +179,7 @@ def decide(
 
     Args:
         store: the store that holds the journal.
-        match: as it was opened.
+        match: match as it was opened.
         requests: ids of the review requests; empty = all pending ones.
         verdict: the verdict on each.
         who: name of the reviewer.
@@ -281,7 +281,7 @@ def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str
         why: the reviewer's comment.
 
     Raises:
-        InputError: one of them is not in force.
+        InputError: one of the corrections is not in force.
     """
     say(
         store,
@@ -315,7 +315,7 @@ def unit_origins(
     unit with corrected evidence, and units computed from it are automatic.
 
     Args:
-        made_from: for each unit, its input units.
+        made_from: input units of each unit.
         applied: the corrections in the results.
         rejected: units whose last verdict is a rejection.
     """

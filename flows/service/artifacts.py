@@ -88,7 +88,7 @@ def table_of(store: Store, match_id: str) -> list[dict[str, Any]]:
             "state": unit.state,
             "seconds": None if unit.seconds is None else round(unit.seconds, 2),
             "why": unit.why,
-            "figures": in_short(unit.figures),
+            "metrics": in_short(unit.figures),
         }
         for stage, unit in match.units
     ]

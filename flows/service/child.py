@@ -83,7 +83,7 @@ def pages(plan: ServePlan) -> None:
 
 
 PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}
-"""In start order."""
+"""Functions of the parts, in start order."""
 
 
 def _end_with_parent() -> None:

@@ -108,7 +108,7 @@ def match(
 
 
 def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:
-    """Run a match, again after each verdict; only plan it if the latest run has all results."""
+    """Run a match now and after each verdict; only plan it if the latest run has all results."""
     stages = selected_stages(request.from_stage, request.until_stage)
     policy: GatePolicy = request.gates or "auto"
     while True:

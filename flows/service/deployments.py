@@ -277,8 +277,8 @@ def require_installed(run: FlowRun, installed: Mapping[UUID, Installed]) -> Inst
         installed: flows by deployment id.
 
     Raises:
-        RefusedRunError: it belongs to another deployment, sets variables of its job, or has unknown
-            or fixed parameters.
+        RefusedRunError: the run belongs to another deployment, sets variables of its job, or has
+            unknown or fixed parameters.
     """
     if run.deployment_id is None or run.deployment_id not in installed:
         raise RefusedRunError("it is of no deployment that was installed with this service")

@@ -33,13 +33,13 @@ class Finding:
         part: its name.
         is_well: whether it works as expected.
         state: its state, as text.
-        mend: how to fix it if it does not work.
+        remedy: how to fix it if it does not work.
     """
 
     part: str
     is_well: bool
     state: str
-    mend: str = ""
+    remedy: str = ""
 
 
 def check(state: StateFolder) -> list[Finding]:
@@ -65,8 +65,8 @@ def _processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     for name, service in serving.services.items():
         if name != "serve" and not is_alive(service.pid):
             log = state.logs / f"{name}.log"
-            mend = f"It restarts automatically; if it keeps ending, see {log}."
-            yield Finding(name, False, "its process has ended", mend)
+            remedy = f"It restarts automatically; if it keeps ending, see {log}."
+            yield Finding(name, False, "its process has ended", remedy)
 
 
 def _check_answer(state: StateFolder, serving: Serving) -> Iterator[Finding]:
@@ -112,8 +112,8 @@ def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
     if problem:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
         is_refused = problem.endswith(" 401")
-        mend = f"Set {variable} as it was when the service began." if is_refused else ""
-        yield Finding("deployments", False, problem, mend or "Fix prefect first.")
+        remedy = f"Set {variable} as it was when the service began." if is_refused else ""
+        yield Finding("deployments", False, problem, remedy or "Fix prefect first.")
         return
     offered = {each["name"] for each in _flows(serving, deployments, ask)}
     missing = set(FLOWS) - offered
@@ -160,8 +160,8 @@ def _flows(
 def _inbox(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     inbox = Path(serving.inbox)
     if not os.access(inbox, os.R_OK | os.X_OK):
-        mend = f"Make the folder {inbox}, readable for this user."
-        yield Finding("inbox", False, "cannot be read", mend)
+        remedy = f"Make the folder {inbox}, readable for this user."
+        yield Finding("inbox", False, "cannot be read", remedy)
         return
     arrivals = list(state.arrivals().values())
     refused = [each for each in arrivals if each.state == "refused"]
@@ -171,8 +171,8 @@ def _inbox(state: StateFolder, serving: Serving) -> Iterator[Finding]:
 
 def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(folder).free / 1e9
-    mend = "Free some: worldpose gc --keep-last 3 --delete."
-    return Finding("disk", free >= LOW_DISK_GB, f"{free:.1f} GB free", mend)
+    remedy = "Free some: worldpose gc --keep-last 3 --delete."
+    return Finding("disk", free >= LOW_DISK_GB, f"{free:.1f} GB free", remedy)
 
 
 def _ask(

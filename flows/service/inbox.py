@@ -40,7 +40,7 @@ class Entry:
     Attributes:
         path: its path.
         name: path below the inbox for display and storage.
-        priority: from the folder that contains it.
+        priority: priority that the containing folder states.
     """
 
     path: Path
@@ -121,8 +121,8 @@ def fingerprint_of(path: Path) -> str:
     """Return a digest of the names, sizes and times of all files of an arrival.
 
     Raises:
-        RefusalError: it is not a folder, or has a link, a special file, or an unsafe name.
-        OSError: it is not readable, or changed in between.
+        RefusalError: the arrival is not a folder, or has a link, a special file, or an unsafe name.
+        OSError: the arrival is not readable, or changed in between.
     """
     _require_plain(path.name)
     mode = path.lstat().st_mode

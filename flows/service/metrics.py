@@ -35,7 +35,7 @@ UNIT_STATES: Final = ("done", "waiting", "failed", "blocked")
 ARRIVAL_STATES: Final = ("arriving", "incomplete", "refused", "taken")
 
 
-class ProjectFigures(Collector):
+class ProjectMetrics(Collector):
     """Prometheus collector for a project.
 
     Attributes:
@@ -60,7 +60,7 @@ class ProjectFigures(Collector):
             ended = self._overview.poses()
             size = self._store_size()
         yield _counts("worldpose_matches", "Matches by state", "state", STATES, matches)
-        yield from _unit_figures(matches)
+        yield from _unit_metrics(matches)
         yield from _quality(matches)
         total = sum(count for _, count in ended)
         yield CounterMetricFamily("worldpose_poses", "Bodies fitted by all runs", value=total)
@@ -90,19 +90,19 @@ class ProjectFigures(Collector):
         return size
 
 
-def exposition(figures: ProjectFigures) -> bytes:
+def exposition(metrics: ProjectMetrics) -> bytes:
     """Return the metrics in Prometheus text format."""
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(figures)
+    registry.register(metrics)
     return generate_latest(registry)
 
 
-def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> ThreadingHTTPServer:
+def metrics_server(plan: ServePlan, metrics: ProjectMetrics, token: str) -> ThreadingHTTPServer:
     """Create a server of `/metrics` and `/health`, for requests that name it.
 
     Args:
         plan: its address and names.
-        figures: collector behind `/metrics`.
+        metrics: collector behind `/metrics`.
         token: required by `/metrics`, as `Authorization: Bearer TOKEN`.
     """
     names = LOOPBACK | {plan.host.lower(), *(name.lower() for name in plan.names)}
@@ -119,7 +119,7 @@ def metrics_server(plan: ServePlan, figures: ProjectFigures, token: str) -> Thre
             elif self.path == "/metrics" and not hmac.compare_digest(given, expected):
                 self._answer(401, b"expected Authorization: Bearer TOKEN\n")
             elif self.path == "/metrics":
-                self._answer(200, exposition(figures), CONTENT_TYPE_LATEST)
+                self._answer(200, exposition(metrics), CONTENT_TYPE_LATEST)
             elif self.path == "/health":
                 self._answer(200, b"up\n")
             else:
@@ -169,7 +169,7 @@ def _counts(
     return family
 
 
-def _unit_figures(matches: list[MatchStatus]) -> Iterator[Metric]:
+def _unit_metrics(matches: list[MatchStatus]) -> Iterator[Metric]:
     units = GaugeMetricFamily(
         "worldpose_units", "Units of latest runs by stage and state", labels=["stage", "state"]
     )
@@ -204,7 +204,7 @@ def _quality(matches: list[MatchStatus]) -> Iterator[Metric]:
     """Yield the metrics that gates judge: the worst of a match's units, and the limit."""
     worst = GaugeMetricFamily(
         "worldpose_quality",
-        "Figure that a gate judges, worst unit of the match",
+        "Metric that a gate evaluates, of the match's worst unit",
         labels=["match", "stage", "figure"],
     )
     limits = GaugeMetricFamily(

@@ -13,7 +13,7 @@ METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """Flows that the Prefect server offers, known without importing Prefect."""
 TITLES = {"ingest": "inbox", "reprocess": "stale matches", "finetune": "fine-tuning"}
-"""Flow to what its runs are named by, if not a match."""
+"""Flow to the name of its runs; the runs of all other flows have the name of their match."""
 
 
 def deployment_name(name: str, flow: str) -> str:
@@ -59,9 +59,9 @@ class ServePlan(Record):
     names: tuple[str, ...] = ()
     """Further names of this machine in browsers and scrapers."""
     pages_port: int = 8571
-    """Of the review and status pages."""
+    """Port of the review and status pages."""
     metrics_port: int = METRICS_PORT
-    """Of the metrics for Prometheus."""
+    """Port of the metrics for Prometheus."""
     certificate: Path | None = None
     """PEM file of the pages' certificate."""
     key: Path | None = None

@@ -39,7 +39,7 @@ STARTING: Final = timedelta(minutes=5)
 """Maximum time from the start of a run's process until the run is active, on an overloaded
 machine."""
 MOST_BEGINNINGS: Final = 3
-"""After so many starts, a killed run stays crashed and needs an operator."""
+"""Number of starts after which a killed run stays crashed and needs an operator."""
 MOST_SERVICE_DEATHS: Final = 10
 """Starts that do not count, because the whole service was killed; a run may be to blame for it."""
 DEATHS: Final = "worldpose.service_deaths"

@@ -199,7 +199,7 @@ def read_alert_settings(file: Path) -> AlertSettings:
     """Return the channels that a file names; none if there is no file.
 
     Raises:
-        UsageError: it is malformed, or other users can read it.
+        UsageError: the file is malformed, or other users can read it.
     """
     try:
         content = file.read_bytes()
@@ -232,7 +232,7 @@ def senders_of(environment: Mapping[str, str], file: Path | None = None) -> tupl
     """Return the channels of WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL, else of alerts.toml.
 
     Raises:
-        UsageError: one of them is malformed.
+        UsageError: a variable or the file is malformed.
     """
     kept = AlertSettings() if file is None else read_alert_settings(file)
     webhook = environment.get("WORLDPOSE_ALERT_URL") or kept.webhook

@@ -102,7 +102,7 @@ def kept_secret(file: Path, make: Callable[[], str]) -> str:
     A secret that other users can read or write is replaced.
 
     Args:
-        file: in a folder that only this user can read.
+        file: file in a folder that only this user can read.
         make: returns a new secret, one line.
     """
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

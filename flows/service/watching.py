@@ -29,7 +29,7 @@ from prefect.deployments import arun_deployment
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
 from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
-from flows.service.metrics import ProjectFigures, metrics_server
+from flows.service.metrics import ProjectMetrics, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan, deployment_names
 from flows.service.recovery import begin_again, may_begin_again, name_scheduled_runs
@@ -58,8 +58,8 @@ LOG = logging.getLogger("worldpose.operations")
 def watch(plan: ServePlan) -> None:
     """Watch until this process ends."""
     store = Store.create(plan.project)
-    figures = ProjectFigures(store, plan.state_folder)
-    server = metrics_server(plan, figures, os.environ[METRICS_TOKEN])
+    metrics = ProjectMetrics(store, plan.state_folder)
+    server = metrics_server(plan, metrics, os.environ[METRICS_TOKEN])
     threading.Thread(target=server.serve_forever, daemon=True).start()
     asyncio.run(_watch(plan, store))
 

@@ -53,7 +53,7 @@ class User(Record):
 
 
 class UserFile(Record):
-    """The file users.toml: who may log in. Without the file, the access token admits everybody."""
+    """The file users.toml: who may log in. Without the file, the access token admits every user."""
 
     users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User]
     """Name to role and token."""
@@ -63,7 +63,7 @@ def read_users(file: Path) -> Mapping[str, User]:
     """Return the people of a file, by name.
 
     Raises:
-        UsageError: it is missing or malformed, other users of the machine can read it, or two
+        UsageError: the file is missing or malformed, other users of the machine can read it, or two
             people have the same token.
     """
     problem = ""

@@ -59,7 +59,7 @@ class Login(Record):
     """Recorded with all decisions and corrections of the person; printable, so that no log line
     breaks."""
     token: str
-    """As the server printed it, or as the operator chose it."""
+    """Token as the server printed it, or as the operator chose it."""
 
     @field_validator("who")
     @classmethod

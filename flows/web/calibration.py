@@ -44,7 +44,7 @@ class Clicked(Record):
 
 
 class Pictures:
-    """Cache of the last decoded images for clicking."""
+    """Cache of the images decoded last, on which users click."""
 
     def __init__(self) -> None:
         self._decoded: OrderedDict[tuple[str, str, int | None], NDArray[np.uint8]] = OrderedDict()

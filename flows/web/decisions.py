@@ -46,7 +46,7 @@ class Edits(Record):
     """Edits that are kept all or none."""
 
     edits: tuple[GivenEdit, ...] = Field(min_length=1, max_length=EDITS)
-    """In the order of application."""
+    """Edits in the order of application."""
     note: str = Field(default="", max_length=2000)
     """The person's comment."""
 

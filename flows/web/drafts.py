@@ -122,7 +122,7 @@ class Drafts:
         """Create an empty draft.
 
         Raises:
-            InputError: there are too many.
+            InputError: there are too many drafts.
         """
         if len(self.all()) >= MAX_DRAFTS:
             raise _refusal("drafts", f"at most {MAX_DRAFTS}", "more", "Finish or discard some.")
@@ -139,7 +139,7 @@ class Drafts:
         """Return a draft.
 
         Raises:
-            InputError: there is none with this id.
+            InputError: there is no draft with this id.
         """
         file = self._folder(draft_id) / "draft.json"
         try:
@@ -171,12 +171,12 @@ class Drafts:
         """Begin a file, or return the same one that was begun before: its transfer continues.
 
         Args:
-            draft_id: of the draft.
+            draft_id: id of the draft.
             file: its id and name in the match folder are chosen here.
 
         Raises:
-            InputError: it is no video and no file of a match folder, it is empty, the disk is too
-                small for it, or the draft has too many files.
+            InputError: the file is no video and no file of a match folder, the file is empty, the
+                disk is too small for it, or the draft has too many files.
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
         if title not in MATCH_FILES and not is_video(title):
@@ -244,7 +244,7 @@ class Drafts:
         """Return a draft for the pages, with all that is wrong or missing.
 
         Raises:
-            InputError: there is none with this id.
+            InputError: there is no draft with this id.
         """
         with self._hold(draft_id):  # it writes match.yaml
             return self._view(self.read(draft_id))

@@ -28,7 +28,7 @@ ANSWER_SECONDS: Final = 60.0
 MAX_CONNECTIONS: Final = 200
 """Open connections; beyond it the oldest one without a complete request is closed."""
 ACCEPTED_SHARE: Final = 8
-"""At most this fraction of the limit is accepted per loop iteration, before other reads."""
+"""A loop iteration accepts at most this fraction of the limit before other reads."""
 QUEUE: Final = 2048
 """Connections that the operating system queues until they are accepted."""
 LOG_SECONDS: Final = 60.0

@@ -46,7 +46,7 @@ class SavedForm(Record):
     """The form of a match that is being created."""
 
     revision: Count
-    """Of the form that the person saw."""
+    """Revision of the form that the person saw."""
     content: dict[str, JsonValue]
     """match.yaml as filled in so far."""
 

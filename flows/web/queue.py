@@ -77,7 +77,7 @@ def routes(context: PageContext) -> APIRouter:
 
 @dataclass
 class _Glances:
-    """Summaries of all matches for the queue, of which one request checks as many as time allows.
+    """Summaries of all matches for the queue; one request checks as many as its time allows.
 
     A match is opened again only if its folder, journal or runs have changed.
     """

@@ -26,9 +26,9 @@ def list_videos(folders: Sequence[Path], number: int, path: str) -> dict[str, An
     """Return the folders and videos inside a folder: names, and sizes of videos [byte].
 
     Args:
-        folders: as the operator named them.
+        folders: folders as the operator named them.
         number: index of one of them.
-        path: of a folder inside it, with forward slashes; empty for itself.
+        path: path of a folder inside it, with forward slashes; empty for itself.
 
     Raises:
         InputError: there is no such folder, or the path is unsafe.

@@ -42,7 +42,7 @@ def test_people_and_markings_win_and_markings_alone_are_refused():
     base, free = scores["base"], scores["+ BA, S, unguarded"]
     assert both.g_mpjpe_mm < 1.02 * true.g_mpjpe_mm
     assert both.ground_error_m < 0.5 * base.ground_error_m
-    # Lines fit better, people worse (trap 1); the guard sees it.
+    # Lines fit better and people worse, as the paper warns; the held-out validation detects this.
     assert free.marking_error_px < 0.7 * base.marking_error_px
     assert free.g_mpjpe_mm > 1.1 * base.g_mpjpe_mm
     assert scores["+ BA, S only"].changed < 0.2

@@ -33,7 +33,7 @@ PRESENT = {
     "body_fitting": {renames.SETTINGS["body_fitting"]["longest_gap"]: 0.5},
     "tracking": {renames.SETTINGS["tracking"]["max_lost"]: 2.5},
 }
-"""What was asked for with `--set longest_gap` and `--set max_lost`."""
+"""The settings given as `--set longest_gap` and `--set max_lost`, under their present names."""
 
 
 def seal_fields(fields):

@@ -40,7 +40,7 @@ class Conversation(socketserver.StreamRequestHandler):
                 offered = "250-STARTTLS\r\n" * (is_bare and self.server.is_asked_for_tls)
                 self.say(f"250-test\r\n{offered}250 AUTH PLAIN")
             elif verb == "STARTTLS":
-                self.say("220 go on")
+                self.say("220 ready to start TLS")
                 self.request = self.server.tls.wrap_socket(self.request, server_side=True)
                 super().setup()
             elif verb == "AUTH":
@@ -54,7 +54,7 @@ class Conversation(socketserver.StreamRequestHandler):
                 letter["to"].append(rest[4:-1])
                 self.say(self.server.answers.pop(0) if self.server.answers else "250 ok")
             elif verb == "DATA":
-                self.say("354 go on")
+                self.say("354 start mail input")
                 lines = iter(self.rfile.readline, b".\r\n")
                 letter["message"] = message_from_bytes(b"".join(lines))
                 self.server.letters.append(letter)

@@ -41,7 +41,7 @@ def test_what_was_never_started_or_killed_is_said(state, tmp_path):
     state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
     (finding,) = check(state)
     assert "killed" in finding.state
-    assert "worldpose serve" in finding.mend
+    assert "worldpose serve" in finding.remedy
 
 
 def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path):
@@ -55,16 +55,16 @@ def test_every_part_that_is_not_well_says_how_to_mend_it(server, state, tmp_path
             "disk",
         }
         assert "match" in found["deployments"].state
-        assert "worker.log" in found["worker of healthy"].mend
-        assert "pages.log" in found["pages"].mend
-        assert "inbox" in found["inbox"].mend
-        assert all(each.mend for each in found.values() if not each.is_well)
+        assert "worker.log" in found["worker of healthy"].remedy
+        assert "pages.log" in found["pages"].remedy
+        assert "inbox" in found["inbox"].remedy
+        assert all(each.remedy for each in found.values() if not each.is_well)
         # Without the server, deployments are unknown, and the server must be fixed first.
         state.write_serving(serving(tmp_path, "http://127.0.0.1:9/api"))
         (tmp_path / "inbox").mkdir()
         found = by_part(check(state))
-        assert "Start the Prefect server" in found["prefect"].mend
-        assert found["deployments"].mend == "Fix prefect first."
+        assert "Start the Prefect server" in found["prefect"].remedy
+        assert found["deployments"].remedy == "Fix prefect first."
         assert found["inbox"].is_well
 
 
@@ -138,7 +138,7 @@ def test_runs_that_run_for_more_than_a_day_are_told(prefect, tmp_path):
     prefect.answers["/flow_runs/count"] = 2
     runs = at_prefect(tmp_path)["runs"]
     assert (runs.is_well, runs.state) == (False, "2 seem to run for more than a day")
-    assert "http://127.0.0.1:4200, and cancel" in runs.mend
+    assert "http://127.0.0.1:4200, and cancel" in runs.remedy
     asked = prefect.asked["/flow_runs/count"]["flow_runs"]
     assert asked["state"] == {"name": {"any_": ["Running"]}}
     before = datetime.fromisoformat(asked["expected_start_time"]["before_"])
@@ -158,7 +158,7 @@ def test_processes_that_have_ended_and_arrivals_that_were_refused_are_told(state
     dead = Service(pid=2**22 + 1)
     known = serving(tmp_path, "", pages=dead, watch=Service(pid=os.getpid()))
     (ended,) = health._processes(state, known)
-    assert (ended.part, ended.is_well, "pages.log" in ended.mend) == ("pages", False, True)
+    assert (ended.part, ended.is_well, "pages.log" in ended.remedy) == ("pages", False, True)
     for name, seen in (("a", "taken"), ("b", "refused"), ("c", "refused")):
         state.write_arrival(Arrival(name=name, state=seen, changed_at=datetime.now(UTC)))
     (tmp_path / "inbox").mkdir()

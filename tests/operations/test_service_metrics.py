@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from data_contracts.operations import Arrival
 from flows.service.alerts import Alert, AlertDispatcher
 from flows.service.layout import StateFolder
-from flows.service.metrics import ProjectFigures, exposition, metrics_server
+from flows.service.metrics import ProjectMetrics, exposition, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan
 from worldpose.store import Store
@@ -47,7 +47,7 @@ def served(project_copy):
         prefect="http://127.0.0.1:4200/api",
         metrics_port=0,
     )
-    server = metrics_server(plan, ProjectFigures(Store.open(str(project_copy)), state), "token")
+    server = metrics_server(plan, ProjectMetrics(Store.open(str(project_copy)), state), "token")
     Thread(target=server.serve_forever, daemon=True).start()
 
     def ask(path, host="127.0.0.1:8573", token="token"):
@@ -139,7 +139,7 @@ def test_figures_are_for_those_who_have_their_token(served):
 
 def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     store = Store.open(str(project_copy))
-    figures = ProjectFigures(store, StateFolder(project_copy / "operations"))
+    figures = ProjectMetrics(store, StateFolder(project_copy / "operations"))
     before = scraped(exposition(figures).decode())
     run = store.run(TINY)
     again = run.model_copy(update={"run_id": store.reserve_run(TINY), "executed": ()})

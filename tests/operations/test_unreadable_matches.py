@@ -47,7 +47,7 @@ def stale_mount(monkeypatch, two):
 
 
 def without_rights(*arguments):
-    """Run the command line as a user to whom file permissions apply, even if tests run as root."""
+    """Run the command line as a user bound by file permissions, even if tests run as root."""
     drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"]
     command = [*(drop if os.geteuid() == 0 else ()), *WORLDPOSE, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=480)

@@ -321,9 +321,9 @@ class BodyFittingReport(Record):
     bodies: int
     """Fitted bodies, one per frame and person [1]."""
     filled: int
-    """Of these, in frames without any joint of the person [1]."""
+    """Fitted bodies in frames without any joint of the person [1]."""
     guided: int
-    """Of these, fitted with a monocular pose [1]."""
+    """Bodies fitted with a monocular pose [1]."""
     offset_rms_m: float
     """Root mean square offset per axis from a body's joint to the detector's [m]."""
     residual_m: tuple[float | None, ...]

@@ -140,8 +140,8 @@ def pool_shapes(shapes: Sequence[Shape], weight: float) -> Shape:
     independent, although the detector's offsets are the same in all of them.
 
     Args:
-        shapes: of one person and body model, at least one.
-        weight: of that prior in every one of them [1], `shape_weight` of the settings.
+        shapes: shapes of one person and body model, at least one.
+        weight: weight of that prior in every one of them [1], `shape_weight` of the settings.
     """
     prior_precision = weight * np.eye(len(shapes[0].betas))
     precisions = [np.linalg.inv(shape.covariance) for shape in shapes]

@@ -77,7 +77,7 @@ def read_monocular(path: Path) -> MonocularEstimates:
 
 
 def parse_monocular(arrays: Mapping[str, NDArray[Any]], where: Path) -> MonocularEstimates:
-    """Return the bodies of arrays in the layout of such a file.
+    """Return the bodies of arrays in the layout of a file that `read_monocular` reads.
 
     Raises:
         InputError: arrays are missing or have wrong shapes; the error names `where`.
@@ -174,7 +174,7 @@ def place_monocular_poses(
     frame by frame.
 
     Args:
-        estimates: in images of the camera.
+        estimates: poses estimated in images of the camera.
         camera: batch (frames,).
         frame: (frames,), frame numbers.
         joints: (frames, persons, 17, 3) [m], world; gaps are interpolated.

@@ -94,7 +94,7 @@ Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground [m] at x and y [m], world."""
 
 ANKLES: Final = (15, 16)
-"""Of COCO-17."""
+"""Ankles in COCO-17."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def find_contacts(
 
     Args:
         joints: (frames, 17, 3) [m], world, of a fit.
-        ankle_height: of this person's ankle above the sole [m].
+        ankle_height: height of this person's ankle above the sole [m].
         ground: the surface.
         fps: [1/s].
         settings: limits of low and slow.
@@ -152,7 +152,7 @@ def level_feet(rotations: Floats, clear: Floats) -> Floats:
     """Return rotations of feet relative to their shanks (frames, 3, 3): flat where they stand.
 
     Args:
-        rotations: (frames, 3, 3) of the shank, world.
+        rotations: (frames, 3, 3) rotations of the shank, world.
         clear: (frames,) [m], height of the ankle above that of a flat foot; a foot 0.15 m up or on
             a horizontal shank hangs as in the unposed body.
     """
@@ -248,7 +248,7 @@ class Track:
         Args:
             pose: where to linearise.
             offsets: (17, 3) [m] forward, left, up, from a body's joints to the detector's.
-            bordered: with betas and offsets; else the border is empty.
+            bordered: whether the equations have a border for betas and offsets.
         """
         frames, settings = len(pose.transl), self.settings
         body = self.chained.differentiate(pose.parameters())

@@ -48,7 +48,7 @@ def find_ray_constraints(
 
     Args:
         cameras: batch (cameras,).
-        detections: of tracked people, left-right swaps undone.
+        detections: detections of tracked people, left-right swaps undone.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """
     index = detections.detection_index

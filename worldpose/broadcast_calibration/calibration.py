@@ -274,9 +274,9 @@ class _Learned:
     """Spreads that the residuals of a clip show.
 
     Attributes:
-        errors: of the pitch.
+        errors: errors of the pitch.
         lines: deviation of a line's sample over its assumed one, at least 1 [1].
-        clicks: the same of clicks [1].
+        clicks: the same ratio for clicks [1].
         lasting: samples of lines that count as one, since the errors of a piece of a marking last
             for the whole clip [1].
     """

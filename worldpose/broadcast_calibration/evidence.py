@@ -28,12 +28,12 @@ class ObservedPoints:
         image: (n, 2) [px].
         kind: CLICK, MARKING or PLAYER.
         source: (n,) index of the marking or person, -1 for clicks.
-        ends: (n, 2) indices of the template's points that define the place, -1 = none; None = no
-            survey error.
-        shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
-            error; with `ends`.
-        by_size: (n, 3) [m] displacement of the place along x, y, z per standard deviation of the
-            pitch's length, width and crown; None = they are known.
+        ends: (n, 2) indices of the template's points that define the world point, -1 = none;
+            None = no survey error.
+        shares: (n, 2) [m] displacement of the world point per standard deviation of the survey
+            error of `ends`; None without `ends`.
+        by_size: (n, 3) [m] displacement of the world point along x, y, z per standard deviation of
+            the pitch's length, width and crown; None = length, width and crown are known.
     """
 
     frame: Integers
@@ -217,7 +217,7 @@ _FLOW_PARTS = ("frame", "start", "end", "deviation")
 
 
 def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
-    """Return evidence in which so many samples of lines count as one; losses keep their pixels."""
+    """Return evidence in which `lasting` samples of lines count as one; losses stay in pixels."""
     root = np.where(points.kind == MARKING, np.sqrt(lasting), 1.0)
     return replace(
         points, whitening=points.whitening / root[:, None, None], loss=points.loss / root

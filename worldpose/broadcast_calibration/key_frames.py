@@ -155,7 +155,8 @@ def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> 
     """Return a single frame with rotation and focal length changed to show the same ground.
 
     Args:
-        camera: with the new center and principal point, but the old rotation and focal length.
+        camera: camera with the new center and principal point, but the old rotation and focal
+            length.
         center: old center (3,) [m].
         principal_point: old principal point (2,) [px].
     """

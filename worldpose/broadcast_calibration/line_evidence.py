@@ -57,7 +57,7 @@ class FieldSamples:
     Attributes:
         lines: samples of the painted markings.
         whites: all white structures, for the clearance test.
-        errors: of the pitch.
+        errors: errors of the pitch.
     """
 
     lines: LineSamples
@@ -83,7 +83,7 @@ def find_lines(
 
     Args:
         camera: a single frame, approximate.
-        samples: of the pitch.
+        samples: samples of the pitch.
         picture: grey (height, width).
         people: boxes (detections, 4) [px] that occlude lines; None = no people.
         settings: search width, noise, number of samples.
@@ -224,7 +224,7 @@ class FollowedLines:
     """Painted lines detected in all frames, and the corrected cameras.
 
     Attributes:
-        evidence: of all frames.
+        evidence: evidence of all frames.
         camera: all frames, with rotation and focal length fitted to their lines.
     """
 
@@ -243,7 +243,7 @@ def follow_lines(
 
     Args:
         camera: all frames, as tracked.
-        samples: of the pitch.
+        samples: samples of the pitch.
         pictures: grey (height, width), in order.
         boxes: (frames, detections, 4) [px] of people, which occlude lines; None = no people.
         settings: search width, noise, number of samples.

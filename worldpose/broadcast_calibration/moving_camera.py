@@ -24,7 +24,7 @@ class MovingCamera:
     Attributes:
         center: (3,) [m], world.
         principal_point: (2,) [px].
-        rotation: (frames, 3, 3) of x_cam = R (x_world - center).
+        rotation: (frames, 3, 3) rotation of x_cam = R (x_world - center).
         focal: (frames,) [px]; square pixels.
         distortion: (frames, 3) k1, k2, k3.
         image_size: (2,) width, height [px].

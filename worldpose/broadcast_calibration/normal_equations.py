@@ -122,7 +122,7 @@ def point_row(
     Args:
         r: (3, 3) rotation.
         center: (3,) [m], world.
-        lens: of the frame.
+        lens: lens of the frame.
         world: (3,) [m].
         image: (2,), written.
         jacobian: (2, 12), written: by a frame's step, then by the clip's.
@@ -204,14 +204,14 @@ def add_points(
     paint_offsets: Floats,
     equations: NormalEquations,
 ) -> float:
-    """Add points to the normal equations and return their cost, half a sum of losses.
+    """Add points to the normal equations and return their cost, half the sum of their losses.
 
     Args:
-        cameras: of all frames.
-        bounds: (frames + 1,) of the points.
-        points: sorted by frame.
+        cameras: the cameras of all frames.
+        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` belong to frame t.
+        points: all points, sorted by frame.
         paint_offsets: (painted, 3) paint errors of the template's points [standard deviations].
-        equations: added to.
+        equations: the normal equations that the function extends.
     """
     center, rotation = cameras.center, cameras.rotation
     image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss
@@ -391,10 +391,10 @@ def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEq
     """Add followed points to the normal equations and return their cost; see `add_points`.
 
     Args:
-        cameras: of all frames.
-        bounds: (frames + 1,) of the points by their first frame.
+        cameras: cameras of all frames.
+        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` begin in frame t.
         flow: followed points, sorted by frame.
-        equations: added to.
+        equations: the normal equations that the function extends.
     """
     principal, focal = cameras.principal_point, cameras.focal
     rotation, distortion = cameras.rotation, cameras.distortion

@@ -30,11 +30,11 @@ class PitchErrors:
 
     Attributes:
         surveyed: (points,) mask of the template's points whose place is surveyed.
-        survey_m: of a surveyed point, each axis [m].
-        paint_m: of any other point, each axis [m].
-        size_m: (3,) of length, width, crown [m]; 0 = known.
+        survey_m: standard deviation of a surveyed point, each axis [m].
+        paint_m: standard deviation of any other point, each axis [m].
+        size_m: (3,) standard deviations of length, width, crown [m]; 0 = known.
         by_size: (points, 2) change of x by the length, and of y by the width [1].
-        half_width: of the pitch [m].
+        half_width: half of the width of the pitch [m].
     """
 
     surveyed: NDArray[np.bool_]
@@ -128,10 +128,10 @@ class PitchFit:
         points: places (3,) [m], world, of the template's points without survey that the clip's
             markings rest on.
         size: (3,) length, width, crown [m].
-        size_std: (3,) of these [m]; 0 = given.
+        size_std: (3,) standard deviations of `size` [m]; 0 = given.
         paint_m: spread of markings without survey about the Laws, each axis [m]; 0 = all surveyed.
         line_noise: deviation of a line's sample over its assumed one [1].
-        click_noise: the same of clicks [1].
+        click_noise: the same ratio for clicks [1].
     """
 
     points: Mapping[str, Floats]

@@ -260,7 +260,7 @@ class FeedOffset:
     Attributes:
         frames: the clip's frame t corresponds to the static cameras' frame t + frames; NaN where
             `determined` is false.
-        standard_error: of the offset [frame]; infinite without motion.
+        standard_error: standard error of the offset [frame]; infinite without motion.
         determined: whether the best offset lies inside the search range, with a standard error
             below half a frame.
         tried: (n,) tested offsets [frame].

@@ -28,8 +28,8 @@ class Prior:
         center_information: (3, 3) [1/m^2].
         principal_point: (2,) [px].
         principal_std: (2,) [px].
-        log_focal: (frames,); with `log_focal_std`.
-        log_focal_std: standard deviation of the logarithm.
+        log_focal: (frames,) mean of the logarithm of the focal length [px].
+        log_focal_std: standard deviation of this logarithm.
         distortion: (frames, 3).
         distortion_std: (frames, 3).
     """
@@ -50,7 +50,7 @@ def build_prior(
     """Return the prior of frames with given approximate focal lengths.
 
     Args:
-        settings: middles and spreads.
+        settings: means and standard deviations.
         focal: (frames,) [px], approximate.
         image_size: (2,) width, height [px].
     """
@@ -133,9 +133,10 @@ class Weights(Record):
     """Deviation of second differences: their root mean square in the logarithm of the tracked focal
     lengths, smoothed over 0.2 s."""
     smooth_k1: float
-    """As the focal length's, times 1.6 and k1: a zoom lens's distortion changes with its zoom."""
+    """The same deviation for k1: that of the focal length times 1.6 and k1, because a zoom lens's
+    distortion changes with its zoom."""
     smooth_k2: float
-    """As the focal length's, times k2."""
+    """The same deviation for k2: that of the focal length times k2."""
     smooth_frames: float
     """Correlation time of these second differences: the sum of their autocorrelation [frame]."""
     player_share: float
@@ -169,7 +170,8 @@ def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
 def correlation_time(camera: MovingCamera, fps: float) -> float:
     """Return the correlation time of second differences of a tracked clip's zoom [frame].
 
-    The sum of their autocorrelation: so many frames are worth one independent frame.
+    The correlation time is the sum of the autocorrelation: this number of consecutive frames has
+    the information of one independent frame.
 
     Args:
         camera: all frames, as tracked.
@@ -204,7 +206,7 @@ def estimate_flow_share(
     Args:
         links: a tracked clip; without a gap between key frames, `drift` applies.
         key_frames: their numbers, rising.
-        deviation: of a followed point's motion [px].
+        deviation: deviation of a followed point's motion [px].
         drift: tracking error after one frame, growing with the square root of frames [px].
     """
     points = np.array([kept.sum() for kept in links.kept])

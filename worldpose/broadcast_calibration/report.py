@@ -48,8 +48,9 @@ class BroadcastReport:
         status: (frames,) main evidence of each frame, an index into FRAME_STATUS.
         reprojection_error: (frames,) expected image error of places on the pitch, root mean square
             over the visible places [px].
-        marking_rms: (frames,) of the samples of painted lines, across them [px]; NaN without any.
-        player_rms: (frames,) of matched keypoints [px]; NaN without any.
+        marking_rms: (frames,) root mean square residual of the samples of painted lines, across the
+            lines [px]; NaN without any.
+        player_rms: (frames,) root mean square residual of matched keypoints [px]; NaN without any.
         marking_count: (frames,) samples of painted lines.
         player_count: (frames,) matched players.
         flow_count: (frames,) followed points from the frame to the next.
@@ -58,12 +59,12 @@ class BroadcastReport:
         wrong: outliers among a key frame's clicks and markings, by frame.
         drift: (gaps,) tracking error from one key frame to the next [px].
         feed_offset: the clip's clock offset, from people; None without people.
-        weights: of the terms.
+        weights: weights of the terms.
         pitch: the pitch and the noise that the fit shows.
         pick_next: frames whose clicks would help most, the best first.
         markings_off: median distance of painted lines from their projection [px], before players
             and the joint fit, and after; NaN without any.
-        players_off: the same of people, by the mean over a person's keypoints.
+        players_off: the same distances of people, by the mean over a person's keypoints.
         decisions: choices and the metrics behind them.
         reasons: why a person must review the clip; empty if not necessary.
     """
@@ -114,7 +115,7 @@ class JointFit:
         uncertainty: covariance of `camera`.
         points: evidence of the fit.
         matches: players; None without.
-        weights: of the terms.
+        weights: weights of the terms.
         feed_offset: the clip's clock offset; None without people.
         pitch: the pitch and the noise that the fit shows.
     """
@@ -214,7 +215,7 @@ def report_calibration(
 def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: PitchTemplate) -> Floats:
     """Return the expected image error of places on the pitch per frame (frames,) [px].
 
-    Root mean square over the visible places; NaN if the frame shows none.
+    Each error is the root mean square over the visible places; NaN if the frame shows none.
     """
     half = 0.5 * np.array([pitch.length, pitch.width])
     x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, _GRID) for h in half))

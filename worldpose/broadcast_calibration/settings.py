@@ -11,38 +11,43 @@ from data_contracts.records import Positive, Record
 from worldpose.static_calibration import CameraPrior, StaticCalibrationSettings
 
 _Offset = Annotated[float, Field(ge=-1, le=1)]
-"""In widths of the image [1]."""
+"""Offset in widths of the image [1]."""
 
 
 class BroadcastPrior(Record):
-    """Gaussian prior of a main camera: middles and spreads.
+    """Gaussian prior of a main camera: means and standard deviations.
 
-    From 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), widened for lenses and
-    stadiums of other broadcasters.
+    They come from 20 released clips of the 2022 World Cup (K, k, R, t of WorldPose), and are
+    widened for lenses and stadiums of other broadcasters.
     """
 
     principal_point: tuple[_Offset, _Offset] = (0.0, -0.018)
-    """From the image center, in image widths [1]; 2022: 0, and -35 px of 1920."""
+    """Mean offset of the principal point from the image center, in image widths [1]; 2022: 0, and
+    -35 px of 1920."""
     principal_point_std: tuple[Positive, Positive] = (0.01, 0.012)
-    """In widths [1]; 2022: 19 and 23 px of 1920."""
+    """Standard deviation of the principal point in image widths [1]; 2022: 19 and 23 px of 1920."""
     focal: float = Field(default=2.1, ge=1e-6, le=1000)
-    """In image widths [1]; 2022: 1.25 to 3.7."""
+    """Focal length in image widths [1]; 2022: 1.25 to 3.7."""
     log_focal_std: float = Field(default=0.4, ge=1e-6, le=100)
-    """Of the focal length's logarithm [1]."""
+    """Standard deviation of the focal length's logarithm [1]."""
     k1: float = Field(default=0.4, ge=-100, le=100)
-    """At a focal length of 2.19 widths [1]; it grows with the focal length to the power 1.6."""
+    """Mean of k1 at a focal length of 2.19 widths [1]; it grows with the focal length to the power
+    1.6."""
     k1_std: float = Field(default=0.25, ge=1e-6, le=100)
-    """As `k1`, with the same growth [1]; 2022: 0.08. Wide enough for a lens without distortion."""
+    """Standard deviation of k1, with the same growth [1]; 2022: 0.08. It is wide enough for a lens
+    without distortion."""
     k2: float = Field(default=1.5, ge=-100, le=100)
-    """At a focal length of 2.19 widths [1]; it grows with the focal length."""
+    """Mean of k2 at a focal length of 2.19 widths [1]; it grows with the focal length."""
     k2_std: float = Field(default=0.8, ge=1e-6, le=100)
-    """As `k2`, with the same growth [1]; 2022: 0.5 to 0.8."""
+    """Standard deviation of k2, with the same growth [1]; 2022: 0.5 to 0.8."""
     k3_std: float = Field(default=0.5, ge=1e-6, le=100)
-    """As `k2_std`, about zero [1]: the released cameras have none (trap 3)."""
+    """Standard deviation of k3 about zero, with the growth of k2 [1]: the released cameras have no
+    k3."""
     center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, -75.0, 17.0)
-    """World [m]: on the main stand, at the halfway line."""
+    """Mean center in the world [m]: on the main stand, at the halfway line."""
     center_std_m: tuple[Positive, Positive, Positive] = (15.0, 20.0, 8.0)
-    """[m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in large stadiums."""
+    """Standard deviation of the center [m]; 2022: 0.1, 6 and 2 m, of cameras at the halfway line in
+    large stadiums."""
 
 
 class BroadcastCalibrationSettings(Record):
@@ -53,17 +58,17 @@ class BroadcastCalibrationSettings(Record):
     click_noise_px: float = Field(default=1.0, ge=1e-6, le=100)
     """Standard deviation of a clicked point, each axis [px]."""
     survey_error_m: float = Field(default=0.006, ge=0, le=1)
-    """Of a surveyed point of the template from the painted one, each axis, standard deviation
+    """Standard deviation of a surveyed point of the template from the painted one, each axis
     [m]."""
     paint_error_m: float = Field(default=0.03, ge=1e-6, le=1)
-    """The same of a point that has its place from the Laws of the Game [m], plan and height: prior,
-    which the clip's own markings correct."""
+    """Standard deviation of a point that has its place from the Laws of the Game [m], in plan and
+    height. It is a prior, which the clip's own markings correct."""
     crown_std_m: float = Field(default=0.1, ge=0, le=1)
-    """Of an unmeasured crown, from the standard 0.2 m, standard deviation [m]: prior. The
-    pitches of two real cameras have about 0.1 m; 0 = as given."""
+    """Standard deviation of an unmeasured crown from the standard 0.2 m [m]: prior. The pitches of
+    two real cameras have about 0.1 m; 0 = as given."""
     pitch_size_std_m: float = Field(default=0.1, ge=0, le=10)
-    """Of an unmeasured length or width, from 105 and 68 m, standard deviation [m]: prior.
-    Top competitions prescribe this size; 0 = as given. A pitch of another size needs pitch.json."""
+    """Standard deviation of an unmeasured length or width from 105 and 68 m [m]: prior. Top
+    competitions prescribe this size; 0 = as given. A pitch of another size needs pitch.json."""
     field_weight: float = Field(default=1.0, ge=1e-6, le=100)
     """Factor on the loss of markings (M3; the paper's 1)."""
     player_weight: float = Field(default=0.5, ge=0, le=100)

@@ -35,7 +35,7 @@ class ProgrammeSettings(Record):
     rate_hz: float = Field(default=25.0, ge=1e-6, le=10000)
     """Approximate sampling rate of frames [Hz]; it limits the accuracy of cuts."""
     cut_share: float = Field(default=0.25, gt=0, lt=1)
-    """As in calibration: minimum share of homography inliers within a shot [1]."""
+    """Minimum share of homography inliers within a shot, as in calibration [1]."""
     min_transition_s: float = Field(default=0.1, ge=1e-6, le=10)
     """Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
     replay."""
@@ -60,9 +60,9 @@ class Shot:
         seconds: duration [s].
         grass: median share of grass in the frame [1].
         tallest: median height of the tallest region on the grass, in image heights [1].
-        pan: from its leftmost to its rightmost view, in image widths [1].
+        pan: distance from its leftmost to its rightmost view, in image widths [1].
         pictures: small preview frames, in RGB.
-        unfit: reasons against it as a clip; empty = proposed.
+        unfit: reasons against the shot as a clip; empty = proposed.
     """
 
     first: int

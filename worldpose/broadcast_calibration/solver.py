@@ -37,7 +37,7 @@ class Problem:
     Attributes:
         points: clicks, lines and players.
         flow: followed points.
-        prior: of center and lenses.
+        prior: prior of center and lenses.
         smoothness: (7,) standard deviation of second differences of a frame's parameters; infinite
             = free.
         flow_weight: factor on the loss of followed points [1].
@@ -187,7 +187,7 @@ def displace(points: PointEvidence, problem: Problem, paint_offsets: Floats) -> 
 
     Args:
         points: evidence of the problem.
-        problem: with the rows of the paint errors.
+        problem: problem with the rows of the paint errors.
         paint_offsets: (painted, 3) [standard deviations].
     """
     padded = np.concatenate([paint_offsets, np.zeros((1, 3))])

@@ -134,8 +134,8 @@ class Turned:
 
     Attributes:
         camera: two frames: the given one, and the next.
-        residual: (n, 2) of the followed points, predicted minus observed [px]; NaN where there is
-            no prediction.
+        residual: (n, 2) residual of the followed points, predicted minus observed [px]; NaN where
+            there is no prediction.
         determined: whether the points determine the motion.
     """
 
@@ -178,8 +178,8 @@ def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
 def modified_z_scores(residual: Floats) -> Floats:
     """Return each point's modified z-score (n,), the larger of both axes (M6).
 
-    0.6745 times the distance from the median over the median of these distances (Iglewicz and
-    Hoaglin, 1993); NaN where the residual is missing.
+    The score is 0.6745 times the distance from the median, divided by the median of these distances
+    (Iglewicz and Hoaglin, 1993). It is NaN where the residual is missing.
 
     Args:
         residual: (n, 2) [px].

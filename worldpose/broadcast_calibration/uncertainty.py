@@ -52,7 +52,7 @@ class Uncertainty:
 
     @property
     def clip(self) -> Floats:
-        """(5, 5) of center [m] and principal point [px]."""
+        """Return the covariance (5, 5) of center [m] and principal point [px]."""
         return np.asarray(self.frame[0, FRAME_SIZE:, FRAME_SIZE:])
 
 
@@ -92,9 +92,10 @@ def compute_uncertainty(
     Args:
         solution: the camera and the paint errors.
         problem: evidence, smoothness and priors of the solution.
-        line_shift: of all painted lines in the image, each axis, standard deviation [px].
-        player_shift: of all keypoints in all frames, each axis, standard deviation [standard
-            deviations of a keypoint].
+        line_shift: standard deviation of a common shift of all painted lines in the image, each
+            axis [px].
+        player_shift: standard deviation of a common shift of all keypoints in all frames, each axis
+            [standard deviations of a keypoint].
         smooth_frames: correlation time of the lens's second differences [frame].
 
     Raises:

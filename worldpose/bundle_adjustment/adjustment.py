@@ -64,19 +64,20 @@ class BundleAdjustment:
     Attributes:
         clip: the input, with the noise of its detector in its confidences.
         cameras: (cameras,) batch; unchanged where the change was refused.
-        covariance: (cameras, 12, 12) of a step; as calibrated where the change was refused.
+        covariance: (cameras, 12, 12) covariance of a step; as calibrated where the change was
+            refused.
         accepted: (cameras,) bool.
         reasons: why each camera was accepted or refused.
         proposed: match frames best suited to adjustment.
         used: match frames that supplied people.
         judged: match frames for held-out validation.
-        noise: of keypoints, as measured.
+        noise: noise of keypoints, as measured.
         verdict: held-out errors with calibrated and with changed cameras, also where refused.
         evidence: result of all held-out people together for the proposed change.
-        motion: (cameras, 3) of the accepted cameras: of the center [m], of the axes [rad], of the
-            focal length [1]; 0 where refused.
+        motion: (cameras, 3) motion of the accepted cameras: of the center [m], of the axes [rad],
+            of the focal length [1]; 0 where refused.
         refused: (cameras,) batch as it would be without held-out validation.
-        iterations: of the last solution.
+        iterations: iterations of the last solution.
         converged: whether the last solution converged.
         observations: keypoints in the adjustment [1].
     """
@@ -115,7 +116,7 @@ def adjust_cameras(
         settings: evidence, weights, acceptance.
 
     Note:
-        B1-B3, trap 1; paper section "Bundle Adjustment".
+        B1-B3; paper section "Bundle Adjustment".
     """
     proposed = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views

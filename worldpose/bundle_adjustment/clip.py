@@ -22,7 +22,7 @@ class Clicks:
     """The clicked points of one camera.
 
     Attributes:
-        names: of points of the pitch template.
+        names: names of points of the pitch template.
         points_world: (n, 3) [m], world.
         points_image: (n, 2) [px].
         inlier: (n,) bool, whether the calibration uses it.
@@ -57,17 +57,17 @@ class Clip:
 
     Attributes:
         cameras: (cameras,) batch, as they were calibrated or given.
-        covariance: (cameras, 12, 12) of a step, in the order of `PARAMETERS`; all zero for a given
-            camera.
-        clicks: of every camera.
+        covariance: (cameras, 12, 12) covariance of a step, in the order of `PARAMETERS`; all zero
+            for a given camera.
+        clicks: clicks of every camera.
         fps: frames per second.
-        detections: (frames, cameras, detections) of tracked people, with match frames.
+        detections: (frames, cameras, detections) detections of tracked people, with match frames.
         joints: (frames, persons, 17, 3) [m], world, as triangulated; NaN where not determined.
         views: (frames, persons, 17) inlier cameras.
         triangulation: settings that made the joints.
-        pitch: as surveyed; None = not known.
+        pitch: the pitch as surveyed; None = not known.
         on_lines: (cameras,) bool, whether it was calibrated on painted lines; None = no camera.
-        names: of the cameras, for messages; empty = not known.
+        names: names of the cameras, for messages; empty = not known.
     """
 
     cameras: Camera
@@ -84,7 +84,7 @@ class Clip:
 
     @cached_property
     def given(self) -> Flags:
-        """Whether each camera (cameras,) comes from a file that states no covariance."""
+        """Return whether each camera (cameras,) comes from a file that states no covariance."""
         return np.asarray(~self.covariance.any(axis=(1, 2)))
 
     @cached_property
@@ -225,7 +225,7 @@ def project_joints(
         cameras: (cameras,) batch.
         joints: (frames, persons, 17, 3) [m], world.
         confidence: (frames, cameras, persons, 17).
-        settings: of triangulation, with the stated noise.
+        settings: settings of triangulation, with the stated noise.
 
     Returns:
         (frames, cameras, persons, 17, 2) and (frames, cameras, persons, 17); NaN and infinite

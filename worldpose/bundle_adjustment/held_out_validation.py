@@ -56,7 +56,7 @@ def held_out_errors(
         cameras: (cameras,) batch to validate.
         frames: (k,) indices of frames.
         people: (k, persons) bool, held-out people.
-        robust_scale: of Cauchy's loss [standard deviations].
+        robust_scale: robust scale of Cauchy's loss [standard deviations].
     """
     detections = clip.detections[frames]
     index = np.where(people[:, None], detections.detection_index, -1).astype(np.int16)

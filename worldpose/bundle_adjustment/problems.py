@@ -110,7 +110,7 @@ def estimate_variance_factor(problem: Problem, adjusted: Solution) -> Floats:
 
 
 def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSettings) -> Problem:
-    """Return the adjustment of cameras to clicks alone, all parameters free, no prior (trap 1).
+    """Return the adjustment of cameras to clicks alone, all parameters free, without a prior.
 
     Args:
         clip: cameras and clicks.
@@ -210,7 +210,7 @@ def estimate_noise(
         cameras: (cameras,) batch, adjusted.
         points: (points, 3) [m], world, adjusted.
         observed: keypoints of these points.
-        robust_scale: of Cauchy's loss [standard deviations].
+        robust_scale: robust scale of Cauchy's loss [standard deviations].
     """
     off = residuals(cameras, points, observed)
     views = np.bincount(observed.point_of, minlength=len(points))[observed.point_of]

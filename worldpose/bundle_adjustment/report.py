@@ -29,7 +29,7 @@ def adjustment_arrays(
 
     Args:
         adjusted: the adjustment.
-        settings: of the adjustment.
+        settings: settings of the adjustment.
         person: (persons,) ids.
 
     Returns:
@@ -139,7 +139,7 @@ class ClickReview:
 
     Attributes:
         camera: (n,)
-        name: of each point of the pitch.
+        name: name of each point of the pitch.
         residual: (n, 2) [px], projected minus clicked; NaN where the camera cannot image the point.
         surprise: (n,) Mahalanobis distance from the prediction of all other data [1]; infinite
             where the camera cannot image the point.
@@ -161,7 +161,7 @@ def keypoint_outliers(
     Args:
         clip: keypoints and their persons.
         cameras: (cameras,) batch, adjusted.
-        noise: of keypoints, as measured.
+        noise: noise of keypoints, as measured.
         limit: Mahalanobis distance from which a keypoint is listed [1].
         longest: maximum number of entries.
     """
@@ -209,9 +209,9 @@ def review_clicks(
     """Return every clicked point's residual and its Mahalanobis distance.
 
     Args:
-        clicks: of every camera.
+        clicks: clicks of every camera.
         cameras: (cameras,) batch, adjusted.
-        covariance: (cameras, 12, 12) of a step; all zero for a given camera.
+        covariance: (cameras, 12, 12) covariance of a step; all zero for a given camera.
         click_noise: standard deviation per axis [px].
     """
     camera: list[int] = []

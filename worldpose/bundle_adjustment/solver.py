@@ -38,8 +38,8 @@ class Problem:
     Attributes:
         cameras: (cameras,) batch with square pixels.
         free: (cameras, 12) bool, parameters that may move, in the order of `PARAMETERS`.
-        camera_information: (cameras, 12, 12) of a step from `cameras`: the prior, without the
-            observations here.
+        camera_information: (cameras, 12, 12) information of a step from `cameras`: the prior,
+            without the observations here.
         points: (points, 3) [m], world.
         point_information: (points,) [1/m^2] per axis; 0 = free, infinite = fixed where it is.
         point_of: (n,) point of every observation, ascending.
@@ -48,7 +48,7 @@ class Problem:
         weight: (n,) [1/px^2], one over the variance per image axis.
         scale: (n,) standard deviations beyond which an observation counts less (Cauchy's loss);
             infinite = plain squares.
-        names: of the cameras, for messages; empty = not known.
+        names: names of the cameras, for messages; empty = not known.
     """
 
     cameras: Camera
@@ -75,8 +75,8 @@ class Solution:
         cost: robust sum of squares with priors.
         iterations: number of steps tried.
         converged: whether the last step gained less than `min_cost_change`.
-        camera_covariance: (12 cameras, 12 cameras) of steps from the solution, the points being
-            free; zero for fixed parameters, empty if not requested.
+        camera_covariance: (12 cameras, 12 cameras) covariance of steps from the solution, the
+            points being free; zero for fixed parameters, empty if not requested.
     """
 
     cameras: Camera

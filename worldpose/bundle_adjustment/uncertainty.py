@@ -123,9 +123,10 @@ def relative_covariance(
     the people; the rest is relative.
 
     Args:
-        covariance: (12 cameras, 12 cameras) of steps.
+        covariance: (12 cameras, 12 cameras) covariance of steps.
         cameras: (cameras,) batch.
-        information: (cameras, 12, 12) of keypoints on each camera alone, used as its weight.
+        information: (cameras, 12, 12) information of keypoints on each camera alone, used as its
+            weight.
         origin: (3,) [m], world: position of the people.
 
     Returns:
@@ -208,9 +209,10 @@ def add_shared_errors(covariance: Floats, information: Floats, response: Floats)
     correlation (the sandwich of White 1980).
 
     Args:
-        covariance: (12 cameras, 12 cameras) of the adjustment with independent calibrations.
-        information: (cameras, 12, 12) of the calibrations in the adjustment.
-        response: (cameras, 12, unknowns) of each calibration to the shared unknowns.
+        covariance: (12 cameras, 12 cameras) covariance of the adjustment with independent
+            calibrations.
+        information: (cameras, 12, 12) information of the calibrations in the adjustment.
+        response: (cameras, 12, unknowns) response of each calibration to the shared unknowns.
     """
     count, size = information.shape[:2]
     blocks = covariance.reshape(count, size, count, size)
@@ -258,7 +260,7 @@ def weak_direction(camera: Camera, covariance: Floats) -> WeakDirection:
 
     Args:
         camera: a single camera.
-        covariance: (12, 12) of a step.
+        covariance: (12, 12) covariance of a step.
     """
     width, height = camera.image_size
     across, down = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 6))

@@ -105,7 +105,7 @@ class Comparison:
     """Cameras, their detections, and the agreement between them.
 
     Attributes:
-        cameras: as stated, batch (cameras,).
+        cameras: batch (cameras,), as stated.
         count: number of cameras.
         frames: number of frames.
         sample: (n,) frames at which cameras are compared.
@@ -413,9 +413,9 @@ def pair_scores(
     assignment is greedy, best first.
 
     Args:
-        view: of the first camera.
+        view: view of the first camera.
         frames: (n,) its compared frames; -1 = none.
-        partner: of the second camera.
+        partner: view of the second camera.
         partner_frames: (n,) frame of the second camera for each of `frames`.
         heights: lowest and highest mean height of a person's joints [m]; infinite where the
             ground is unknown.

@@ -43,7 +43,7 @@ def check_consistency(
 
     Args:
         cameras: batch (cameras,).
-        covariance: (cameras, 12, 12) of a step of each; NaN or None for given cameras.
+        covariance: (cameras, 12, 12) covariance of a step of each; NaN or None for given cameras.
         detections: (frames, cameras, detections); a confidence of 0 or less excludes a keypoint,
             only its sign counts.
         fps: frames per second [1/s].

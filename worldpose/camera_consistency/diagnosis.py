@@ -75,9 +75,10 @@ class Fault:
         detail: description; may be empty.
         value: ratio or frames, if the fault has one.
         other: index of the other camera of a swap, duplicate or contradiction.
-        cause: of a contradiction, the fault of this camera that would explain it.
+        cause: cause of a contradiction, the fault of this camera that would explain it.
         share_now: share of its detections that agree with others as stated [1].
-        share_corrected: the same after correction of the fault; None without a known correction.
+        share_corrected: the same share after correction of the fault; None without a known
+            correction.
     """
 
     camera: int

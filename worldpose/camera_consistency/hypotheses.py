@@ -45,7 +45,7 @@ class Hypothesis:
     """A possible camera fault, represented by its correction.
 
     Attributes:
-        kind: of the fault.
+        kind: kind of the fault.
         detail: description for users.
         camera: the corrected calibration; None = as stated.
         mirrored: whether the detections are mirrored back, with left and right swapped.

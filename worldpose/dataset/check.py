@@ -46,7 +46,7 @@ def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]
     """Yield boxes without their skeletons, and whether another number order explains it.
 
     Args:
-        boxes: (frames, persons, 4) as in the file.
+        boxes: (frames, persons, 4) boxes as in the file.
         skel_2d: (frames, persons, points, 2) [px].
         clip: its name.
     """
@@ -89,7 +89,7 @@ def skeleton_findings(
     axes. The residual does not depend on body size, so units are checked by thigh lengths.
 
     Args:
-        skel_3d: (frames, persons, points, 3) as in the file.
+        skel_3d: (frames, persons, points, 3) points as in the file.
         skel_2d: (frames, persons, points, 2) [px].
         skeleton: names of the points.
         rows: the clip's camera; a frame without a pose has K and k.

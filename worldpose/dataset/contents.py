@@ -167,7 +167,7 @@ def read_clip(
         clip: one of `clips`.
         clips: all of the data set; a camera with none of their names is static.
         body: returns the body model for a name, or for a file without one.
-        manifest: of the release, if it is one.
+        manifest: manifest of the release, if it is one.
         fps: frames per second.
         pitch: whether the ground is z = 0.
 
@@ -217,7 +217,7 @@ def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
         frames: number of frames; the first image is frame 0.
 
     Raises:
-        InputError: it is not a COCO keypoints file.
+        InputError: the file is not a COCO keypoints file.
     """
     pixels = np.full((frames, len(ids), len(COCO17), 2), np.nan)
     person_of = {person: place for place, person in enumerate(ids)}

@@ -44,7 +44,7 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
     """Read the manifest of a release; None if the folder has none.
 
     Raises:
-        InputError: it is not a manifest, or has another contract version.
+        InputError: the file is not a manifest, or has another contract version.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -161,7 +161,7 @@ def read_origins(path: Path) -> NDArray[np.int64]:
     """Read the origins (frames, persons, 17) of a file.
 
     Raises:
-        InputError: names file and member.
+        InputError: the file is invalid; the error names file and member.
     """
     origin: NDArray[np.int64] = read_archive(path, MEMBERS)["origin"]
     return origin

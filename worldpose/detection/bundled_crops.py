@@ -39,7 +39,7 @@ def frame_from_crop(
     """Return the affine map (2, 3) from pixels of a crop to pixels of the frame.
 
     Args:
-        crop: (3,) from `crops_around`.
+        crop: (3,) crop from `crops_around`.
         size: width, height of the crop [px].
         turn: rotation of the crop within the frame, from x to y [rad].
         mirrored: whether the crop is mirrored left to right.
@@ -58,7 +58,7 @@ def cut_crop(image: Image, mapping: Floats, size: tuple[int, int], outside: int 
 
     Args:
         image: (height, width, 3).
-        mapping: (2, 3) from pixels of the crop to those of the frame.
+        mapping: (2, 3) affine map from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
         outside: grey level outside of the frame [of 255].
     """
@@ -105,9 +105,9 @@ def surroundings(box: Floats, others: Floats, mapping: Floats, size: tuple[int, 
     The person whose box ends lower in the frame stands nearer to the camera.
 
     Args:
-        box: (4,) of the target person x0, y0, x1, y1 [px].
-        others: (people, 4) of others [px].
-        mapping: (2, 3) from pixels of the crop to those of the frame.
+        box: (4,) box of the target person x0, y0, x1, y1 [px].
+        others: (people, 4) boxes of others [px].
+        mapping: (2, 3) affine map from pixels of the crop to those of the frame.
         size: width, height of the crop [px].
     """
     columns, rows = size[0] // MAP_CELL, size[1] // MAP_CELL

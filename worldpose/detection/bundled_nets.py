@@ -119,7 +119,7 @@ class PeopleNet(nn.Module):
         """Return the maps of frames whose sides are multiples of `COARSEST`.
 
         Args:
-            images: (batch, 3, height, width) from `normalize`.
+            images: (batch, 3, height, width) images from `normalize`.
 
         Returns:
             Logits that a cell is a person's centre (batch, rows, columns), and distances from the
@@ -166,7 +166,7 @@ class KeypointNet(nn.Module):
         """Return the net's output for crops.
 
         Args:
-            crops: (batch, 3, height, width) from `normalize`.
+            crops: (batch, 3, height, width) crops from `normalize`.
             surroundings: (batch, 3, rows, columns) maps of the target box and its neighbours.
         """
         features, coarsest = self.pyramid(crops, self.around(surroundings))
@@ -246,7 +246,7 @@ def fold_normalisations(net: Net) -> Net:
     """Return `net` for inference: its normalisations are part of its convolutions.
 
     Args:
-        net: with its weights, changed in place.
+        net: net with its weights, changed in place.
     """
     for module in net.modules():
         if isinstance(module, Block):

@@ -65,7 +65,7 @@ class Part:
         end: right, lower pixel, not included.
         zoom: enlargement [1]; less than 1 is a reduction.
         inner: x0, y0, x1, y1 of the region that holds the centres of its people [px].
-        heights: of people that count in it, bounds not included [px].
+        heights: heights of people that count in it, bounds not included [px].
         replaced: heights between which earlier people with centres in `inner` are dropped [px].
     """
 
@@ -113,7 +113,7 @@ class SeesParts(Detector, Protocol):
         """Return the people in each image, as `detect`.
 
         Args:
-            images: of one size.
+            images: images of one size.
             parts: where people are expected small or large, from the camera; empty where they are
                 not.
         """
@@ -133,7 +133,7 @@ def restore_size(people: People, size: Sequence[int] | NDArray[np.integer], zoom
     """Return people of a resized image in the pixels of the original.
 
     Args:
-        people: in the image that `resize` returned.
+        people: people in the image that `resize` returned.
         size: width, height of the original [px].
         zoom: its factor.
     """
@@ -165,7 +165,7 @@ def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]
     Args:
         people: detections in the whole frame.
         shape: height, width of the frame [px].
-        step: of `STEPS`.
+        step: step of `STEPS`.
     """
     sure = _sure_heights(people)
     if not len(sure) or np.median(sure) >= step[0]:

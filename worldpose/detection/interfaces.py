@@ -49,8 +49,8 @@ class Detector(Protocol):
         """Return the people in each image, from `MIN_SCORE` on.
 
         Args:
-            images: of one size. The detector chooses its batch size; a result must not depend on
-                the other images of a batch.
+            images: images of one size. The detector chooses its batch size; a result must not
+                depend on the other images of a batch.
         """
 
 

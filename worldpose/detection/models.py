@@ -208,7 +208,7 @@ def _find_pulled(name: str) -> tuple[str, Path]:
     """Return kind and path of a pulled checkpoint.
 
     Raises:
-        InputError: it was not pulled.
+        InputError: the checkpoint was not pulled.
     """
     folder = model_folder()
     # A name is never a path.

@@ -41,7 +41,7 @@ class Form:
         decode: the people of one view, from the outputs without their batch dimension, the size of
             the view (width, height) [px], and the classes of people.
         classes: the number of classes, from the outputs; None if the form has class labels.
-        scale: of grey levels 0..255, before mean and std.
+        scale: scale of grey levels 0..255, before mean and std.
         mean, std: per channel, subtracted and divided by, after scaling.
         bgr: channels are blue, green, red.
     """
@@ -100,7 +100,7 @@ def recognize_form(where: str, outputs: Outputs, size: tuple[int, int]) -> str:
 
     Args:
         where: the file, for messages.
-        outputs: for one image, without the batch dimension.
+        outputs: outputs for one image, without the batch dimension.
         size: width, height of the net's input [px].
 
     Raises:

@@ -43,7 +43,7 @@ class OnnxNet:
         where: the file, for messages.
         size: width, height of its input [px].
         channels_last: whether it takes (batch, height, width, 3), as TensorFlow has it.
-        dtype: of its input.
+        dtype: dtype of its input.
         batch: images per call; None for any number.
         metadata: what the exporter wrote into the file.
         outputs: shape of each output, with None for dynamic sizes.
@@ -168,7 +168,7 @@ def cut_crops(image: Image, frames: Floats, size: tuple[int, int], fill: int = 0
 
     Args:
         image: the whole frame.
-        frames: (boxes, 3) from `fit_crops`.
+        frames: (boxes, 3) crops from `fit_crops`.
         size: width, height of a crop [px].
         fill: grey level beyond the frame's border.
     """
@@ -218,7 +218,7 @@ def points_in_frame(points: Floats, frames: Floats) -> Floats:
 
     Args:
         points: (boxes, points, 2) [px of the crop].
-        frames: (boxes, 3) from `fit_crops`.
+        frames: (boxes, 3) crops from `fit_crops`.
     """
     return np.asarray(points * frames[:, None, 2:] + frames[:, None, :2])
 

@@ -82,7 +82,7 @@ class DetectionReport:
         unreadable: numbers of the frames without an image.
         empty: frames with an image and without people.
         detections: people in all frames.
-        boxes: of the detectors, from `low_score_threshold` on.
+        boxes: boxes of the detectors, from `low_score_threshold` on.
         crowd: those of them that are outside of the pitch.
         bridged: boxes that were filled in.
         flickers: boxes of tracks with too few sightings.
@@ -146,7 +146,7 @@ class PeopleFinder:
     """Detectors, an estimator and settings, for a match's videos.
 
     Attributes:
-        report: of the last video.
+        report: report of the last video.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class PeopleFinder:
         Args:
             detectors: one, or an ensemble.
             estimator: finds keypoints in boxes.
-            settings: of the stage.
+            settings: settings of the stage.
         """
         self._detectors = [
             detector
@@ -316,10 +316,10 @@ def find_poses(
     """Return the poses of people with the estimator's boxes, then of occluded people next to them.
 
     Args:
-        estimator: of poses.
+        estimator: estimator of poses.
         image: the whole frame.
         people: detected people.
-        settings: of the stage.
+        settings: settings of the stage.
     """
     poses = combine_boxes(people, estimator.estimate(image, people.boxes))
     if not (settings.find_occluded and isinstance(estimator, FindsOccludedPeople)):

@@ -79,8 +79,8 @@ class DetectionSettings(Record):
     min_keypoint_confidence: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
     oks_nms: float = Field(default=0.85, ge=1e-6, le=1)
-    """Of two poses per frame more similar than this, the one with the better box stays [1, COCO's
-    object keypoint similarity]."""
+    """If two poses in a frame are more similar than this, the pose with the better box stays [1,
+    COCO's object keypoint similarity]."""
     max_people: int = Field(default=64, ge=1, le=1024)
     """Most people per frame; those with the best scores stay."""
 

@@ -24,7 +24,7 @@ def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
     """Return the indices of boxes that pass non-maximum suppression, best first.
 
     Args:
-        people: of one frame.
+        people: people of one frame.
         overlap: a better box with a larger intersection over union suppresses a box [1].
     """
     order = _best_first(people)
@@ -55,7 +55,7 @@ def combine_boxes(people: People, poses: KeypointDetections) -> KeypointDetectio
     """Return the poses with the estimator's boxes, where it gives any, else the detector's.
 
     Args:
-        people: as a detector found them.
+        people: people as a detector found them.
         poses: the estimate for each person. Its score, the expected fit of its box, becomes the
             geometric mean of the detector's score, the fit and the mean confidence of the surest
             keypoints; without a fit the detector's score stays.
@@ -122,7 +122,7 @@ def object_keypoint_similarity(keypoints: AnyFloats, area: AnyFloats) -> Floats:
 
     Args:
         keypoints: (people, 17, 2) [px]; NaN where not found.
-        area: (people,) of their boxes [px^2]; the smaller of a pair counts.
+        area: (people,) area of their boxes [px^2]; the smaller of a pair counts.
     """
     apart = np.square(keypoints[:, None] - keypoints[None]).sum(axis=3)
     scale = 2.0 * np.minimum(area[:, None], area[None])[..., None]
@@ -142,7 +142,7 @@ def suppress_poses(
     Bodla, 2017): a person behind another stays, a duplicate ranks last.
 
     Args:
-        detections: (people,) of one image.
+        detections: (people,) detections of one image.
         least_keypoint: a keypoint below this confidence was not found [1].
         same_pose: similarity of poses above which two boxes are of one person [1].
     """

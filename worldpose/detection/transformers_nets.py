@@ -29,7 +29,7 @@ def load_transformers_detector(folder: Path, device: str = "cpu", half: bool = F
     """Return a detector of people from a saved checkpoint.
 
     Args:
-        folder: with config.json, model.safetensors and preprocessor_config.json.
+        folder: folder with config.json, model.safetensors and preprocessor_config.json.
         device: `cpu` or `cuda`.
         half: compute in half precision, on a GPU only.
 

@@ -204,7 +204,7 @@ class ReferenceAlignment:
     offset: float
     """Time on the reference's clock at match frame 0 [s]."""
     motion: Similarity
-    """From the reference's world into the prediction's; scale 1."""
+    """Motion from the reference's world into the prediction's; its scale is 1."""
     residual: float
     """Root mean square distance of joints after the motion [m]."""
 

@@ -134,7 +134,7 @@ def _hota_parts(
 def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
 
-    NaN where no joint is in front of the camera. Boxes are not clipped to the image.
+    A box is NaN where no joint is in front of the camera. Boxes are not clipped to the image.
 
     Args:
         joints: (frames, persons, joints, 3) [m], world; NaN where missing.
@@ -153,7 +153,7 @@ def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float
 def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return intersection over union of all pairs (frames, true, predicted) [0..1].
 
-    NaN where a box is missing; 0 for boxes without area.
+    The value is NaN where a box is missing, and 0 for boxes without area.
 
     Args:
         predicted: (frames, predicted persons, 4) x0 y0 x1 y1 [px].

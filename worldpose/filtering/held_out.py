@@ -53,8 +53,8 @@ def measure_held_out(
         cameras: batch (cameras,).
         used: detections for triangulation; NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
-        settings: of triangulation.
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+        settings: settings of triangulation.
+        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
     """
     count = cameras.batch_shape[0]
     if count - max(1, count // FOLDS) < settings.min_views:

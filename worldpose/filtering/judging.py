@@ -31,9 +31,9 @@ class Spread:
     """Factors on the stated variance of keypoints about their bodies.
 
     Attributes:
-        joint: (17,)
+        joint: (17,) factor per joint.
         knots: (bins - 1,) confidences that separate the classes.
-        confidence: (bins,) by class.
+        confidence: (bins,) factor per class of confidence.
     """
 
     joint: Floats
@@ -88,7 +88,7 @@ class TriangulatedDetections:
     """Tracked detections in some frames, with the results of their triangulation.
 
     Attributes:
-        detections: (frames, cameras, detections) of tracked people.
+        detections: (frames, cameras, detections) detections of tracked people.
         offsets: (frames, cameras, persons, 2) [px], offset of a person's detection in an image from
             the person's position by all cameras.
         exchanged: (frames, cameras, persons, 3), body parts with a corrected left-right swap.
@@ -223,7 +223,7 @@ def body_residuals(
         views: the bodies in all images.
         suspects: detections in these images.
         judged: their judgement; rejected keypoints do not count.
-        spread: of keypoints around bodies.
+        spread: spread of keypoints around bodies.
         repeated: detections of a person with correlated errors, which count as one.
     """
     unshifted = replace(suspects, offsets=np.zeros_like(suspects.offsets))
@@ -248,7 +248,7 @@ def judge_detections(
     Args:
         views: the bodies in all images.
         suspects: detections in these images.
-        spread: of keypoints around bodies, learned in the same clip.
+        spread: spread of keypoints around bodies, learned in the same clip.
         settings: limits of agreement.
 
     Note:
@@ -353,8 +353,8 @@ class _BestBodies:
         camera: index of the camera.
         detection: index among the camera's detections.
         fits: index of the person.
-        similarity: of bones [1].
-        distance: (n, 17) in standard deviations.
+        similarity: similarity of bones [1].
+        distance: (n, 17) distances in standard deviations.
     """
 
     camera: Places

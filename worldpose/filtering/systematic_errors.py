@@ -62,7 +62,7 @@ class ViewBias:
         """Return the bias of keypoints (..., 17, 2) [px].
 
         Args:
-            azimuth: (...) of the camera seen from the body [rad]; NaN = unknown.
+            azimuth: (...) azimuth of the camera seen from the body [rad]; NaN = unknown.
             scale: (...) [px/m].
         """
         waves = _waves(azimuth) * np.asarray(scale)[..., None]
@@ -89,7 +89,7 @@ def learn_view_bias(residuals: Residuals, azimuth: Floats, scale: Floats) -> Vie
     """Return the bias by viewing direction, from linear least squares.
 
     Args:
-        residuals: of bodies.
+        residuals: residuals of bodies.
         azimuth: (n,) [rad], of each row.
         scale: (n,) [px/m].
     """
@@ -131,7 +131,7 @@ class SystematicErrors:
     """Systematic errors of a clip's detector and clocks.
 
     Attributes:
-        view_bias: by viewing direction.
+        view_bias: bias by viewing direction.
         late: (cameras,) clock offset of each camera relative to the cameras' mean [frame]; positive
             = the camera shows a later time.
     """
@@ -147,7 +147,7 @@ class SystematicErrors:
     def shift(self, motion: BodyMotion, views: BodyViews) -> Floats:
         """Return the systematic error of keypoints (frames, cameras, persons, 17, 2) [px].
 
-        NaN where a body, or its motion, is unknown.
+        The shift is NaN where a body, or its motion, is unknown.
         """
         sides = self.view_bias.shift(motion.azimuth, _scale(views))
         return np.asarray(sides + self.late[:, None, None, None] * motion.image_motion)
@@ -160,7 +160,7 @@ class SystematicErrors:
 
         Args:
             offsets: (frames, cameras, persons, 2) [px], as of `TriangulatedDetections`.
-            motion: of the bodies.
+            motion: motion of the bodies.
         """
         image_motion = np.nan_to_num(motion.image_motion.mean(axis=-2))
         along = (np.nan_to_num(offsets) * image_motion).sum(axis=(0, 2, 3))
@@ -173,7 +173,7 @@ class BodyMotion:
     """Azimuth and image motion of bodies in all images."""
 
     azimuth: Floats
-    """(frames, cameras, persons) of the camera, seen from the body [rad]."""
+    """(frames, cameras, persons) azimuth of the camera, seen from the body [rad]."""
     image_motion: Floats
     """(frames, cameras, persons, 17, 2) motion of joints per frame [px]."""
 
@@ -209,10 +209,10 @@ def learn_systematic_errors(
         cameras: batch (cameras,).
         joints: (frames, persons, 17, 3) [m], world, of the bodies, as the detector sees them.
         views: projections of the bodies in all images.
-        motion: of the bodies.
+        motion: motion of the bodies.
         suspects: detections in these frames.
         settings: limits of the consistency check.
-        fps: of these frames [1/s].
+        fps: frame rate of these frames [1/s].
     """
     systematic = SystematicErrors.none(cameras.batch_shape[0])
     repeated = max(1.0, 2.0 * LASTING * fps)
@@ -280,7 +280,7 @@ class ClockEquations:
             cameras: batch (cameras,).
             joints: (frames, persons, 17, 3) [m], world, of bodies.
             image_motion: (n, 17, 2) [px], of each row's joints per frame; NaN = unknown.
-            residuals: of these joints; `frame` indexes the first axis of `joints`.
+            residuals: residuals of these joints; `frame` indexes the first axis of `joints`.
         """
         persons, joint_count = joints.shape[1:3]
         count, width = cameras.batch_shape[0], 1 + STEP

@@ -23,7 +23,7 @@ class Residuals:
         camera: (n,)
         person: (n,)
         missed: (n, 17, 2) vector from the body to the keypoint [px]; NaN = does not count.
-        variance: (n, 17) of it per axis [px^2].
+        variance: (n, 17) variance of this vector per axis [px^2].
         repeated: rows of a person with correlated errors, which count as one.
     """
 

@@ -60,8 +60,8 @@ def read_archive(
         float64, int64 and str arrays by name; optional members that are absent are left out.
 
     Raises:
-        InputError: names file and member: absent, truncated, not npz, members missing or unknown,
-            another type or shape, too large.
+        InputError: the file is absent, truncated, too large or no npz, or has members that are
+            missing, unknown, or of another type or shape; the error names file and member.
     """
     if not path.is_file():
         raise wrong(str(path), "an npz file", "nothing", "Check the path.")
@@ -164,8 +164,8 @@ def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
         limit: maximum unpacked size of all arrays together [byte].
 
     Raises:
-        InputError: with file and member: no npz, truncated, Python objects, inconsistent sizes, or
-            too large.
+        InputError: the file is no npz, truncated or too large, or has Python objects or
+            inconsistent sizes; the error names file and member.
     """
     with open_npz(path) as file:
         infos = [info for info in file.infolist() if info.filename.endswith(".npy")]
@@ -213,7 +213,7 @@ def require_size(path: Path, infos: list[zipfile.ZipInfo], limit: int) -> None:
     """Raise InputError for arrays beyond `limit` bytes, and for excessive compression ratios.
 
     Raises:
-        InputError: with the file.
+        InputError: the arrays are too large, or compressed too much; the error names the file.
     """
     total = sum(info.file_size for info in infos)
     # The archive's directory may state more bytes than the file has.

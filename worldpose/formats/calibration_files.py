@@ -172,8 +172,9 @@ def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
     """Return the cameras of a TOML file by name, in file order.
 
     Raises:
-        InputError: with file and key: unreadable, a missing or misshapen entry, not finite, no
-            rotation, a fisheye camera, no camera, or two cameras of one name.
+        InputError: the file is unreadable or has a missing, misshapen or infinite entry, no
+            rotation, a fisheye camera, no camera, or two cameras of one name; the error names file
+            and key.
     """
     return index_by_name(
         path,
@@ -358,8 +359,9 @@ def read_calibration_qualisys(path: Path) -> dict[str, CameraCalibration]:
     """Return the active cameras of a Qualisys calibration by serial, in file order.
 
     Raises:
-        InputError: with file, camera and attribute: unreadable, missing, no finite number, no
-            rotation, no camera, or two cameras of one serial.
+        InputError: the file is unreadable, or has a missing attribute, no finite number, no
+            rotation, no camera, or two cameras of one serial; the error names file, camera and
+            attribute.
     """
     size = require_file(path)
     if size > SETTINGS_BYTES:

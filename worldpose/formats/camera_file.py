@@ -75,8 +75,9 @@ def read_camera(path: Path, image_size: tuple[int, int] = RELEASE_SIZE) -> Camer
         image_size: width and height [px].
 
     Raises:
-        InputError: names file and place: absent, members missing or unknown, wrong shapes, no rows,
-            a K with skew or without focal length, an R that is not a rotation.
+        InputError: the file is absent, has missing or unknown members, wrong shapes or no rows, a K
+            with skew or without focal length, or an R that is not a rotation; the error names file
+            and place.
     """
     arrays = read_archive(path, MEMBERS)
     k, rotation = arrays["K"], arrays["R"].copy()
@@ -151,7 +152,8 @@ def read_camera_rows(path: Path) -> CameraRows:
     """Read the rows of a camera file without validation; `read_camera` refuses invalid cameras.
 
     Raises:
-        InputError: names file and member: absent, members missing or unknown, wrong shapes.
+        InputError: the file is absent, or one of its members is missing, unknown or of the wrong
+            shape; the error names file and member.
     """
     arrays = read_archive(path, _ROW_MEMBERS)
     count, poses = len(arrays["K"]), len(arrays["R"])

@@ -118,7 +118,7 @@ def write_challenge_camera(path: Path, camera: Camera, edition: Edition) -> None
     Args:
         path: the file.
         camera: (frames,).
-        edition: 2025 repeats R and t as Rt.
+        edition: edition of the challenge; that of 2025 repeats R and t as Rt.
 
     Raises:
         InputError: the first frame has no camera.
@@ -188,7 +188,8 @@ def read_challenge(folder: Path, only: str | None = None) -> dict[str, Challenge
         only: the requested clip, if it is there; None = all. No other is loaded.
 
     Raises:
-        InputError: names file and place: absent, wrong types or shapes, kinds that disagree.
+        InputError: the file is absent, has wrong types or shapes, or kinds that disagree; the error
+            names file and place.
     """
     kinds: dict[str, dict[str, Floats]] = {}
     for kind in KINDS:

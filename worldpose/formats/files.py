@@ -224,7 +224,7 @@ class JsonItems:
 
         Args:
             path: the file.
-            key: of the list if the file is a mapping.
+            key: key of the list if the file is a mapping.
             limit: maximum size of the file [byte].
 
         Raises:

@@ -79,7 +79,7 @@ class _File:
         """Append an array (rows, ...); return the index of its accessor.
 
         Args:
-            array: of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
+            array: array of a type in `_KINDS`; 16-bit integers with a sign count as fractions.
             target: use of the data, for vertices and indices.
             bounds: state the extreme values.
         """
@@ -129,7 +129,7 @@ def write_gltf(
         model: body model of the poses.
         people: bodies over the same frames.
         fps: frames per second; frame 0 is at 0 s.
-        cameras: by name, single or one per frame, with NaN where unknown.
+        cameras: cameras by name, single or one per frame, with NaN where unknown.
         markings: lines on the pitch (points, 3) [m], world.
         notes: texts for the file's `extras`; `licence` is its copyright.
         surface: write the surface of bodies, not only their joints.

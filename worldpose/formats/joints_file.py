@@ -100,8 +100,8 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
 
     Each joint of each person is interpolated between its first and its last frame by monotone
     cubic pieces, which do not overshoot; nothing is extrapolated. `views` is 0 at an interpolated
-    joint, as at every joint that no camera contributes to, and its covariance is NaN: how far a
-    person goes astray in a gap is unknown. Frames that all people lack are added.
+    joint, as at every joint that no camera contributes to, and its covariance is NaN: the
+    error of an interpolated position is unknown. Frames that all people lack are added.
     """
     if not len(tracks.frames):
         return tracks
@@ -157,8 +157,8 @@ def read_joints(path: str | os.PathLike[str]) -> JointTracks:
     """Read the tracks of a joints file.
 
     Raises:
-        InputError: names file and place: absent, truncated, members missing or unknown, wrong
-            shapes, infinite values.
+        InputError: the file is absent or truncated, or has missing or unknown members, wrong shapes
+            or infinite values; the error names file and place.
     """
     arrays = read_archive(Path(path), MEMBERS)
     try:
@@ -211,8 +211,8 @@ def read_poses(path: Path) -> tuple[BodyParameters, str | None]:
         The poses, and the name of their body model if the file has it.
 
     Raises:
-        InputError: names file and member: absent, truncated, members missing or unknown, wrong
-            shapes.
+        InputError: the file is absent or truncated, or has missing or unknown members or wrong
+            shapes; the error names file and member.
     """
     errors: list[InputError] = []
     for renamed in ({}, PLURALS):

@@ -61,8 +61,9 @@ def read_coco_results(path: Path) -> KeypointDetections:
     The function reads in batches: the arrays bound the memory, not Python objects.
 
     Raises:
-        InputError: with file, result and joint: unreadable, another number of joints, NaN, a
-            confidence outside 0..1, no frame index, or too many people per frame.
+        InputError: the file is unreadable, or has another number of joints, NaN, a confidence
+            outside 0..1, no frame index, or too many people per frame; the error names file, result
+            and joint.
     """
     items = JsonItems(path, "annotations", JSON_BYTES)
     batches = [_read_batch(path, results, first) for first, results in _batches(path, items)] or [
@@ -314,8 +315,9 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
     The function checks every declared type, shape and size before it unpacks data.
 
     Raises:
-        InputError: with file and member: truncated or no npz, another type, shape or byte order,
-            too large, frames that do not rise, infinite values, or a keypoint without confidence.
+        InputError: the file is truncated, too large or no npz, has another type, shape or byte
+            order, frames that do not rise, infinite values, or a keypoint without confidence; the
+            error names file and member.
     """
     require_file(path)
     with open_npz(path) as file:
@@ -425,8 +427,8 @@ def read_observations(
             frames that the file lacks have no people.
 
     Raises:
-        InputError: with file and place: unreadable, invalid, or all people are outside the wanted
-            frames.
+        InputError: the file is unreadable or invalid, or all people are outside the wanted frames;
+            the error names file and place.
     """
     path = Path(path)
     people = read_keypoint_arrays(path) if path.suffix == ".npz" else read_coco_results(path)

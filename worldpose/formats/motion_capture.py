@@ -1,4 +1,4 @@
-"""Exports of joints and poses: TRC markers, BVH and OpenSim motion, COCO keypoints in a camera."""
+"""Exports: TRC markers, BVH and OpenSim motion, and COCO keypoints in the images of a camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry import Camera, Rigid
 
 PIXEL_DECIMALS: Final = 2
-"""Of all pixel values: a hundredth of a pixel is far below any detector's error."""
+"""Decimals of all pixel values: a hundredth of a pixel is far below any detector's error."""
 
 
 def coco_dataset(
@@ -117,9 +117,9 @@ def _labels(pixels: NDArray[np.float64], visible: NDArray[np.int64]) -> dict[str
 Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation of world points to the axes of OpenSim and of animation tools: x stays, y is up."""
 MILLIMETRES: Final = 1000.0
-"""In a metre: TRC files are in millimetres, and state it."""
+"""Millimetres in a metre: TRC files are in millimetres, and state it."""
 TRC_DECIMALS: Final = 3
-"""Of all coordinates: a micrometre."""
+"""Decimals of all coordinates: a micrometre."""
 
 
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
@@ -168,9 +168,9 @@ def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
 
 
 CENTIMETRES: Final = 100.0
-"""In a metre: animation tools interpret the numbers of a BVH file as centimetres."""
+"""Centimetres in a metre: animation tools interpret the numbers of a BVH file as centimetres."""
 BVH_DECIMALS: Final = 6
-"""Of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
+"""Decimals of all numbers: a hundredth of a micrometre, and angles that move a hand by as much."""
 _LOCKED: Final = 1e-7
 """Cosine of the middle angle below which the outer two have the same axis (gimbal lock) [1]."""
 
@@ -186,7 +186,7 @@ def write_motion(path: Path, model: BodyModel, poses: BodyParameters, fps: float
     Args:
         path: the file.
         model: body model of the parameters.
-        poses: (frames,) of one person, complete; the betas are those of the first frame.
+        poses: (frames,) poses of one person, complete; the betas are those of the first frame.
         fps: frames per second.
 
     Raises:
@@ -277,7 +277,7 @@ MIRROR: Final = np.diag([1.0, 1.0, -1.0])
 MID_HIP_M: Final = np.array([-0.056276, -0.07849, 0.0])
 """Middle of the hips from the pelvis's origin in the unscaled model [m], pelvis axes."""
 MOT_DECIMALS: Final = 5
-"""Of degrees, metres and seconds."""
+"""Decimals of degrees, metres and seconds."""
 OPENSIM_COORDINATES: Final = (
     *("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz"),
     *("hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r", "ankle_angle_r"),

@@ -46,8 +46,8 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
     a person's score is the mean confidence.
 
     Raises:
-        InputError: with file and key: no frames, two files of a frame, no JSON of OpenPose, or an
-            unknown or a changing number of keypoints.
+        InputError: there are no frames, two files for the same frame, no JSON of OpenPose, or an
+            unknown or a changing number of keypoints; the error names file and key.
     """
     files = _frame_files(folder)
     frames = sorted(files)

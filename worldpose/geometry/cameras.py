@@ -94,7 +94,7 @@ class Camera:
         """Return one batch of cameras, stacked along a new first dimension.
 
         Raises:
-            InputError: there are none, or their batch shapes differ.
+            InputError: there are no cameras, or their batch shapes differ.
         """
         if len({camera.batch_shape for camera in cameras}) != 1:
             raise InputError(
@@ -126,7 +126,7 @@ class Camera:
         Args:
             matrix: (..., 3, 3), `K` [px], without skew.
             distortion: (..., 5) k1 k2 p1 p2 k3.
-            rotation: (..., 3, 3) of `x_cam = rotation x_world + translation`.
+            rotation: (..., 3, 3) rotation of `x_cam = rotation x_world + translation`.
             translation: (..., 3) [m].
             image_size: (..., 2) width, height [px].
 

@@ -73,10 +73,10 @@ class Surface(NamedTuple):
     Attributes:
         faces: (triangles, 3), counter-clockwise seen from outside.
         backs: (triangles,) which of the two textures has their colours.
-        texels: (vertices, 2) column and row there.
+        texels: (vertices, 2) column and row in the texture.
         textures: (2, rows, columns, 3) RGB.
         opened: (vertices, 3) pixel [px] and depth [m] when the shutter opens.
-        closed: the same when it closes.
+        closed: (vertices, 3) pixel [px] and depth [m] when the shutter closes.
         light: (vertices,) brightness of each vertex, 1 = as in the texture.
     """
 
@@ -160,7 +160,7 @@ def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: I
     Args:
         pixels: (vertices, 2) [px]; triangles with a NaN are skipped.
         faces: (triangles, 3).
-        bit: to set, a power of 2.
+        bit: bit to set, a power of 2.
         mask: (height, width), written.
     """
     for f in range(len(faces)):
@@ -195,7 +195,7 @@ def resolve(
 
     Args:
         who: (height, width, 4) of `Samples`.
-        color: (height, width, 4, 3) of `Samples`.
+        color: (height, width, 4, 3) color of `Samples`.
         picture: (height, width, 3) RGB, changed in place.
         persons: (height, width), written where half of the samples show a person; objects from
             len(seen) on are no people.

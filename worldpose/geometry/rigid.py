@@ -209,7 +209,7 @@ def common_batch(where: str, *batches: tuple[int, ...]) -> tuple[int, ...]:
     """Return the shape that all batch shapes broadcast to.
 
     Raises:
-        InputError: they do not broadcast.
+        InputError: the shapes do not broadcast.
     """
     try:
         return functools.reduce(np.broadcast_shapes, batches)

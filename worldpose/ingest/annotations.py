@@ -64,8 +64,9 @@ def read_clicked_markings(
         pitch: the match's pitch; its template defines the names.
 
     Raises:
-        InputError: with file and entry: not JSON, an unknown key or name, no number, a repeated
-            name, a pixel outside the image, no clicks, or a match without a pitch.
+        InputError: the file is not JSON, or has an unknown key or name, no number, a repeated name,
+            a pixel outside the image, or no clicks, or the match has no pitch; the error names file
+            and entry.
     """
     template = _template(file, pitch)
     clicked = validate_record(ClickedMarkings, read_json(file), str(file))

@@ -42,9 +42,9 @@ class RepeatedClick:
     Attributes:
         owner: the static camera, or the clip.
         image: name of the image.
-        label: as in the file.
-        names: of the first click and of this one, in the match folder.
-        pixels: of both [px].
+        label: label as in the file.
+        names: names of the first click and of the repeated click, in the match folder.
+        pixels: pixels of both clicks [px].
     """
 
     owner: str

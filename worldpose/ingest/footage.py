@@ -71,7 +71,7 @@ def read_unit(
     """Return detections and given calibration of a static camera or a clip's broadcast camera.
 
     Args:
-        match: as read by `read_match`.
+        match: match as read by `read_match`.
         unit_id: id of a static camera, or of a clip that names a broadcast camera.
 
     Returns:
@@ -129,7 +129,7 @@ def read_footage(
         image_size: width, height from match.yaml [px].
         frames: the unit's frames in the match.
         clips: id, first match frame and number of frames of each clip.
-        index: of the video; None = read it.
+        index: index of the video; None = read it from the video.
 
     Raises:
         InputError: no video, another size or rate, or a clip of which it has no frame.

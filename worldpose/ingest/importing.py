@@ -240,8 +240,8 @@ def import_pose2sim(
         Content of match.yaml, and sentences about what was found and what was left out.
 
     Raises:
-        InputError: with file and key: something is absent, invalid or contradicts the rest; nothing
-            is written then.
+        InputError: something is absent, invalid or contradicts the rest; nothing is written then,
+            and the error names file and key.
     """
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)

@@ -131,7 +131,7 @@ def require_calibrated(match: MatchFolder) -> None:
     A match without static cameras needs clicked key frames, in one clip at least.
 
     Raises:
-        InputError: with the missing cameras and the required files.
+        InputError: the error names the missing cameras and the required files.
     """
     if not match.spec.static_cameras:
         _require_key_frames(match)

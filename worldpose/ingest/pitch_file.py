@@ -62,7 +62,7 @@ def _check_size(content: object, file: str) -> None:
     """Raise InputError for an implausible pitch size in metres, with a guess of its unit.
 
     Raises:
-        InputError: with the key, and the unit.
+        InputError: a number is out of bounds; the error names the key and the unit.
     """
     if not isinstance(content, dict) or content.get("any_size") is True:
         return
@@ -86,7 +86,8 @@ def _check_points(content: object, file: str) -> None:
     """Raise InputError for surveyed points far from their places in the Laws.
 
     Raises:
-        InputError: with the point of the largest distance.
+        InputError: points are too far from the Laws; the error names the point of the largest
+            distance.
     """
     if not isinstance(content, dict) or content.get("any_size") is True:
         return

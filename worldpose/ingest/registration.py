@@ -27,7 +27,7 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     folder's name nor an edited click, still, roster, estimate or calibration changes it.
 
     Args:
-        match: as read by `read_match`.
+        match: match as read by `read_match`.
         previous: the last registration of this folder, if any. A file with unchanged size and
             modification time keeps its digest. As in git, this is only a shortcut: it misses a
             change that preserves both; without `previous` the function reads all files.

@@ -59,8 +59,8 @@ def write_match(
         folder: absent, or an empty folder.
         spec: match.yaml.
         calibrations: static cameras by id.
-        observations: by id of a static camera or clip; `frame` is the camera's (or the broadcast
-            clip's) own frame number, as in the files, not the match frame.
+        observations: detections by id of a static camera or clip; `frame` is the camera's (or the
+            broadcast clip's) own frame number, as in the files, not the match frame.
         pitch: written to the file named by `spec.pitch`, else to pitch.json.
         annotations: clicked markings of the cameras; None = no clicks.
         stills: images (height, width, 3), RGB, by camera id; written to the file named by the

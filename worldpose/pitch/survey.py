@@ -44,7 +44,7 @@ class Survey:
 
     Attributes:
         where: the file, for messages.
-        names: of the pitch template's points, each once.
+        names: names of the pitch template's points, each once.
         places: (n, 3) [m]; z is up, NaN without a height.
     """
 
@@ -61,8 +61,8 @@ def read_survey(path: Path) -> Survey:
     tabs.
 
     Raises:
-        InputError: it names file and row: unreadable, a missing or unknown column, an unknown or
-            repeated name, or text that is no number.
+        InputError: the error names file and row: the file is unreadable, or has a missing or
+            unknown column, an unknown or repeated name, or text that is no number.
     """
     rows = _rows(path)
     if not rows:
@@ -209,7 +209,7 @@ def _require_spread(survey: Survey) -> None:
     """Reject fewer than four points, or points near one line.
 
     Raises:
-        InputError: it names the points.
+        InputError: the survey is rejected; the error names the points.
     """
     enough = len(survey.names) >= 4
     for places in (survey.places[:, :2], _nominal_places(survey)) if enough else ():
@@ -230,12 +230,12 @@ def _require_orientation(
     """Reject a survey whose mirror image fits far better than the survey.
 
     Args:
-        survey: for its names and messages.
+        survey: survey, which the messages name.
         places: (n, 2) [m], in a right-handed frame if the settings are correct.
         settings: stated handedness of the frame.
 
     Raises:
-        InputError: it names possible causes.
+        InputError: the survey is rejected; the error names possible causes.
     """
     nominal = _nominal_places(survey)
     target = nominal - nominal.mean(axis=0)
@@ -260,12 +260,12 @@ def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: Surve
     """Reject points that are far from the positions of their names.
 
     Args:
-        survey: for its names and messages.
-        offsets: (n, 2) of the aligned survey from the Laws [m].
+        survey: survey, which the messages name.
+        offsets: (n, 2) offsets of the aligned survey from the Laws [m].
         settings: largest plausible error of the markings.
 
     Raises:
-        InputError: it names the points.
+        InputError: the survey is rejected; the error names the points.
     """
     offset = np.linalg.norm(offsets, axis=-1)
     far = [
@@ -288,7 +288,7 @@ class SurveyFit:
 
     Attributes:
         pitch: length, width, crown and the surveyed points in the world frame.
-        names: of the points, as in the survey.
+        names: names of the points, as in the survey.
         offset_plan: (n,) distance in plan between survey and law [m].
         offset_height: (n,) height of the survey above the crowned surface [m]; NaN without height.
         scale: survey lengths over true ones, from markings of prescribed size [1].

@@ -38,8 +38,8 @@ def law_points(length: float, width: float) -> dict[str, Place]:
     """Return the named points as (x, y, height above the surface) [m], world.
 
     Args:
-        length: of the pitch [m].
-        width: of the pitch [m].
+        length: length of the pitch [m].
+        width: width of the pitch [m].
     """
     x_goal, y_touch = 0.5 * length, 0.5 * width
     points: dict[str, Place] = {"center_mark": (0.0, 0.0, 0.0)}

@@ -82,8 +82,8 @@ def paint_bodies(
         camera: the image's camera, single.
         bodies: (persons, vertices, 3) [m], world, finite.
         faces: (triangles, 3), counter-clockwise seen from outside.
-        colors: (persons, 3) in 0..1.
-        opacity: of the bodies; 1 is opaque. Below 1, each body has an opaque rim.
+        colors: (persons, 3) colors in 0..1.
+        opacity: opacity of the bodies; 1 is opaque. Below 1, each body has an opaque rim.
     """
     height, width = canvas.shape[:2]
     surfaces = bodies.astype(np.float32)

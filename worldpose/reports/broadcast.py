@@ -43,7 +43,7 @@ def plot_camera_course(
     Args:
         frame: (frames,) match frames.
         camera: a batch (frames,).
-        covariance: (frames, 7, 7) of a step, in the order of
+        covariance: (frames, 7, 7) covariance of a step, in the order of
             `data_contracts.broadcast_calibration.FRAME_STEP`.
         before: the same frames, independent and without smoothing; drawn below.
     """

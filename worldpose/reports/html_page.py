@@ -168,7 +168,7 @@ class Table:
     Attributes:
         heading: title of the table.
         columns: titles; the prefix ">" marks numeric columns.
-        rows: of text.
+        rows: rows of text.
     """
 
     heading: str
@@ -182,7 +182,7 @@ class Section:
 
     Attributes:
         heading: also in the navigation bar.
-        blocks: in this order.
+        blocks: blocks in this order.
         lead: introduction.
     """
 

@@ -185,11 +185,11 @@ class CameraSummary:
         camera_id: the camera.
         origin: `given`, or the evidence of its calibration.
         ground_error_median_m: expected ground error, median over the visible pitch [m].
-        ground_error_p95_m: the same, 95th percentile [m].
-        reprojection_rms_px: of the inlying clicks [px].
+        ground_error_p95_m: expected ground error, 95th percentile [m].
+        reprojection_rms_px: root mean square reprojection error of the inlying clicks [px].
         clicks_used: number of inlying clicks.
         clicks_wrong: names of outliers among the clicks.
-        weak: why a person should review it; empty without warnings.
+        weak: why a person should review the camera; empty without warnings.
     """
 
     camera_id: str

@@ -39,7 +39,7 @@ class Click:
     """A clicked point, as inlier or outlier of its camera.
 
     Attributes:
-        name: of the pitch template.
+        name: name of the pitch template.
         place: (2,) the click [px].
         inlier: whether the fit includes the click.
     """
@@ -156,7 +156,9 @@ NEAR: Final = 12.0
 
 
 def detect_paint(still: Image) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of pixels as bright as paint against both sides.
+    """Return the mask (height, width) of pixels that look like paint.
+
+    They are colourless, bright, brighter than both sides, and part of a long region.
 
     Args:
         still: (height, width, 3), RGB.

@@ -31,7 +31,7 @@ PIXELS_PER_M: Final = 10.0
 MARGIN_M: Final = 5.0
 """Ground around the pitch [m]."""
 RADIUS_PX: Final = 8
-"""Of a person's disc on the pitch from above [px]."""
+"""Radius of a person's disc on the pitch from above [px]."""
 
 
 def overlay_frames(

@@ -30,7 +30,7 @@ class Replay:
     """A match folder with corrections applied; its files are unchanged.
 
     Attributes:
-        folder: with the corrected clicks.
+        folder: match folder with the corrected clicks.
         applied: the applied corrections, in the order they were made.
         stale: the corrections that no longer apply, each with the reason.
     """
@@ -48,7 +48,7 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
 
     Args:
         folder: the folder as read.
-        corrections: in the order they were made.
+        corrections: corrections in the order of their creation.
     """
     pictures = _pictures(folder)
     template = None if folder.pitch is None else PitchTemplate.from_spec(folder.pitch)
@@ -93,8 +93,8 @@ def add_previous_value(folder: MatchFolder, edit: Edit) -> Edit:
     """Return the edit with the current value as `was`, unless it has one.
 
     Args:
-        folder: with the corrections so far.
-        edit: as entered.
+        folder: match folder with the corrections so far.
+        edit: edit as entered.
     """
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit
@@ -107,7 +107,7 @@ def current_value(
     """Return the current value of an edit's point or marking: None or empty without a click.
 
     Args:
-        folder: with the corrections so far.
+        folder: match folder with the corrections so far.
         edit: names the point or marking; its new value is ignored.
     """
     return _now(_pictures(folder), edit)

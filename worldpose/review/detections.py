@@ -29,7 +29,7 @@ class DetectionReplay:
     """Detections of one camera with corrections applied.
 
     Attributes:
-        observations: with corrections.
+        observations: detections with corrections.
         objections: per edit the reason why it does not apply; None if it does.
     """
 
@@ -46,7 +46,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
 
     Args:
         found: detected or given observations; not modified.
-        edits: of this camera, in the order they were made.
+        edits: edits of this camera, in the order they were made.
     """
     changed = KeypointDetections(
         frame=found.frame,
@@ -126,7 +126,7 @@ class Changes:
     """Changes of an annotator.
 
     Attributes:
-        edits: in the order of application.
+        edits: edits in the order of application.
         pictures: number of images in the annotator's file.
         boxes: number of changed boxes of existing people: corrections cannot express these.
     """
@@ -151,8 +151,8 @@ def find_changes(
 
     Args:
         exported: named by `image_name`, people with their `detection`.
-        edited: from the annotator; names can have a folder, or a prefix that ends in `-`, before
-            them.
+        edited: images from the annotator; names can have a folder, or a prefix that ends in `-`,
+            before them.
         where: the annotator's file, for messages.
 
     Raises:

@@ -57,8 +57,8 @@ def open_detections(
     Args:
         frame: (frames,) match frames, rising without gaps.
         score: (frames, detections) without corrections; NaN = no detection.
-        acceptances: of this result.
-        edits: of this camera; a corrected detection counts as reviewed.
+        acceptances: acceptances of this result.
+        edits: edits of this camera; a corrected detection counts as reviewed.
     """
     there = np.isfinite(score)
     waits = there.copy()
@@ -104,7 +104,7 @@ def clip_curves(
 
     Args:
         bodies: (frames, persons, 17, 3) keypoints of the fitted bodies [m], world; NaN = no body.
-        covariance: (frames, persons, 17, 3, 3) of these keypoints [m^2].
+        covariance: (frames, persons, 17, 3, 3) covariance of these keypoints [m^2].
         filled: (frames, persons) bodies from the motion model alone.
         placed: (frames, persons, 17, 3) triangulated joints [m] of the same people; NaN where
             missing.
@@ -178,7 +178,7 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     Args:
         source: one camera.
         target: another camera.
-        pixel: (2,) in the image of `source` [px].
+        pixel: (2,) pixel in the image of `source` [px].
 
     Returns:
         Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
@@ -364,7 +364,7 @@ def preview(
         image_size: width, height [px].
         picture: (height, width, 3); if given, the calibration refines the camera on the painted
             lines, which takes seconds and not milliseconds.
-        settings: as for the stage `static_calibration`.
+        settings: settings as for the stage `static_calibration`.
         lens: the given lens of a static camera, if there is one.
 
     Raises:

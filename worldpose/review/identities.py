@@ -76,7 +76,7 @@ class IdentityReplay:
     """Identities with corrections applied.
 
     Attributes:
-        identities: with corrections.
+        identities: identities with corrections.
         objections: per edit the reason why it does not apply; None if it does.
     """
 
@@ -171,7 +171,7 @@ def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> Ident
 
     Args:
         found: identities from the tracker.
-        edits: of this clip, in the order they were made.
+        edits: edits of this clip, in the order they were made.
     """
     objections = []
     for edit in edits:

@@ -262,7 +262,7 @@ def last_decision(
 
     Args:
         records: records of the journal, in order.
-        unit: as `stage/unit`.
+        unit: unit as `stage/unit`.
         content: digest of the result's files; its key may differ from that at the decision.
     """
     about: set[str] = set()

@@ -43,8 +43,8 @@ class Clicks:
 
     Attributes:
         markings: annotations/static_calibration/<camera>.json.
-        wrong: by the name of every wrong click, the name of the point under it or, for the same
-            name, of the intended point.
+        wrong: maps the name of every wrong click to the name of the point under the click or, for
+            the same name, of the intended point.
         clustered: all points come from one part of the image.
     """
 
@@ -94,7 +94,10 @@ def click(
 
 
 def every(share: float, index: int, start: float) -> bool:
-    """Return whether the item with this number is in an even share of all, spaced from `start`."""
+    """Return whether item `index` is chosen if a `share` of all items is chosen at equal distances.
+
+    `start` in [0, 1) shifts the choice.
+    """
     return bool(np.floor((index + 1) * share + start) > np.floor(index * share + start))
 
 
@@ -246,7 +249,7 @@ def click_key_frames(
         people: joints (frames, persons, 17, 3) [m], world, of possible occluders.
         settings: accuracy; lines and arcs are always drawn.
         count: number of key frames.
-        rng: of the clicks.
+        rng: random generator of the clicks.
     """
     frames = len(people)
     drawing = settings.model_copy(update={"enough": len(pitch.points) + 1})
@@ -285,7 +288,7 @@ def survey(painted: PitchSpec, error: float, rng: np.random.Generator) -> PitchS
 
     Args:
         painted: the true pitch.
-        error: of a point, standard deviation along each axis [m].
+        error: error of a point, standard deviation along each axis [m].
         rng: the surveyor's own.
     """
     points = {}

@@ -53,7 +53,8 @@ def person_capsules(joints: Floats, look: np.random.Generator) -> tuple[Floats, 
     other, the rest officials; the last of each team wears a goalkeeper's colours.
 
     Args:
-        joints: (persons, 17, 3) of COCO-17 [m], world; a limb with a missing joint is missing.
+        joints: (persons, 17, 3) joints of COCO-17 [m], world; a limb with a missing joint is
+            missing.
         look: draws skin and hair.
     """
     persons = len(joints)
@@ -115,7 +116,7 @@ def draw_shadows(
         limbs: (things, limbs, 8) [m], world.
         light: (4,) direction down from the light, (x, y, z) with z = -1, and the share of all
             light that it gives.
-        bend: (2,) of the surface, whose height is -bend[0] x^2 - bend[1] y^2.
+        bend: (2,) bend of the surface, whose height is -bend[0] x^2 - bend[1] y^2.
     """
     for thing in limbs:
         known = thing[np.isfinite(thing).all(-1)]
@@ -146,7 +147,7 @@ def draw_things(
         camera: a single camera.
         limbs: (limbs, 8) per thing [m], world.
         colors: (limbs, 3) per thing.
-        brightness: of the light on each thing.
+        brightness: brightness of the light on each thing.
     """
     middles = np.array([_middle(thing) for thing in limbs]).reshape(-1, 3)
     distance = np.linalg.norm(middles - camera.center, axis=-1)

@@ -49,7 +49,7 @@ class Prop:
     Attributes:
         faces: (triangles, 3), counter-clockwise seen from outside.
         backs: (triangles,) which of the two images has their colours.
-        texels: (vertices, 2) column and row there.
+        texels: (vertices, 2) column and row in the image.
         image: (2, rows, columns, 3) RGB.
         surfaces: its position, a batch of 1.
         shadow: whether it casts a shadow.
@@ -200,8 +200,8 @@ def dress_people(
     """Return a cast; a person's looks depend on the seed and the person's number alone.
 
     Args:
-        betas: (persons, 10) of the open body.
-        roles: of each.
+        betas: (persons, 10) betas of the open body.
+        roles: role of each person.
         seed: draws kits and looks.
         patterns: shirt patterns to draw from.
     """

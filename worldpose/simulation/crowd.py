@@ -33,7 +33,7 @@ PUSH: Final = 60.0
 FORESIGHT: Final = 0.6
 """Time ahead at which people see a collision [s]."""
 CLOSING: Final = 1.5
-"""At lower closing speed people lean in instead of passing [m/s]."""
+"""Closing speed below which people lean in instead of passing [m/s]."""
 DODGE: Final = 15.0
 """Lateral acceleration on an exact collision course [m/s^2]; a pass in contact needs none."""
 BRAKE: Final = 6.0

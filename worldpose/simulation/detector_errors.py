@@ -192,7 +192,7 @@ class Detections:
 
 
 def draw_systematic_errors(rng: np.random.Generator) -> SystematicErrors:
-    """Return a detector, drawn once per match for all cameras and people."""
+    """Return a detector's systematic errors, drawn once per match for all cameras and people."""
     joint_bias = rng.standard_normal((17, 3))
     for joint, mirror in enumerate(MIRRORED):
         if _SIDE[joint] < 0.0:
@@ -355,7 +355,7 @@ def report(
     """Return detections in shuffled order, and the body of each.
 
     Args:
-        detections: of all bodies, including false positives.
+        detections: detections of all bodies, including false positives.
         size: (frames, bodies) [px]; scales the margins of boxes.
         dropped: (frames,), frames without any detection.
         rng: shuffles every frame independently.
@@ -409,13 +409,15 @@ POSTURES: Final = 12.0
 def draw_false_positives(
     scenario: Scenario, pitch: PitchTemplate, frames: int, rng: np.random.Generator
 ) -> Bodies:
-    """Return still false people that appear and vanish at random places on and around the area.
+    """Return motionless false positives that appear and vanish at random places.
+
+    The places are on and around the area of the scenario.
 
     Args:
         scenario: area and the rates of false positives.
         pitch: the ground under them.
         frames: number of frames.
-        rng: this camera's own: false positives of cameras are independent.
+        rng: generator of this camera alone, so that false positives of cameras are independent.
     """
     noise, crowd = scenario.noise, scenario.crowd
     share = noise.false_people / MAX_FALSE_POSITIVES
@@ -442,7 +444,7 @@ def draw_false_positives(
 
 
 class MonocularErrors(Record):
-    """Errors of such methods; together 80 mm of mean joint distance after alignment (PA-MPJPE)."""
+    """Errors of monocular methods: a PA-MPJPE of 80 mm in total (mean distance after alignment)."""
 
     turn: float = Field(default=0.135, ge=0, le=100)
     """Error of every joint's rotation, standard deviation about each axis [rad]."""
@@ -477,11 +479,11 @@ def estimate_bodies(
     identify persons.
 
     Args:
-        model: the bodies'.
+        model: the bodies' model.
         bodies: (frames, persons), world; NaN where missing.
         camera: batch (frames,).
         fps: [1/s].
-        errors: of the method.
+        errors: errors of the method.
         rng: draws the same numbers for any people in the image.
     """
     frames, persons = bodies.batch_shape
@@ -538,7 +540,7 @@ def write_estimates(
         poses: (persons, frames), world.
         camera: batch (frames,).
         fps: [1/s].
-        seed: of the scene.
+        seed: seed of the scene.
     """
     given = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
     bodies = BodyParameters(*(np.swapaxes(values, 0, 1) for values in given))

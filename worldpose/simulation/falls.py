@@ -211,7 +211,7 @@ def dive(climb: float) -> Motion:
     """Return a goalkeeper's dive to the left off the right foot, side landing, and getting up.
 
     Args:
-        climb: of the mid-hip at take-off [m/s]: 1 for a low ball, 2.5 for a high one.
+        climb: climb of the mid-hip at take-off [m/s]: 1 for a low ball, 2.5 for a high one.
     """
     off, high, low = 0.52, 0.80, 0.2
     # For a leg of 0.87 m; with others the same flight ends centimetres higher or lower.

@@ -54,7 +54,7 @@ class Ball:
 
     Attributes:
         position: (samples, 2) [m], every `STEP`.
-        touches: in temporal order.
+        touches: touches in temporal order.
     """
 
     position: Floats
@@ -141,7 +141,7 @@ class Duels:
         mode: (samples, people), mode of movement.
         max_speed: (samples, people), speed limit before an action [m/s].
         push: (samples, people, 2), acceleration off a leg [m/s^2].
-        actions: of each person.
+        actions: actions of each person.
     """
 
     def __init__(

@@ -74,7 +74,7 @@ def act(
         action: the action to blend in.
         times: (frames,) [s], ascending.
         ground: height of the ground [m] at x and y [m].
-        pose: of the gait at these times; overwritten while the action lasts.
+        pose: pose of the gait at these times; overwritten while the action lasts.
     """
     first, behind = np.searchsorted(times, [action.begin, action.end])
     if first == behind:

@@ -191,8 +191,8 @@ def expose(
         venue: the stadium.
         camera: a single camera.
         sharp: (height, width, 3) the scene without them; changed in place.
-        blurred: the same through the lens; changed in place.
-        grain: of `sensor_grain`.
+        blurred: the same image through the lens; changed in place.
+        grain: grain of `sensor_grain`.
         moment: people and things in the scene.
         frame: seeds the noise of this image.
     """

@@ -109,8 +109,8 @@ def pose_people(mannequin: Mannequin, shaped: Singles, poses: BodyParameters) ->
 
     Args:
         mannequin: common model of the people.
-        shaped: (persons, vertices, 3) of `shape_people`.
-        poses: of the same people, a batch (persons,); NaN = missing.
+        shaped: (persons, vertices, 3) vertices of `shape_people`.
+        poses: poses of the same people, a batch (persons,); NaN = missing.
     """
     posed = mannequin.body.articulate(poses)
     motions = np.concatenate(
@@ -240,7 +240,7 @@ _CLOTH: Final = np.array(
 _BRIGHT: Final = np.array(
     [[0.80, 0.95, 0.15], [0.97, 0.42, 0.60], [0.15, 0.80, 0.45], [0.98, 0.60, 0.10]]
 )
-"""Of goalkeepers and officials."""
+"""Colors of the shirts of goalkeepers and officials."""
 _LIGHT, _DARK = np.array([0.90, 0.69, 0.56]), np.array([0.24, 0.14, 0.095])
 _HAIR: Final = np.array(
     [[0.05, 0.04, 0.035], [0.14, 0.09, 0.06], [0.28, 0.18, 0.10], [0.62, 0.48, 0.26]]
@@ -257,7 +257,7 @@ class Kit:
     shorts: Floats
     socks: Floats
     tops: Floats
-    """Of the socks."""
+    """Color of the upper ends of the socks."""
     sleeve: float
     """End of the sleeves in the T-pose, x of both arms [m]."""
     gloves: bool = False

@@ -65,7 +65,7 @@ class View:
         venue: the stadium.
         camera: a single camera.
         sharp: (height, width, 3) RGB, before the lens; without goals.
-        blurred: the same through the lens.
+        blurred: the same image through the lens.
         grain: noise of the sensor.
         props: the goals.
     """
@@ -86,7 +86,7 @@ def open_view(
     Args:
         camera: a single camera.
         pitch: the painted pitch.
-        seed: of the stadium's look and the sensor's noise.
+        seed: seed of the stadium's look and the sensor's noise.
         settings: the defaults if None.
     """
     venue = build_venue(pitch, seed, settings or RenderingSettings())
@@ -165,8 +165,8 @@ def film_scene(
     Args:
         scene: the scene to film.
         scenario: its look, and its frame rate.
-        seed: of the stadium, kits and noise.
-        folder: of the match.
+        seed: seed of the stadium, kits and noise.
+        folder: folder of the match.
         clip_id: names the broadcast camera's files.
         stills: write stills, too.
         masks: write masks, too.
@@ -339,7 +339,7 @@ def simulate_match(
 
     Args:
         scenario: the scenario to simulate.
-        seed: from 0.
+        seed: seed from 0.
         out: absent or an empty folder; the write is atomic.
         options: changes of the scenario, and which files to write; the defaults if None.
         advance: receives the filming's progress.
@@ -491,7 +491,7 @@ def write_references(
 
     Args:
         folder: reference/ of the match.
-        scenario: of the scene.
+        scenario: scenario of the scene.
         scene: the ground truth.
         detected: whether the match includes the scene's detections.
     """

@@ -76,12 +76,12 @@ class Motion:
     """A motion of a body whose acting side is the left one.
 
     Attributes:
-        name: of the motion.
+        name: name of the motion.
         duration: [s].
-        time: (keys,) of key poses [s].
+        time: (keys,) time of key poses [s].
         channels: (keys, channels), as `key` lays them out.
-        heights: of the mid-hip.
-        stances: of the acting foot and of the other one; before and after both walk.
+        heights: heights of the mid-hip.
+        stances: stances of the acting foot and of the other one; before and after both walk.
         ease: time of blending in and out [s].
         flight: when the body is in the air [s]; None = never.
         blow: time of the decisive contact: the kick, the head at the ball, the tackle [s].
@@ -108,7 +108,7 @@ class Action:
 
     Attributes:
         begin: [s].
-        motion: of the body.
+        motion: motion of the body.
         left: whether the left side acts.
         turn: direction of its aim, relative to the heading, to the left [rad].
     """
@@ -203,8 +203,8 @@ def jump(rise: float, *, hurdle: bool = False) -> Motion:
     """Return a header off both feet: crouch, take-off, flight, landing; the left foot leaves last.
 
     Args:
-        rise: of the mid-hip in flight [m]; footballers reach 0.35 to 0.45 with a countermovement
-            (docs/explanation/simulation.md).
+        rise: rise of the mid-hip in flight [m]; footballers reach 0.35 to 0.45 with a
+            countermovement (docs/explanation/simulation.md).
         hurdle: knees come up and the head stays down, as over a sliding player.
     """
     climb = float(np.sqrt(2.0 * GRAVITY * rise))

@@ -277,7 +277,7 @@ def keep_ready(path: GroundPath, goal: Floats, ball: Floats) -> GroundPath:
     """Return a goalkeeper's path, with readiness during rests while the ball is near.
 
     Args:
-        path: of the goalkeeper.
+        path: path of the goalkeeper.
         goal: (2,) [m].
         ball: (samples, 2) [m], at the path's times.
     """

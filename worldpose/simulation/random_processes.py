@@ -32,7 +32,7 @@ def bursts(
     """Return a stationary on-off process along the first axis: on for a given share of the frames.
 
     Args:
-        share: of frames that are on, below 1.
+        share: share of frames that are on, below 1.
         time: mean length of an interval that is on [s]; at least one frame.
         shape: (frames, ...).
         fps: [1/s].

@@ -32,7 +32,7 @@ class Capture:
     """A captured motion.
 
     Attributes:
-        names: of the joints; the end of a terminal joint's bone is called "<joint>_end".
+        names: names of the joints; the end of a terminal joint's bone is called "<joint>_end".
         parents: (joints,) index of each joint's parent, -1 for the root; parents come first.
         positions: (frames, joints, 3), in the file's axes and unit.
         frame_time: [s].
@@ -356,7 +356,7 @@ def clip_path(clip: Clip, like: GroundPath, body: Body) -> GroundPath:
     """Return the path of a person who plays a clip from time 0 on, and then stands.
 
     Args:
-        clip: as read.
+        clip: clip as read.
         like: place of the person at time 0, and times of the path.
         body: target of the clip's leg length.
     """
@@ -387,7 +387,7 @@ def play_clip(
 
     Args:
         body: measures.
-        clip: in its place.
+        clip: clip in its place.
         times: (frames,) [s].
         ground: height of the ground [m] at x and y [m].
         gait: (frames, 17, 3) joints of a person on the clip's path, used before and after it.

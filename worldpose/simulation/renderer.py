@@ -44,7 +44,7 @@ def render_pitch(
         camera: a single camera.
         pitch: the painted pitch; the surface follows its crown.
         people: (persons, 17, 3) joints of COCO-17 [m], world; None = no people.
-        seed: of the stadium's look, the same for all its cameras, and of the sensor's noise.
+        seed: seed of the stadium's look, the same for all its cameras, and of the sensor's noise.
         settings: the defaults if None.
 
     Raises:
@@ -115,7 +115,7 @@ class Panorama:
     Attributes:
         levels: (height, width, 3) RGB, each level half as fine as the one before.
         scale: pixels per radian of the first.
-        pan: of its left border, from the world's y axis towards x [rad].
+        pan: direction of its left border, from the world's y axis towards x [rad].
         rise: tangent of the elevation at its upper border.
         center: (3,) [m], world.
     """
@@ -190,7 +190,7 @@ def render_broadcast(
         cameras: a batch (frames,) with one center.
         pitch: the painted pitch.
         people: (frames, persons, 17, 3) joints of COCO-17 [m], world; None = no people.
-        seed: of the stadium's look and the sensor's noise.
+        seed: seed of the stadium's look and the sensor's noise.
         settings: the defaults if None; their light is ignored.
 
     Raises:

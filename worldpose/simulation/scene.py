@@ -242,10 +242,10 @@ class Scene:
         crowd: the people, at any time.
         poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
-        given: the same with the errors of calibration.toml.
+        given: the same cameras with the errors of calibration.toml.
         broadcast: the moving camera, a batch (frames,); None without.
-        observations: by id of a static camera, or of the clip for the broadcast camera.
-        identities: by the same ids.
+        observations: detections by id of a static camera, or of the clip for the broadcast camera.
+        identities: identities of the detections, by the same ids.
         clocks: offset of a static camera behind its stated clock, by id [frame].
         clicks: a person's clicks in the first frame of every static camera, by id.
         surveyed: the pitch of pitch.json; the scenario has the painted one.
@@ -315,7 +315,7 @@ def simulate_scene(
 
     Args:
         scenario: everything but the seed.
-        seed: from 0.
+        seed: seed from 0.
         clip_id: names the broadcast camera's detections.
         driven: paths of the people, instead of the scenario's movement.
         clip: motion capture for one of them.

@@ -22,7 +22,7 @@ PATTERNS: Final[tuple[Pattern, ...]] = (
     "sash",
     "chequers",
 )
-"""Of shirts; plain ones are the most common."""
+"""Patterns of shirts; plain shirts are the most common."""
 
 
 class RenderingSettings(Record):
@@ -96,7 +96,7 @@ class ObservationNoise(Record):
     person_missed: float = Field(default=0.03, ge=0, lt=1)
     """Share of frames in which a visible person is not found at all [1]."""
     person_missed_time_s: float = Field(default=0.2, gt=0, le=100)
-    """Mean length of such a gap [s]: misses come in bursts, because the image hardly changes."""
+    """Mean length of a gap [s]: misses come in bursts, because the image hardly changes."""
     hidden_std: float = Field(default=1.0, ge=0, le=100)
     """Additional error of a joint hidden behind a person, in units of its usual one [1]: the
     detector guesses from the rest of the body; 1 doubles the error."""
@@ -231,9 +231,9 @@ class RigSettings(Record):
     image_size_px: tuple[ImageLength, ImageLength] = (1920, 1080)
     """Width and height [px] (C8)."""
     distance_m: Range = (6.0, 30.0)
-    """Of the ring from the pitch border [m]: stands of a stadium."""
+    """Distance of the ring from the pitch border [m]: stands of a stadium."""
     height_m: Range = (10.0, 20.0)
-    """Of the ring above the pitch [m]: roofs and upper tiers."""
+    """Height of the ring above the pitch [m]: roofs and upper tiers."""
     person_height_px: float = Field(default=115.0, gt=0, le=100000)
     """Height of a person of 1.8 m in the area's middle in the ring's images [px]; sets the focal
     length."""
@@ -249,7 +249,7 @@ class BroadcastSettings(Record):
     """
 
     setback_m: Range = (67.0, 88.0)
-    """From the long axis of the pitch [m], at negative y."""
+    """Distance from the long axis of the pitch [m], at negative y."""
     height_m: Range = (12.0, 19.0)
     """Above the pitch [m]."""
     aside_m: float = Field(default=0.3, ge=0, le=100)
@@ -281,7 +281,7 @@ class CalibrationErrors(Record):
     """Along each axis of the world [m]; the rotation then keeps the image centre on the same point
     60 m away, as a fit to markings does."""
     focal: float = Field(default=0.0, ge=0, le=100)
-    """Of the focal length, relative [1]."""
+    """Relative error of the focal length [1]."""
     bad_cameras: int = Field(default=0, ge=0, le=100)
     """Number of cameras whose errors are `bad_factor` times as large [1]."""
     bad_factor: float = Field(default=10.0, ge=1, le=1000)
@@ -300,7 +300,7 @@ class ClickSettings(Record):
     """Share of cameras in which all points lie within `window` [1]: where one part of the image
     holds most of the markings, as behind a goal, people look no farther."""
     window: float = Field(default=0.34, gt=0, le=1)
-    """Of the image width [1]."""
+    """Width of the window, as a share of the image width [1]."""
     clustered_points: tuple[Count, Count] = (5, 7)
     """Minimum and maximum number of points per such camera [1]."""
     wrong: float = Field(default=0.2, ge=0, le=1)

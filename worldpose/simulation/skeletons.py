@@ -141,9 +141,9 @@ class Pose:
 
     Attributes:
         pelvis: (frames, 3) mid-hip [m].
-        hips_left: (frames, 3) from the mid-hip to the left hip.
-        trunk: (frames, 3) from mid-hip to mid-shoulder.
-        shoulders_left: (frames, 3) from mid-shoulder to the left shoulder.
+        hips_left: (frames, 3) vector from the mid-hip to the left hip.
+        trunk: (frames, 3) vector from mid-hip to mid-shoulder.
+        shoulders_left: (frames, 3) vector from mid-shoulder to the left shoulder.
         head: (frames, 3, 3), rows: forward, left, up of the head.
         arms: (frames, 2, 2, 3): left and right; upper arm and forearm.
         ankles: (frames, 2, 3) desired ankles [m]; a leg extends at most to its reach.

@@ -30,11 +30,13 @@ _HALF = 0.5 * LINE_WIDTH
 
 
 def paint_rows(pitch: PitchTemplate) -> Floats:
-    """Return the painted markings, a row (8,) each for `paint_cover`.
+    """Return the painted markings, one row (8,) per marking, for `paint_cover` [m, rad].
 
-    Kind, then for a line x y of its start, its direction, length, and both ends' heights above the
-    crown; for an arc center x y, radius, start angle, span, height; for a spot x y, radius, and
-    height last but one, as for an arc [m, rad].
+    The first number of a row is the kind; heights are above the crown. The rest of a row is
+
+    - for a line: x and y of its start, x and y of its direction, length, height of start and end;
+    - for an arc: x and y of its center, radius, start angle, span, height, 0;
+    - for a spot: x and y of its center, radius, 0, 0, height, 0.
     """
 
     def above(name: str) -> tuple[float, float, float]:
@@ -102,7 +104,7 @@ def paint_cover(paint: Floats, place: Floats) -> float:
     """Return the painted share of a pixel.
 
     Args:
-        paint: (n, 8) of `paint_rows`.
+        paint: (n, 8) rows of `paint_rows`.
         place: (8,) x y on the surface, their changes by a pixel to the right and one down, and by
             a metre of height.
     """
@@ -175,10 +177,10 @@ def grass(
     """Return brightness (1 on average) and yellowness of the grass.
 
     Args:
-        table: (64, 64) of numbers about 0 with spread 1.
-        place: as in `paint_cover`.
-        length: of the pitch [m].
-        width: of the pitch [m].
+        table: (64, 64) table of numbers about 0 with spread 1.
+        place: place as in `paint_cover`.
+        length: length of the pitch [m].
+        width: width of the pitch [m].
         stripes: brightness of a stripe against its neighbour [1].
     """
     x, y = place[0], place[1]
@@ -206,7 +208,7 @@ def wear(table: Floats, place: Floats) -> float:
 
 
 BOARD_SETBACK: Final = (5.0, 4.0)
-"""From the goal lines and from the touch lines [m]."""
+"""Distance of the boards from the goal lines and from the touch lines [m]."""
 BOARD_HEIGHT: Final = 0.95
 """[m]"""
 _PANEL = 7.0
@@ -302,7 +304,7 @@ def scenery(
         dy: direction along y.
         dz: direction upwards.
         half: (2,) half the distances between the boards along x and y [m].
-        bend: (2,) of the surface, see `surface_hit`.
+        bend: (2,) bend of the surface, see `surface_hit`.
         look: seed of the stadium's look.
     """
     nearest = surface_hit(o, dx, dy, dz, bend)

@@ -62,7 +62,7 @@ class SceneRows(NamedTuple):
     """What `paint_scene` needs to know of a stadium.
 
     Attributes:
-        paint: of `paint_rows`.
+        paint: rows of `paint_rows`.
         table: (64, 64) random numbers of the grass.
         scene: length and width of the pitch, two bends of its surface, contrast of stripes, paint.
         half: (2,) half the distances between the boards [m].
@@ -89,13 +89,13 @@ def paint_scene(
     """Write the colour of every pixel, and its place on the pitch; NaN beyond the boards.
 
     Args:
-        grid: of `plane_grid`.
+        grid: grid of `plane_grid`.
         o: (3,) the camera's center.
         r: (3, 3) world from camera.
         stadium: pitch, boards and look.
         color: (height, width, 3), written.
         ground: (height, width, 2), written.
-        distance: (height, width) from the camera [m], written; infinite in the sky.
+        distance: (height, width) distance from the camera [m], written; infinite in the sky.
     """
     paint, table, scene, half, look = stadium
     place = np.empty(8)
@@ -278,7 +278,7 @@ def paint_venue(
 
     Args:
         venue: the stadium.
-        grid: (rows, columns, 2) of `plane_grid`.
+        grid: (rows, columns, 2) grid of `plane_grid`.
         center: (3,) origin of the rays [m], world.
         world_from_cam: (3, 3).
         size: width and height of the image [px].
@@ -346,7 +346,7 @@ def draw_capsules(
         camera: a single camera.
         color: (height, width, 3) RGB, 1 = white; changed in place.
         things: (limbs, 8) each [m], world.
-        colors: (limbs, 3) of each.
+        colors: (limbs, 3) colors of each.
     """
     lit = []
     for thing in things:

@@ -430,8 +430,8 @@ def _start_on_pitch(
 
     Args:
         problem: clicks, noise and prior.
-        size: of the other pitch.
-        settings: with the prior of cameras.
+        size: size of the other pitch.
+        settings: settings with the prior of cameras.
 
     Returns:
         None if a point is not in the Laws, or the points determine no camera.

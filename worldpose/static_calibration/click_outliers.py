@@ -82,9 +82,9 @@ class InlierFit:
 
     Attributes:
         row: (22,) camera.
-        covariance: (12, 12) of a step, to second order.
-        tangent_covariance: (12, 12) of a step, to first order.
-        evidence_information: (12, 12) of the inliers, at the estimated noise.
+        covariance: (12, 12) covariance of a step, to second order.
+        tangent_covariance: (12, 12) covariance of a step, to first order.
+        evidence_information: (12, 12) information of the inliers, at the estimated noise.
         inliers: (n,) bool.
         markings: (m,) bool, inliers among the drawn markings.
         mahalanobis: (n,) distance of each click from its prediction by the other evidence.
@@ -363,8 +363,9 @@ def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray
 def held_out_error(problem: Problem, fit: InlierFit) -> float:
     """Return the root mean square leave-one-out error of clicks and markings [px].
 
-    The function leaves out one click, or all pixels of one marking, at a time; the fit with them
-    gives their residual without them (the block form of the PRESS statistic).
+    The function leaves out one click, or all pixels of one marking, at a time. The
+    residual of the left-out part follows from the complete fit, without a new fit (the block form
+    of the PRESS statistic).
     """
     evidence = problem.evidence
     rows = compute_residuals(problem, fit.row)

@@ -50,7 +50,7 @@ def add_curvature(problem: Problem, row: Floats, covariance: Floats, scale: floa
     Args:
         problem: evidence, noise and prior of the fit.
         row: (22,) the best camera.
-        covariance: (12, 12) to first order.
+        covariance: (12, 12) covariance to first order.
         scale: factor on the stated noise of the evidence.
     """
     free = np.ix_(problem.free, problem.free)
@@ -224,7 +224,7 @@ class ClicksAndBars:
         Args:
             camera: near the answer.
             surface: (2,) near the answer [m].
-            noise: (m,) to add to the residuals; None = none.
+            noise: (m,) noise to add to the residuals; None = none.
         """
         residuals, rows = self.residuals(camera, surface)
         free = free_on_pitch(self.problem)

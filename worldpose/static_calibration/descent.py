@@ -35,7 +35,7 @@ class Measurements(NamedTuple):
         free: (12,) parameters to solve for.
         click_noise: (n,) standard deviations, each axis [px].
         drawn_noise: (d,) standard deviations across the marking [px].
-        half_diagonal: of the image [px].
+        half_diagonal: half of the diagonal of the image [px].
         click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
         drawn_loss: Cauchy scale of drawn pixels [standard deviations].
     """
@@ -59,9 +59,9 @@ class Linearization(NamedTuple):
     """Normal equations linearized at one estimate, written by the kernels.
 
     Attributes:
-        information: (12, 12) of evidence and prior.
+        information: (12, 12) information of evidence and prior.
         observed: (12, 12) contribution of the evidence alone.
-        gradient: (12,) of the cost.
+        gradient: (12,) gradient of the cost.
     """
 
     information: Floats
@@ -75,7 +75,7 @@ class Solutions(NamedTuple):
     Attributes:
         rows: (b, 22) starts, replaced by the fitted cameras.
         cost: (b,).
-        information: (b, 12, 12) of evidence and prior.
+        information: (b, 12, 12) information of evidence and prior.
         observed: (b, 12, 12) contribution of the evidence alone.
     """
 

@@ -40,7 +40,7 @@ class Evidence:
         points_by_surface: (n, 2) derivatives of heights by the pitch's crown and end fall [m/m].
         markings: names of the drawn markings, each once.
         samples_world: (s, 3) [m], world, along the drawn markings one after another.
-        samples_by_surface: (s, 2) as `points_by_surface`.
+        samples_by_surface: (s, 2) the same as `points_by_surface` for samples.
         bounds: (m + 1,) first sample of each marking, and the end.
         drawn_image: (d, 2) [px].
         drawn_marking: (d,) indices into `markings`.
@@ -105,7 +105,7 @@ def gather_evidence(
         pitch: template that defines the names.
         clicked: points and drawn markings.
         image_size: width, height [px].
-        spacing: of the samples along markings [m].
+        spacing: spacing of the samples along markings [m].
         where: file or camera, for messages.
 
     Raises:

@@ -144,7 +144,7 @@ def propose_clicks(
         estimate: the current camera.
         pitch: the template.
         clicked: names that already have clicks.
-        noise: of a click [px].
+        noise: noise of a click [px].
         count: maximum number of names.
     """
     motion = _visible_motion(estimate, pitch)

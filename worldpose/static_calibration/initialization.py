@@ -95,7 +95,7 @@ def camera_from_homography(
         focal_range: minimum and maximum plausible focal length [px].
 
     Note:
-        C2, trap 10.
+        C2.
     """
     width, height = image_size
     middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])

@@ -63,8 +63,8 @@ class CrossSections(NamedTuple):
     Attributes:
         places: (n, 2) [px].
         normals: (n, 2) unit vectors across the line.
-        widths: (n,) of the bar [px].
-        curvatures: (n,) of the line, positive where it turns towards its normal [1/px].
+        widths: (n,) widths of the bar [px].
+        curvatures: (n,) curvatures of the line, positive where it turns towards its normal [1/px].
     """
 
     places: Floats

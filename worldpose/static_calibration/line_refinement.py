@@ -60,10 +60,11 @@ class MarkingFit:
     """Detection result of one marking.
 
     Attributes:
-        name: of the line or arc.
+        name: name of the line or arc.
         samples: count in the image.
         found: count of inliers among them.
-        rms: of the inliers, measured minus projected across the line [px]; NaN without inliers.
+        rms: root mean square residual of the inliers, measured minus projected across the line
+            [px]; NaN without inliers.
     """
 
     name: str
@@ -81,11 +82,13 @@ class LineRefinement:
         refined: whether refinement succeeded.
         reason: why it failed; empty on success.
         markings: markings in the image.
-        rms: of all inliers, measured minus projected across the line [px]; NaN without inliers.
-        correlation: of neighbouring residuals along a marking, mean over the samples [1].
+        rms: root mean square residual of all inliers, measured minus projected across the line
+            [px]; NaN without inliers.
+        correlation: correlation of neighbouring residuals along a marking, mean over the samples
+            [1].
         effective_samples: equivalent number of independent inliers [1].
         bars: bars of the fit; None if refinement failed.
-        noise: of paint and detection, learned from the residuals; None if refinement failed.
+        noise: noise of paint and detection, learned from the residuals; None if refinement failed.
         venue: what the camera tells about the pitch; None before the final fit.
     """
 
@@ -116,13 +119,13 @@ def refine_on_lines(
     projected uncertainty, which reduce the uncertainty of the others.
 
     Args:
-        start: from clicks; its covariance is the Gaussian prior, and parameters without variance
-            stay fixed.
+        start: camera from clicks; its covariance is the Gaussian prior, and parameters without
+            variance stay fixed.
         pitch: the template; its surface is where to linearize.
         picture: (height, width) or (height, width, 3) RGB.
         settings: the defaults if None.
-        survey_error: of the template's points from the painted ones, each axis, standard
-            deviation [m].
+        survey_error: survey error of the template's points from the painted ones, each axis,
+            standard deviation [m].
         begin: camera to begin the search at, if more accurate than the prior; the start if None.
 
     Raises:

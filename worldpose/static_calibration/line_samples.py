@@ -72,7 +72,7 @@ class LineSamples:
         """Return the samples at their places on a changed surface.
 
         Args:
-            change: (2,) of the crown and of the end fall [m].
+            change: (2,) change of the crown and of the end fall [m].
         """
         places = self.points_world.copy()
         places[:, 2] += self.by_surface @ change
@@ -100,8 +100,9 @@ class ProjectedLines:
     Attributes:
         places: (n, 2) [px].
         normals: (n, 2) unit vectors across the projected marking.
-        widths: (n,) of the paint across it [px].
-        curvatures: (n,) of the projected marking, positive where it turns to its normal [1/px].
+        widths: (n,) widths of the paint across it [px].
+        curvatures: (n,) curvatures of the projected marking, positive where it turns to its normal
+            [1/px].
         by_camera: (n, 14) derivatives of a place along its normal by a step of `PARAMETERS`, and by
             crown and end fall.
         by_paint: (n, 11) derivatives by the paint's unknowns, per standard deviation: both ends
@@ -203,9 +204,9 @@ def project_lines(
 
     Args:
         camera: a single camera.
-        samples: of `sample_markings`.
-        line_width: of the paint [m].
-        noise: of the paint.
+        samples: samples of `sample_markings`.
+        line_width: width of the paint [m].
+        noise: noise of the paint.
     """
     points = samples.points_world
     projected = camera.project_with_jacobians(points)
@@ -327,9 +328,9 @@ def clear(
 
     Args:
         camera: a single camera.
-        whites: of the template.
-        half_width: of paint and posts [m].
-        places: (n, 2) of samples [px].
+        whites: white structures of the template.
+        half_width: half of the width of paint and posts [m].
+        places: (n, 2) places of samples [px].
         room: (n,) minimum distance to other structures [px].
         marking: (n,) the samples' own labels.
     """

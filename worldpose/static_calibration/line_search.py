@@ -114,7 +114,7 @@ class LineStep:
         step: (f,).
         information: (f, f) inverse covariance of the step, marginalized over the paint's unknowns.
         residuals: (n,) after subtraction of the paint's unknowns [px].
-        weights: (n,) of the robust loss [1].
+        weights: (n,) weights of the robust loss [1].
         spent: degrees of freedom that the fit takes from the samples [1].
         paint: the paint's unknowns.
     """
@@ -149,7 +149,7 @@ def adjust(
         by_paint: (n, k) derivatives of the projection by unknowns of the paint.
         unknowns: (n, k) indices of these unknowns.
         prior: information (f, f) and mean (f,) of the step.
-        scales: of the loss [standard deviations], one per iteration.
+        scales: scales of the loss [standard deviations], one per iteration.
     """
     known = np.isfinite(offsets)
     weights = known.astype(np.float64)
@@ -322,7 +322,7 @@ class LineSearch:
 
         Args:
             begin: camera and surface to begin at.
-            samples: of the markings, on that surface.
+            samples: samples of the markings, on that surface.
         """
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         surface = begin.surface
@@ -476,7 +476,7 @@ class LineSearch:
         Args:
             seen: the samples.
             reach: (n,) half widths of the search [px].
-            marking: (n,) of the samples, for bars to a subpixel; None = to a pixel.
+            marking: (n,) marking of the samples, for bars to a subpixel; None = to a pixel.
         """
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
@@ -503,7 +503,7 @@ class LineSearch:
 
         Args:
             at: camera, surface, samples and bars.
-            scales: of the loss [standard deviations], one per iteration.
+            scales: scales of the loss [standard deviations], one per iteration.
             trust: weight of the start [1].
         """
         seen, measured = at.seen, at.measured

@@ -35,9 +35,10 @@ class PaintNoise:
     """Standard deviations of the paint from the template, and of its detection.
 
     Attributes:
-        points_m: of the points that define markings, each axis [m].
-        unevenness_m: of paint and ground at knots along a marking, across it and in height [m].
-        shift_px: of a whole marking in the image [px].
+        points_m: standard deviation of the points that define markings, each axis [m].
+        unevenness_m: standard deviation of paint and ground at knots along a marking, across it and
+            in height [m].
+        shift_px: standard deviation of the shift of a whole marking in the image [px].
         reading: factor on the standard deviation of a fitted bar [1].
     """
 
@@ -56,7 +57,7 @@ class PaintNoise:
         Args:
             least: the minimum, and the prior.
             paint: unknowns of a fit with this noise.
-            residuals: (n,) of this fit, in standard deviations of the present reading.
+            residuals: (n,) residuals of this fit, in standard deviations of the present reading.
         """
         mine = paint.numbers <= FIRST_KNOT
         squares = float(np.minimum(paint.values[mine] ** 2, _MAX_UNKNOWN**2).sum())
@@ -80,7 +81,7 @@ class PaintUnknowns:
 
     Attributes:
         numbers: (k,) rising, see `ProjectedLines`.
-        values: (k,) in standard deviations of their prior.
+        values: (k,) values in standard deviations of their prior.
         freedom: (k,) degrees of freedom that the samples determine of each, 0 to 1.
     """
 
@@ -93,7 +94,8 @@ def stated_noise(survey_error: float, shift: float) -> PaintNoise:
     """Return the noise of a surveyed pitch without unevenness: the minimum.
 
     Args:
-        survey_error: of the points that define markings, each axis, standard deviation [m].
-        shift: of a whole marking in the image, standard deviation [px].
+        survey_error: survey error of the points that define markings, each axis, standard deviation
+            [m].
+        shift: shift of a whole marking in the image, standard deviation [px].
     """
     return PaintNoise(max(survey_error, 1e-6), _MIN_UNEVENNESS_M, max(shift, 1e-6), 1.0)

@@ -22,8 +22,8 @@ class CameraEstimate:
 
     Attributes:
         camera: a single camera with square pixels.
-        covariance: (12, 12) of a step in the order of `PARAMETERS`; rows and columns of fixed
-            parameters are zero.
+        covariance: (12, 12) covariance of a step in the order of `PARAMETERS`; rows and columns of
+            fixed parameters are zero.
     """
 
     camera: Camera
@@ -37,8 +37,8 @@ class CameraOnPitch:
     Attributes:
         camera: a single camera with square pixels.
         surface: (2,) crown and end fall of the pitch [m].
-        covariance: (14, 14) of a step of the camera and of the surface; rows and columns of fixed
-            parameters are zero.
+        covariance: (14, 14) covariance of a step of the camera and of the surface; rows and columns
+            of fixed parameters are zero.
     """
 
     camera: Camera
@@ -68,7 +68,7 @@ def step_camera(camera: Camera, step: ArrayLike) -> Camera:
 
     Args:
         camera: cameras (...) with square pixels.
-        step: (..., 12) in the order of `PARAMETERS`.
+        step: (..., 12) step in the order of `PARAMETERS`.
     """
     step = np.asarray(step, dtype=np.float64)
     distortion = camera.distortion.copy()
@@ -86,7 +86,7 @@ def step_jacobian(step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the derivative (n, n) of a step by a further step after it.
 
     Args:
-        step: (n,) of a camera, or of a camera and the surface of the pitch.
+        step: (n,) step of a camera, or of a camera and the surface of the pitch.
     """
     chain = np.eye(len(step))
     x, y, z = step[3:6]

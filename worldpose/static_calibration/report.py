@@ -30,7 +30,7 @@ class PointResidual:
     """Residual of a clicked point.
 
     Attributes:
-        name: of the template.
+        name: name of the template.
         pixel: (2,) [px], the click.
         residual: (2,) [px], projected minus clicked; NaN where the camera cannot image the point.
         mahalanobis: Mahalanobis distance from the prediction by the other evidence [1]; infinite
@@ -52,9 +52,9 @@ class MarkingResidual:
     """Residual of a drawn marking.
 
     Attributes:
-        name: of the template.
+        name: name of the template.
         pixels: number of drawn pixels [1].
-        rms: of their distances to the projected marking [px].
+        rms: root mean square of their distances to the projected marking [px].
         worst: largest distance [px].
         inlier: whether the fit includes the marking.
     """

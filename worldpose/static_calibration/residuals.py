@@ -101,7 +101,7 @@ def nearest_on_markings(
         c: (22,) camera.
         reach: half the image diagonal [px].
         samples: (s, 3) [m], world.
-        bounds: (m + 1,) of the markings' samples.
+        bounds: (m + 1,); samples `bounds[k]` to `bounds[k + 1]` belong to marking k.
         pixels: (d, 2) [px].
         marking: (d,).
         place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.

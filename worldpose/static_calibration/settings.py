@@ -46,7 +46,7 @@ _AddedSpread = Annotated[float, Field(ge=0, le=10)]
 class CameraPrior(Record):
     """Gaussian prior of a stadium camera.
 
-    Every entry has a middle and a spread (one standard deviation); spreads of logarithms are
+    Every entry has a mean and a standard deviation; standard deviations of logarithms are
     factors. They are wide: they decide only directions that a view does not observe.
     """
 
@@ -54,33 +54,35 @@ class CameraPrior(Record):
     """Focal length in image widths [1]: WorldPose's static cameras have 1.1, its broadcast cameras
     1.25 to 3.7."""
     log_focal_std: float = Field(default=0.6, ge=1e-6, le=100)
-    """Of the focal length's logarithm [1]: a factor of 1.8 either way."""
+    """Standard deviation of the focal length's logarithm [1]: a factor of 1.8 either way."""
     principal_point_std: float = Field(default=0.004, ge=1e-6, le=1)
-    """About the image center, each axis, in widths [1]: 8 px of 1920, a lens and a sensor mounted
-    with ordinary care."""
+    """Standard deviation of the principal point about the image center, each axis, in widths [1]: 8
+    px of 1920, a lens and a sensor mounted with ordinary care."""
     k1: float = Field(default=0.0, ge=-10, le=10)
-    """As `k1_std`, its middle [1]: an unknown lens may bend either way."""
+    """Mean displacement of the image corner by k1, in the unit of `k1_std` [1]: an unknown lens may
+    bend either way."""
     k1_std: float = Field(default=0.025, ge=1e-6, le=10)
-    """Displacement of the image corner by k1, relative to its distance from the center [1]: 2.5 %
-    is a visibly bent touch line."""
+    """Standard deviation of the displacement of the image corner by k1, relative to the corner's
+    distance from the center [1]: 2.5 % is a visibly bent touch line."""
     k2_std: float = Field(default=0.0015, ge=1e-6, le=1)
-    """As `k1_std`, of k2 [1]: a pixel or two in the corner. A larger spread bends the image
-    beyond the clicks: on drawn broadcast lines 0.005 predicts worse than 0.0015."""
+    """The same for k2 [1]: a pixel or two in the corner. A larger spread bends the image beyond the
+    clicks: on drawn broadcast lines 0.005 predicts worse than 0.0015."""
     k3_std: float = Field(default=0.005, ge=1e-6, le=1)
-    """As `k1_std`, of k3 if it is free [1]."""
+    """The same for k3 if it is free [1]."""
     lens_std: tuple[_AddedSpread, _AddedSpread, _AddedSpread] = (0.1, 0.02, 0.01)
-    """Of the coefficients k1, k2, k3 [1], added in squares to the spread from the corner's
-    displacement: wide lenses bend their corners more (C5); zero adds nothing."""
+    """Standard deviations of the coefficients k1, k2, k3 [1], added in squares to the spread from
+    the corner's displacement: wide lenses bend their corners more (C5); zero adds nothing."""
     height_m: float = Field(default=18.0, ge=1e-6, le=10000)
-    """Above the pitch [m]: stands and roofs are 8 to 40 m up."""
+    """Height above the pitch [m]: stands and roofs are 8 to 40 m up."""
     log_height_std: float = Field(default=0.4, ge=1e-6, le=100)
-    """Of the height's logarithm [1]."""
+    """Standard deviation of the height's logarithm [1]."""
     distance_m: float = Field(default=75.0, ge=1e-6, le=10000)
-    """In plan from the centre spot [m]: the stands are 40 to 120 m away."""
+    """Distance in plan from the centre spot [m]: the stands are 40 to 120 m away."""
     log_distance_std: float = Field(default=0.35, ge=1e-6, le=100)
-    """Of the distance's logarithm [1]."""
+    """Standard deviation of the distance's logarithm [1]."""
     roll_std_rad: float = Field(default=0.03, ge=1e-6, le=10)
-    """Of the image horizon [rad]: 1.7 degrees, a level tripod or bracket."""
+    """Standard deviation of the roll of the image horizon [rad]: 1.7 degrees, a level tripod or
+    bracket."""
 
 
 class StaticCalibrationSettings(Record):
@@ -128,7 +130,8 @@ class StaticCalibrationSettings(Record):
     """Median expected ground error over the visible pitch above which a camera is weak [m]: a
     player's foot is then too inaccurate."""
     weak_p95_m: float = Field(default=0.6, ge=1e-6, le=100)
-    """As `weak_median_m`, for the 95th percentile over the visible pitch [m]: half a stride."""
+    """Limit as `weak_median_m`, for the 95th percentile over the visible pitch [m]: half a
+    stride."""
     map_step_m: float = Field(default=2.0, ge=1e-6, le=1000)
     """Grid spacing of the expected ground error's map [m]."""
     lines: bool = True

@@ -36,11 +36,11 @@ class VenueEvidence:
     """Evidence of one camera about the unknowns of a venue.
 
     Attributes:
-        number: (k,) of the unknowns, see `ProjectedLines`, then `SURFACE`.
+        number: (k,) numbers of the unknowns, see `ProjectedLines`, then `SURFACE`.
         prior_mean: (k,) [m].
         prior: (k, k) its information [1/m^2].
         mean: (k,) after this camera's evidence and the prior [m].
-        information: (k, k) of this camera's evidence alone [1/m^2].
+        information: (k, k) information of this camera's evidence alone [1/m^2].
         response: (12, k) step of the camera per change of the unknowns.
     """
 
@@ -62,7 +62,7 @@ class VenueEvidence:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[Any, ArrayLike]) -> VenueEvidence | None:
-        """Return the evidence of a stored camera; None of one that was not refined on lines."""
+        """Return the evidence of a stored camera; None if it was not refined on lines."""
         if f"venue_{ARRAYS[0]}" not in arrays:
             return None
         return cls(**{name: np.asarray(arrays[f"venue_{name}"]) for name in ARRAYS})
@@ -136,8 +136,8 @@ class Venue:
 
     Attributes:
         cameras: batch (cameras,).
-        covariance: (cameras, 12, 12) of a step of each; NaN for a given camera.
-        surface: of the pitch; None if no camera was refined on lines.
+        covariance: (cameras, 12, 12) covariance of a step of each; NaN for a given camera.
+        surface: surface of the pitch; None if no camera was refined on lines.
         disagreement: root mean square distance of the cameras' own surfaces from it [standard
             deviations], about 1 for agreeing cameras; NaN with fewer than two.
     """

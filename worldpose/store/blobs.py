@@ -324,7 +324,7 @@ def _link_new(temporary: Path, target: Path) -> bool:
 
     Raises:
         StoreError: the file system supports neither.
-        OSError: it failed for another reason.
+        OSError: the link failed for another reason.
     """
     try:
         os.link(temporary, target)

@@ -290,7 +290,7 @@ def write_group(
     Args:
         folder: an empty folder.
         layout: required form of the arrays.
-        arrays: by name; those in `layout.optional` can be absent.
+        arrays: arrays by name; those in `layout.optional` can be absent.
         coordinates: one-dimensional arrays by name.
         attributes: the attributes that `layout.attributes` requires.
 
@@ -331,7 +331,7 @@ def write_group(
         for part in array_parts(array, values.shape):
             stored[part] = normalize_nans(values[part])
         files += 1 + stored.nchunks
-    # Files that somebody removed meanwhile are found by their number.
+    # If another process has removed files meanwhile, their number reveals it.
     with suppress(FileNotFoundError), warnings.catch_warnings():
         # Zarr warns that other readers may ignore it, as the format allows.
         warnings.simplefilter("ignore", ZarrUserWarning)

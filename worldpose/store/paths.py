@@ -123,7 +123,7 @@ def checked_name(name: str) -> str:
     """Return `name` after checking that it is safe as a file name.
 
     Raises:
-        InputError: it is not.
+        InputError: the name is not safe.
     """
     try:
         return _NAME.validate_python(name)
@@ -144,8 +144,8 @@ def checked_path(path: str) -> str:
     """Return `path` if it stays inside the project on every file system and object store.
 
     Raises:
-        InputError: it is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line break
-            or a backslash.
+        InputError: the path is absolute or empty, or has `..`, `.`, an empty part, a NUL, a line
+            break or a backslash.
     """
     parts = path.split("/")
     if any(part in ("", ".", "..") for part in parts) or set(path) & set("\0\n\r\\"):

@@ -34,7 +34,7 @@ class Import(NamedTuple):
     """One imported module, or names imported from one.
 
     Attributes:
-        module: as written; empty in `from . import name`.
+        module: name as written; empty in `from . import name`.
         level: number of leading dots.
         names: what is imported from it; empty in `import module`.
     """
@@ -75,8 +75,8 @@ class SourceCache:
         """Return the properties of module `name` with this source.
 
         Raises:
-            SyntaxError: it is no Python.
-            ValueError: the same, because of a zero byte.
+            SyntaxError: the source is not valid Python.
+            ValueError: the source contains a zero byte.
         """
         identity = digest(source)
         kept = self._modules.get(name)
@@ -144,8 +144,8 @@ def parse_source(source: bytes) -> ParsedSource:
     """Return the properties of a source.
 
     Raises:
-        SyntaxError: it is no Python.
-        ValueError: the same, because of a zero byte.
+        SyntaxError: the source is not valid Python.
+        ValueError: the source contains a zero byte.
     """
     tree = _parse(source)
     nodes = _drop_text(tree)

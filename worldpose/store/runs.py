@@ -145,8 +145,8 @@ def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:
     """Read the record of a finished run by number or name; `latest` has the highest number.
 
     Raises:
-        InputError: there is none.
-        CorruptionError: it is damaged.
+        InputError: there is no such run.
+        CorruptionError: the record is damaged.
     """
     finished, reserved = list_runs(blobs, match_id)
     wanted = finished[-1] if run_id == LATEST and finished else run_id

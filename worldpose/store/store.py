@@ -154,7 +154,7 @@ class Store:
         """Return the manifest of a published result.
 
         Raises:
-            StoreError: it is not published.
+            StoreError: the result is not published.
             CorruptionError: its manifest is damaged, or belongs to another result.
         """
         result = ResultId(match_id, stage, unit, key)
@@ -283,8 +283,8 @@ class Store:
         """Return the record of a finished run by number or name; `latest` has the highest number.
 
         Raises:
-            InputError: there is none.
-            CorruptionError: it is damaged.
+            InputError: there is no such run.
+            CorruptionError: the record is damaged.
         """
         return read_record(self.blobs, match_id, run_id)
 

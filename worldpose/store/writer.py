@@ -52,7 +52,7 @@ class ResultWriter:
         """Write the result's arrays, once; see `worldpose.store.groups.write_group`.
 
         Raises:
-            InternalError: they do not match the layout.
+            InternalError: the arrays do not match the layout.
             StoreError: the disk is full or not writable, or the result was written already.
         """
         # Imported here: status and resumed runs need only manifests, and Zarr takes most of a

@@ -214,10 +214,10 @@ def diagnose_no_people(
 
     Args:
         cameras: batch (cameras,).
-        camera_ids: of these.
+        camera_ids: ids of these.
         detections: (frames, cameras, detections); a confidence of 0, less or NaN where not found.
         fps: frames per second [1/s].
-        settings: of the tracking run.
+        settings: settings of the tracking run.
         ground: whether people stand on z = 0.
         births: tracks that began and were dropped again.
     """
@@ -326,8 +326,8 @@ def _explain_missing_detections(
     Args:
         present: (frames, cameras), whether the camera has a usable detection.
         detected: usable detections by camera.
-        detections: as given.
-        settings: of tracking.
+        detections: detections as given.
+        settings: settings of tracking.
     """
     seeing = [name for name, count in detected.items() if count > 0]
     counts = ", ".join(f"{name} {count:.0f}" for name, count in detected.items())
@@ -398,9 +398,9 @@ def _explain_limit(
 
     Args:
         cameras: batch (cameras,).
-        names: of these.
+        names: names of these.
         agreeing: pairs with matches, the best first.
-        settings: of tracking.
+        settings: settings of tracking.
         ground: whether people stand on z = 0.
         births: tracks that began and were dropped again.
     """

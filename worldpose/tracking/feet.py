@@ -102,7 +102,7 @@ def locate_feet(
         cameras: batch (cameras,).
         detections: (frames, cameras, detections); without a box, the ankles alone tell the place.
         pitch: surface under the feet.
-        camera_covariance: (cameras, 12, 12) of the calibration; None = exact.
+        camera_covariance: (cameras, 12, 12) covariance of the calibration; None = exact.
     """
     keypoints, confidence, boxes = detections.keypoints, detections.confidence, detections.boxes
     shape = detections.score.shape

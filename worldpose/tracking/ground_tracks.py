@@ -194,7 +194,8 @@ def track_on_plane(
     Args:
         positions: the clip's foot positions; with `triangulated`, NaN where a detection is theirs.
         fps: frames per second [1/s].
-        clock_s: by camera, time of its image minus time of the frame [s]; None = in step.
+        clock_s: time of each camera's image minus time of the frame [s]; None = all cameras are
+            synchronous.
         pitch_size: length and width of the pitch [m].
         margin_m: people always farther outside than this are bystanders [m].
         triangulated: people who are triangulated in some frames; None = none.
@@ -355,7 +356,8 @@ def _update(
 ) -> None:
     """Match the detections of one camera with people; the others start people.
 
-    Parts of people come last, and start none: most are second boxes of a person.
+    Detections of parts of people come last and start no track: most are a second box of the same
+    person.
     """
     seen = np.isfinite(positions.xy[frame, camera, :, 0])
     whole = seen if positions.is_whole is None else seen & positions.is_whole[frame, camera]

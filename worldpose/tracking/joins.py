@@ -34,12 +34,12 @@ class End:
     """Start or end of a track.
 
     Attributes:
-        number: of the track.
+        number: number of the track.
         frame: first or last frame.
         place: (2,) [m], on the ground.
         velocity: (2,) [m/s]; NaN where unknown.
         limbs: (11,) lengths [m], over the whole track; NaN where unknown.
-        limb_variance: (11,) of those lengths [m^2].
+        limb_variance: (11,) variance of those lengths [m^2].
     """
 
     number: int
@@ -57,8 +57,8 @@ class Candidate:
     Attributes:
         before: number of the track that ends.
         after: number of the track that begins.
-        last_frame: of the first.
-        first_frame: of the second.
+        last_frame: last frame of the earlier track.
+        first_frame: first frame of the later track.
         cost: minus the logarithm of the odds that they are one person rather than two strangers.
         margin: additional cost of the best alternative without this join [nat].
         decided: whether they were joined.
@@ -83,7 +83,7 @@ def fit_track_ends(
     """Return the start and the end of a track.
 
     Args:
-        number: of the track.
+        number: number of the track.
         frames: (n,) frames whose rays determined the position.
         joints: (n, 17, 3) [m], world; NaN where not determined.
         fps: frames per second [1/s].
@@ -299,7 +299,7 @@ def lasting_takeovers(
     """Return takeovers after which a real person was never located again, by final numbers.
 
     Args:
-        takeovers: by numbers of tracks.
+        takeovers: takeovers, by numbers of tracks.
         lasting: tracks with enough evidence.
         chains: each final person's tracks.
     """
@@ -327,8 +327,8 @@ def describe_doubts(
     Args:
         frames: (frames,) numbers of the clip's frames.
         people: number of people.
-        takeovers: by indices of frames in the clip.
-        joins: of the clip, decided or not.
+        takeovers: takeovers, by indices of frames in the clip.
+        joins: joins of the clip, decided or not.
     """
     parts = []
     if takeovers:

@@ -51,7 +51,7 @@ class CameraVisibility:
         centers: (cameras, 3) [m], world.
         reach: (cameras,) greatest distance of a person that the camera showed [m].
         shown: (cameras,) number of people that the camera should have shown [1].
-        missed: (cameras,) of these, people without a detection [1].
+        missed: (cameras,) number of these people without a detection [1].
     """
 
     def __init__(self, cameras: Camera) -> None:
@@ -322,7 +322,7 @@ def group_pairs(pairs: Pairs, weights: Floats, settings: TrackingSettings) -> li
     """Return the pairs that are likelier than their rivals, the likeliest first.
 
     Args:
-        pairs: of one frame.
+        pairs: pairs of one frame.
         weights: (cameras, detections, 17); 0 for matched detections.
         settings: least number of joints.
 

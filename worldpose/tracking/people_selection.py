@@ -4,9 +4,9 @@ A track ends after a moment unseen, so one person usually has several. A fragmen
 look like a bystander, while fetching the ball, or like a shadow, if few cameras see the player in a
 duel; the player's other tracks show neither.
 
-Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot to
-a metre, and given 2D poses may show any person. Several cameras locate a track to centimetres, and
-so distinguish people waiting behind the lines from players.
+Bystanders are never on the pitch or near it (D2, in 3D). A single camera locates a distant foot
+with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
+track to centimetres, and so distinguish people waiting behind the lines from players.
 
 A shadow is a false track that follows a person in a few of the cameras that see the person. If a
 detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
@@ -42,13 +42,13 @@ def join_people(
     accepted one, the chain as a whole is no shadow, and no join of accepted tracks breaks for it.
 
     Args:
-        tracks: of the whole clip, without ghosts.
+        tracks: tracks of the whole clip, without ghosts.
         tracker: that made them.
         pitch_size: length and width of the pitch around the origin [m]; None = there are no
             bystanders.
 
     Returns:
-        joins: of the tracks that stay.
+        joins: joins of the tracks that stay.
         chains: each person's tracks in time order.
     """
     settings = tracker.settings
@@ -76,10 +76,10 @@ def _select_whole(
     """Return the accepted tracks, and the others of the chains that pass as a whole.
 
     Args:
-        chains: of all tracks.
+        chains: chains of all tracks.
         sure: accepted tracks, which always stay.
         pairs: numbers of accepted tracks that are joined in the absence of others.
-        distance: of shadows [m].
+        distance: distance of shadows [m].
     """
     place = {track.number: n for n, chain in enumerate(chains) for track in chain}
     ends = [(place.get(before), place.get(after)) for before, after in pairs]

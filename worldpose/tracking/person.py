@@ -100,10 +100,11 @@ class Person:
         pose: (17, 3) [m], world, at the current frame; NaN for joints never determined.
         last_fixed: last frame whose rays determined the position.
         velocity: (3,) [m/s], of the whole body.
-        sightings: by frame.
+        sightings: detections of the person, by frame.
         misfit: recent mean ray distance [m]: large where a body falls or jumps.
         fixed: number of frames whose rays determined the position.
-        evidence: the same, with frames of fewer views than a birth needs counted in part [1].
+        evidence: the same number, in which a frame with fewer views than a birth needs counts in
+            part [1].
         shown_from: first frame with the evidence of a birth; -1 = none so far.
     """
 

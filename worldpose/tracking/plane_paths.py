@@ -44,7 +44,7 @@ class PlanePath:
 
     Attributes:
         first: first frame.
-        state: (frames, 4) of the track, place and velocity [m, m/s].
+        state: (frames, 4) state of the track, place and velocity [m, m/s].
         covariance: (frames, 4, 4).
         index: frame to camera to detection.
         person: triangulated person; -1 = none.

@@ -20,8 +20,9 @@ class TrackingSettings(Record):
     the shoulder width of two people side by side, and a sprinter's way in two frames of 50 Hz."""
     min_gate_m: float = Field(default=0.25, ge=1e-6, le=100)
     """Smallest such gate [m]: half the distance of two people who stand side by side. If a camera
-    misses a person, a constant `gate_m` lets the track take the neighbour's detection: in 30
-    simulated rooms with three cameras 33 such swaps within a track, 7 with this setting."""
+    misses a person, a constant `gate_m` lets the track take the neighbour's detection. In 30
+    simulated rooms with three cameras there were 33 such swaps within a track, and 7 with this
+    setting."""
     gate_factor: float = Field(default=4.0, ge=1e-6, le=1000)
     """A camera's gate is this times the median distance of its matched detections [1], from
     `min_gate_m` to `gate_m`: badly calibrated cameras need more."""
@@ -90,17 +91,18 @@ class TrackingSettings(Record):
     rms_speed_m_s: float = Field(default=2.0, ge=1e-6, le=1000)
     """Root mean square speed of people on the pitch, per axis [m/s]."""
     paces: tuple[tuple[Share, Positive], ...] = ((0.5, 1.0), (0.5, 0.3))
-    """Shares of time, and the factors on agility and speed in each [1]: at play, and standing or
-    walking, which is half of a match. With the first alone, people occluded for up to 8 s switch
-    identity 98 times instead of 90, and 43 joins instead of 35 are undecided."""
+    """Two modes of motion: their shares of time, and their factors on agility and speed [1]. People
+    play in the first mode, and stand or walk in the second, which is half of a match. With the
+    first alone, people occluded for up to 8 s switch identity 98 times instead of 90, and 43 joins
+    instead of 35 are undecided."""
     limb_noise_m: float = Field(default=0.02, ge=1e-6, le=10)
     """Standard deviation of a limb's length between two long tracks of one person [m]. Half or
-    twice of it changes one join of some 200, and so does ignoring limbs."""
+    twice this value changes one join of some 200; ignoring limbs also changes one."""
     limb_std_m: float = Field(default=0.025, ge=1e-6, le=10)
     """Standard deviation of a limb's length among people [m]: 6 % of 0.42 m."""
     newcomer_odds: float = Field(default=0.01, ge=1e-6, le=1)
     """Prior odds that a person who appears on a pitch is new to the clip and not a lost one [1].
-    Half or twice of it changes nothing, nor do other values if the roster is full."""
+    Half or twice this value changes nothing; if the roster is full, no other value does either."""
     visitor_odds: float = Field(default=0.1, ge=1e-6, le=1)
     """The same without a pitch, where people come and go [1]. At 0.01, a track that fits badly is
     joined where no other fits: in 26 subsets of Shelf's cameras 6 tracks show two people, 4 at

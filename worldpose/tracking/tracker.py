@@ -35,9 +35,10 @@ class TrackingReport(Record):
     births: int
     """Tracks begun [1]."""
     dropped: int
-    """Of these, dropped: too short, shadows, bystanders, or beyond the roster's limit [1]."""
+    """Tracks that were dropped: too short, shadows, bystanders, or beyond the roster's limit
+    [1]."""
     merged: int
-    """Of these, ended as duplicates of another track [1]."""
+    """Tracks that ended as duplicates of another track [1]."""
     joined: int
     """Tracks that continue an earlier person's [1]."""
     undecided: int

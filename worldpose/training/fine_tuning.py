@@ -87,7 +87,7 @@ class Training(Generic[Net, Batch]):
     Attributes:
         net: changed in place.
         batch: draws a batch.
-        loss: of the net on a batch.
+        loss: loss of the net on a batch.
         score: metric of the net on held-out frames; higher is better.
         settings: rate, steps and seed.
     """
@@ -374,7 +374,7 @@ def fine_tune(
 
     Args:
         kind: which net.
-        pictures: with reviewed labels, in the order of recording.
+        pictures: images with reviewed labels, in the order of recording.
         weights: the file to write; with the checkpoint next to it a killed training resumes.
         settings: the defaults if None.
         start: initial weights; the shipped ones if None.

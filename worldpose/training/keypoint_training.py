@@ -87,9 +87,10 @@ class KeypointBatch:
         keypoints: (crops, 17, 2) [px of the crop]; NaN where not labelled.
         visible: (crops, 17): 2 visible, 1 occluded, 0 not labelled.
         tolerance: (crops,) error up to which a keypoint is correct [px of the crop].
-        boxes: (crops, 4) of the person [px of the crop]; NaN in a rotated crop and off people.
-        people: (crops, most_people, 4) of all people [px of the crop]; NaN in a rotated crop and
-            after the last person.
+        boxes: (crops, 4) boxes of the person [px of the crop]; NaN in a rotated crop and off
+            people.
+        people: (crops, most_people, 4) boxes of all people [px of the crop]; NaN in a rotated crop
+            and after the last person.
         ignored: (crops, most_people)
     """
 

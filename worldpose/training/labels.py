@@ -53,7 +53,7 @@ class LabelledPicture:
     """One image and the people in it.
 
     Attributes:
-        path: of the image.
+        path: path of the image.
         boxes: (people, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel.
         keypoints: (people, 17, 2) COCO-17 [px]; NaN where not labelled.
         visible: (people, 17) int8: 2 visible, 1 occluded or outside of the image, 0 not labelled.

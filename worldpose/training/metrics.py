@@ -33,8 +33,9 @@ class KeypointMetrics:
     Attributes:
         people: number of people.
         pck: share of visible keypoints within a fifth of the torso [1].
-        hidden_pck: the same of occluded ones within the image [1]; NaN without.
-        median_error: of visible keypoints, as a share of the longer side of the box [1].
+        hidden_pck: the same share of occluded keypoints within the image [1]; NaN without any.
+        median_error: median error of visible keypoints, as a share of the longer side of the box
+            [1].
         calibration: mean gap between confidence and share of correct keypoints [1].
     """
 
@@ -93,7 +94,7 @@ def score_keypoints(
     cache: PictureCache,
     heights: tuple[float, float] = (0.0, np.inf),
 ) -> KeypointMetrics:
-    """Return metrics of the people of some heights [px], each in the true box."""
+    """Return keypoint metrics of people in their true boxes, within a range of heights [px]."""
     correct, visible, error, confidence, right = [], [], [], [], []
     for picture in pictures:
         tall = picture.boxes[:, 3] - picture.boxes[:, 1]
@@ -134,10 +135,10 @@ def average_precision(
 ) -> float:
     """Return the area under the curve of precision over recall [1]; NaN without wanted people.
 
-    As in COCO: the best boxes choose first, each the person it overlaps most. People who are
-    ignored or of other heights, and boxes on them, count neither as true nor as false positives;
-    nor do boxes of other heights that match no person. Precision is made to fall with recall, and
-    integrated at every step of recall instead of at COCO's 101 points.
+    As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
+    Ignored people, people of other heights, and boxes on them count neither as true nor as false
+    positives. The same applies to boxes of other heights that match no person. Precision is made to
+    fall with recall, and integrated at every step of recall instead of at COCO's 101 points.
 
     Args:
         found: detections in each image.
@@ -198,7 +199,7 @@ def correct_keypoints(found: AnyFloats, true: Floats, share: float = TORSO_SHARE
     Args:
         found: (people, 17, 2) [px]; a missing one is not correct.
         true: (people, 17, 2) [px]; NaN where unknown.
-        share: of the torso [1].
+        share: share of the torso [1].
     """
     error = np.linalg.norm(found - true, axis=-1)
     torso = torso_sizes(true)

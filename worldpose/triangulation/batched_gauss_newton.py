@@ -255,10 +255,10 @@ def largest(state: Floats, row: int) -> float:
 
 @compile_kernel
 def measure(tiles: Floats, depths: Floats, centers: Floats, state: Floats, rays: Floats) -> None:
-    """Write the sum of squared pixel errors of the used views, their number and spread.
+    """Measure the used views of each point, and write three sums to the state.
 
-    The results go to the first three rows of sums, `MATRIX` and the two after it; the spread is the
-    largest squared sine of an angle between two rays.
+    The rows of the state from `MATRIX` on receive the sum of squared pixel errors, the number of
+    used views, and their spread: the largest squared sine of an angle between two rays.
     """
     sums, views, widest = MATRIX, MATRIX + LANES, MATRIX + 2 * LANES
     state[sums : sums + 2 * LANES] = 0.0

@@ -67,8 +67,8 @@ class Chunk:
 
     Attributes:
         frames: its frames in the clip.
-        triangulation: each frame on its own.
-        smoothing: as part of whole tracks.
+        triangulation: joints of each frame on its own.
+        smoothing: joints as parts of whole tracks.
     """
 
     frames: slice
@@ -87,10 +87,10 @@ def learn_clip(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip.
+        detections: detections of the clip.
         fps: frames per second [1/s].
-        settings: of the stage.
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+        settings: settings of the stage.
+        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
     """
     clocks = estimate_clocks(cameras, detections, fps, settings)
     late = clocks.late if settings.correct_clocks else None
@@ -138,11 +138,11 @@ def reconstruct_chunks(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip, as detected.
-        model: of the clip, from `learn_clip`.
+        detections: detections of the clip, as detected.
+        model: model of the clip, from `learn_clip`.
         fps: frames per second [1/s].
-        settings: of the stage.
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+        settings: settings of the stage.
+        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
         length: frames per chunk; rounded up to the margin and whole tiles of the solver.
     """
     frames, margin = detections.confidence.shape[0], round(MARGIN * fps)
@@ -206,7 +206,7 @@ class Reconstruction:
     """Joints and clock offsets of one clip.
 
     Attributes:
-        triangulation: each frame on its own.
+        triangulation: joints of each frame on its own.
         smoothing: whole tracks.
         clocks: clock offsets; corrected if the settings say so.
     """
@@ -227,10 +227,10 @@ def reconstruct_joints(
 
     Args:
         cameras: batch (cameras,).
-        detections: of all tracked people.
+        detections: detections of all tracked people.
         fps: frames per second [1/s].
-        settings: of the stage.
-        camera_covariance: (cameras, 12, 12) as in `triangulate_joints`.
+        settings: settings of the stage.
+        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
 
     Raises:
         InputError: the shapes do not match.

@@ -89,7 +89,7 @@ def estimate_clocks(
 
     Args:
         cameras: batch (cameras,).
-        detections: of the clip, as detected.
+        detections: detections of the clip, as detected.
         fps: frames per second [1/s].
         settings: noise, and the standard error below which an offset is determined.
     """
@@ -144,10 +144,10 @@ class _Sums:
     Attributes:
         information: (persons, cameras, cameras) [1/frame^2].
         score: (persons, cameras) [1/frame]; `late` grows by the solution of the sum.
-        along: (cameras,) of weight x image motion x image scale [1/(frame m)]: the score of a shift
-            of people along their path.
-        misses: (cameras,) of weighted squared residuals [1].
-        scale: (cameras,) of weight x squared image scale [1/m^2].
+        along: (cameras,) sum of weight x image motion x image scale [1/(frame m)]: the score of a
+            shift of people along their path.
+        misses: (cameras,) sum of weighted squared residuals [1].
+        scale: (cameras,) sum of weight x squared image scale [1/m^2].
     """
 
     information: Floats
@@ -242,8 +242,8 @@ def read_frames(
     """Return the detections of some frames of a clip, on the common clock.
 
     Args:
-        detections: of the clip, as detected.
-        frames: from a first frame to before a last one, or single frames.
+        detections: detections of the clip, as detected.
+        frames: range from a first frame to before a last frame, or single frames.
         late: (cameras,) [frame], clock offsets to correct; None = no correction.
     """
     offsets = np.zeros(1) if late is None else np.nan_to_num(late)
@@ -270,7 +270,7 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
     Keypoints are interpolated linearly between two frames and are missing unless both have them.
 
     Args:
-        detections: as detected.
+        detections: detections before any correction.
         late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
 
     Returns:

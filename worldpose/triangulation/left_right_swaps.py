@@ -51,7 +51,7 @@ def find_swaps(
     at least two outlier keypoints are tested.
 
     Args:
-        observations: of all tracked people.
+        observations: observations of all tracked people.
         noise: [px], [m].
         limit: largest squared error of an inlier [variances].
         found: the joints from the unchanged detections.
@@ -66,7 +66,7 @@ def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDete
     """Return detections with left-right swaps undone.
 
     Args:
-        detections: as detected; not changed.
+        detections: detections before any correction; not changed.
         exchanged: (frames, cameras, persons, parts).
     """
     if not exchanged.any():

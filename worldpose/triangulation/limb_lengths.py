@@ -73,10 +73,10 @@ def repair_limb_lengths(
     all views and limb lengths decide. If the limb still has a wrong length, its end is missing.
 
     Args:
-        observations: of all tracked people.
+        observations: observations of all tracked people.
         settings: noise, inlier limit and minimum views.
         found: joints of the same observations; changed.
-        lengths: (persons, limbs) of `limb_lengths`.
+        lengths: (persons, limbs) lengths of `limb_lengths`.
     """
     if found.joints.shape[2] != len(COCO17):
         return
@@ -118,7 +118,7 @@ def _select_end(
     """Return one limb end's observations: one frame, one detection per camera, one joint.
 
     Args:
-        observations: of all tracked people.
+        observations: observations of all tracked people.
         found: joints.
         end: frame, person, joint.
         doubtful: whether the end may move; otherwise it has no observations.
@@ -143,7 +143,7 @@ class _Choices:
 
     Attributes:
         points: (choices,).
-        cost: (choices,) of the residuals of all views.
+        cost: (choices,) cost of the residuals of all views.
         tried: the solution of each; None for an end that stays.
     """
 
@@ -161,7 +161,7 @@ def _list_choices(
     """Return the positions of an end from pairs of views and their inliers.
 
     Args:
-        observations: of the end (`_select_end`); an end without observations stays.
+        observations: observations of the end (`_select_end`); an end without observations stays.
         settings: noise, inlier limit and minimum views.
         found: joints.
         end: frame, person, joint.

@@ -89,9 +89,9 @@ def learn_noise(
 
     Args:
         rig: the cameras.
-        detections: in the sample.
-        shift: of the observations, as in `Observations`.
-        noise: stated, [px] and [m].
+        detections: detections in the sample.
+        shift: shift of the observations, as in `Observations`.
+        noise: stated noise, [px] and [m].
         limit: largest squared error of an inlier [variances].
     """
     confidence, index = detections.confidence, detections.detection_index
@@ -249,7 +249,7 @@ class Proportion:
 
     Attributes:
         ends: one or two pairs of ends; an end is the mean of its joints.
-        share: of stature [1].
+        share: share of stature [1].
         spread: relative standard deviation of published values of the share [1].
         offsets: variance of the length for joint biases of variance 1 per axis, mirrored left to
             right [1].

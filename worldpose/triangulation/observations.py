@@ -35,7 +35,7 @@ class Rig:
     """Cameras in the memory layout of the kernels.
 
     Attributes:
-        cameras: (cameras, 22) as in `worldpose.geometry.projection`.
+        cameras: (cameras, 22) parameters as in `worldpose.geometry.projection`.
         depths: (cameras, 4), depth of (x, y, z, 1) [m]; 1 where a camera is missing.
         centers: (cameras, 3) [m], world.
     """
@@ -79,9 +79,9 @@ class Observations(NamedTuple):
         detection_index: (frames, cameras, persons), index of the detection; -1 = not seen.
         shift: (frames, cameras, persons, 3), subtracted from pixels [px], and additional variance
             [px^2]; no frames = no shift.
-        cameras: (cameras, 22) as in `Rig`.
-        depths: (cameras, 4) as in `Rig`.
-        centers: (cameras, 3) as in `Rig`.
+        cameras: (cameras, 22) parameters as in `Rig`.
+        depths: (cameras, 4) rows as in `Rig`.
+        centers: (cameras, 3) centers as in `Rig`.
     """
 
     keypoints: AnyFloats
@@ -119,7 +119,7 @@ class PersonTrack:
 
     Attributes:
         pixels: (joints, cameras, frames, 2) [px], offsets subtracted.
-        precision: (joints, cameras, frames) as in `Observations`.
+        precision: (joints, cameras, frames) precision as in `Observations`.
         joints: (frames, joints, 3) [m], triangulated; NaN where unknown.
     """
 
@@ -139,8 +139,8 @@ def observe_person(
     """Return one person's observations.
 
     Args:
-        detections: of all people.
-        precision: (frames, cameras, detections, joints) of the keypoints.
+        detections: detections of all people.
+        precision: (frames, cameras, detections, joints) precision of the keypoints.
         offsets: (frames, cameras, persons, 2) [px] to subtract.
         joints: (frames, persons, joints, 3) [m], triangulated.
         person: index of the person.
@@ -164,7 +164,7 @@ def gather(observations: Observations, first: int, tiles: Floats) -> None:
     """Write pixels, precision and additional variance of 64 joints.
 
     Args:
-        observations: of all joints.
+        observations: observations of all joints.
         first: the first joint, counted over frames, persons, joints.
         tiles: (cameras, ROWS x LANES); pixels go to the first rows of `A` and `B`.
     """

@@ -117,9 +117,9 @@ def triangulate_joints(
 
     Args:
         cameras: batch (cameras,).
-        detections: of all tracked people.
+        detections: detections of all tracked people.
         settings: noise, inlier limit and minimum views.
-        camera_covariance: (cameras, 12, 12) of steps in the order of
+        camera_covariance: (cameras, 12, 12) covariance of steps in the order of
             `static_calibration.parameters.PARAMETERS`; None = not known.
         model: result of `learn_detector` for the clip of these frames; None = these frames are the
             clip.
@@ -293,7 +293,7 @@ def check_shapes(
     """Require arrays of matching shapes, and valid indices.
 
     Raises:
-        InputError: they do not match.
+        InputError: shapes do not match, or an index is invalid.
     """
     keypoints, confidence = detections.keypoints, detections.confidence
     detection_index = detections.detection_index

@@ -84,7 +84,8 @@ def stated_errors(
         cameras: batch (cameras,).
         joints: (frames, persons, joints, 3) [m], world; their mean is the person's position.
         settings: `calibration_error_m` replaces a missing covariance.
-        camera_covariance: (cameras, 12, 12) of steps in the order of `PARAMETERS`, or None.
+        camera_covariance: (cameras, 12, 12) covariance of steps in the order of `PARAMETERS`, or
+            None.
     """
     found = np.isfinite(joints[..., 0])
     number = np.maximum(found.sum(axis=-1), 1)[..., None]
@@ -170,7 +171,7 @@ def estimate_offsets(
     that agree get none.
 
     Args:
-        observations: of all tracked people; their shift is not used.
+        observations: observations of all tracked people; their shift is not used.
         noise: [px], [m].
         first: the joints without offsets.
         variance: (frames, cameras, persons) calibration variance per axis [px^2].
@@ -193,7 +194,7 @@ def estimate_offsets(
 def estimate_midhip_shift(
     rig: Rig, detections: KeypointDetections, settings: TriangulationSettings
 ) -> Floats:
-    """Return the mid-hip residual of each person in each image, and a zero.
+    """Return the mid-hip residual of each person in each image, with zero as third component.
 
     With the shift subtracted, reprojection residuals are those of the paper's second stage,
     relative to the mid-hip. The shift is 0 in an image without both hips, and for a person without
@@ -201,8 +202,8 @@ def estimate_midhip_shift(
 
     Args:
         rig: the cameras.
-        detections: of all tracked people.
-        settings: of triangulation.
+        detections: detections of all tracked people.
+        settings: settings of triangulation.
 
     Returns:
         (frames, cameras, persons, 3) [px].
@@ -242,7 +243,7 @@ def _body_offsets(
     joints are eliminated (Schur complement), which leaves two unknowns per camera.
 
     Args:
-        observations: of all tracked people, without a shift.
+        observations: observations of all tracked people, without a shift.
         noise: [px], [m].
         joints: (frames, persons, joints, 3) [m] solved without offsets.
         inliers: (frames, cameras, persons, joints).

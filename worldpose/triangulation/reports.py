@@ -101,9 +101,9 @@ class Agreement:
         seen: observations.
         views: inlier views, summed over all joints.
         used: (cameras,) observations of joints found.
-        agreed: (cameras,) of these, inliers.
+        agreed: (cameras,) number of inliers among these.
         people: (cameras,) views of people.
-        exchanged: (cameras,) of these, with a corrected left-right swap.
+        exchanged: (cameras,) number of these with a corrected left-right swap.
         error: reprojection errors [px].
         deviation: roots of traces [m].
         misplaced: expected displacements by calibration errors, by camera [m].
@@ -158,8 +158,8 @@ class Changes:
 
     Attributes:
         there: joints after smoothing.
-        filled: of these, filled in.
-        moved: distances from the triangulated ones [m].
+        filled: number of filled joints among these.
+        moved: distances from the triangulated joints [m].
     """
 
     there: int

@@ -58,7 +58,7 @@ class TrackCosts(NamedTuple):
     """Weights of errors of observations and of accelerations.
 
     Attributes:
-        noise: of observations, [px] and [m].
+        noise: noise of observations, [px] and [m].
         limit: scale of the Geman-McClure loss of observations [variances].
         penalty: on squared second differences [1/m^2].
     """
@@ -130,7 +130,7 @@ def _solve_track(
     Observations have a Geman-McClure loss of scale `costs.limit`.
 
     Args:
-        tiles: of `prepare_tiles`.
+        tiles: tiles of `prepare_tiles`.
         depths: (cameras, 4).
         costs: weights of errors.
         points: (frames, 3) [m], initial values; written.
@@ -440,7 +440,7 @@ def smooth_joints(
 
     Args:
         cameras: batch (cameras,).
-        detections: of all tracked people.
+        detections: detections of all tracked people.
         raw: triangulation of the same detections; its noise, offsets and left-right swaps are used.
         fps: frames per second [1/s].
         settings: noise and the longest gap.

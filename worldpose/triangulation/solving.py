@@ -198,7 +198,7 @@ def solve_joints(observations: Observations, settings: TriangulationSettings) ->
     """Return the joints of all frames, with covariance from `precision` and the stated noise.
 
     Args:
-        observations: of all tracked people.
+        observations: observations of all tracked people.
         settings: noise, inlier limit and minimum views.
     """
     frames, count, persons = observations.detection_index.shape

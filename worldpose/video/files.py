@@ -173,7 +173,7 @@ class VideoReader:
 
         Args:
             path: the video.
-            index: of the video, if known; else it is computed.
+            index: index of the video; if None, it is computed.
 
         Raises:
             InputError: no video.
@@ -350,7 +350,7 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
         start: number of the first frame.
         stop: one past the last.
         out: the file to write, of the same kind.
-        index: of the video, if known; else it is computed.
+        index: index of the video; if None, it is computed.
 
     Returns:
         The number of frame `start` in the new file.

@@ -30,7 +30,7 @@ def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[n
     """Return an image (height, width, 3) RGB, or (height, width) grey.
 
     Args:
-        content: (bytes,) of a PNG or JPEG file.
+        content: (bytes,) content of a PNG or JPEG file.
         grey: without colour.
 
     Returns:
@@ -80,7 +80,7 @@ class ImageFolder:
 
         Args:
             folder: holds the images.
-            index: of the images, if known; else it is computed.
+            index: index of the images; if None, it is computed.
 
         Raises:
             InputError: no images, or names without a number or with the same one.
@@ -202,7 +202,7 @@ def index_video(path: Path) -> FrameIndex:
     """Return the index of a video file or of a folder of images.
 
     Raises:
-        InputError: neither.
+        InputError: the path is neither a video nor a folder of images.
     """
     return index_images(path) if path.is_dir() else index_frames(path)
 

@@ -1,8 +1,8 @@
 // Clicks of a user, with undo, redo and autosave.
 //
-// Every change is an edit with what it changes (`was`). The server takes an edit in while that is
-// so still; otherwise another person changed it first, and the person decides whose it shall be. An edit
-// keeps its id until the server acknowledged it: sent twice, it is kept once.
+// Every edit includes the value that it replaces (`was`). The server accepts the edit if it still has that
+// value. Otherwise another user has changed the value first, and the page asks which of the two values to keep. An
+// edit keeps its id until the server has acknowledged it, so the server stores an edit that it receives twice only once.
 
 import { matchPath, newId, post, Refusal } from "./api.js";
 

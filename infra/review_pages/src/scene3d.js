@@ -181,7 +181,7 @@ export class Scene3D {
     this.through = null; // name of a camera
     this.follow = null; // index of a person
     this.ranges = new Map(); // by number: unpacked, or a promise
-    this.people = []; // where they are in the picture that was drawn
+    this.people = []; // their positions in the image drawn last
     this.#build();
     this.view = { at: [0, 0, 0.9], turn: -0.5, tilt: 0.42, far: 40 };
     this.watch = new ResizeObserver(() => this.draw());
@@ -323,7 +323,7 @@ export class Scene3D {
     return found ? found[1] : 0;
   }
 
-  // The range of a frame, or null while it is on its way.
+  // The range that contains a frame, or null while it is loading.
   range(frame) {
     const length = this.scene.range_frames;
     const number = Math.floor(frame / length);

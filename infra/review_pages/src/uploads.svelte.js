@@ -1,5 +1,5 @@
-// Uploads in chunks: they go on while a person is on other pages, wait for a server that does not answer, and continue
-// after a reload when the person chooses the same file again.
+// Uploads in chunks. An upload continues while the user is on other pages, waits while the server does not answer, and
+// resumes after a reload when the user chooses the same file again.
 import { post, putBytes } from "./api.js";
 
 const SMALLEST = 1 << 16;

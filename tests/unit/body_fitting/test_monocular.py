@@ -291,7 +291,7 @@ def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known(erro
 
 
 def people_in_a_gap(seed=5):
-    """A walker whose limbs are not triangulated for a second, and the true bodies."""
+    """A walker whose limbs are not triangulated for one second, and the true bodies."""
     rng = np.random.default_rng(seed)
     truth = walker(100, rng)
     joints, covariance = seen(truth, 0.01, rng)

@@ -146,7 +146,7 @@ def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(
             {"detection_index": np.full((40, 2), -2, np.int16)},
             "or -1 for missing, found -2; 80",
         ),
-        ({"surprise": np.zeros(3)}, "unknown: surprise"),
+        ({"unplanned": np.zeros(3)}, "unknown: unplanned"),
         ({"extra": np.zeros(41, np.int32)}, "dimension frame"),
     ],
 )

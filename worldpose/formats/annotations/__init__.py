@@ -72,7 +72,7 @@ def write_annotations(
 
     Args:
         path: the file; overwritten.
-        pictures: with unique names.
+        pictures: images with unique names.
         form: the format.
     """
     path.write_bytes(_CODECS[form].encode(pictures))

@@ -56,7 +56,7 @@ class AnnotatedImage:
     Attributes:
         name: file name; `/` between folders.
         size: width, height [px].
-        people: in arbitrary order.
+        people: people in arbitrary order.
     """
 
     name: str
@@ -164,7 +164,7 @@ def read_coco(content: bytes) -> list[AnnotatedImage]:
     """Read the images of a COCO keypoints file, in its order.
 
     Raises:
-        ContentError: it has another format, other joints, or contradictions.
+        ContentError: the file has another format, other joints, or contradictions.
     """
     dataset = _Dataset.model_validate_json(content)
     for category in dataset.categories:

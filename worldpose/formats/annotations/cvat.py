@@ -31,7 +31,7 @@ def read_xml(content: bytes) -> ElementTree.Element:
     """Return the root element of a document without a document type and thus without entities.
 
     Raises:
-        ContentError: it is not XML, declares a document type, or is nested deeply.
+        ContentError: the document is not XML, declares a document type, or is nested deeply.
     """
     parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
     depth = 0
@@ -92,7 +92,7 @@ def read_cvat(content: bytes) -> list[AnnotatedImage]:
     around its points. Shapes of other kinds or labels are ignored.
 
     Raises:
-        ContentError: it has another format, or a shape is invalid.
+        ContentError: the file has another format, or a shape is invalid.
     """
     root = read_xml(content)
     if root.tag != "annotations":

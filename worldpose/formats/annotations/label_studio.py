@@ -96,7 +96,7 @@ def read_label_studio(content: bytes) -> list[AnnotatedImage]:
     keypoint belongs to its parent rectangle, or else to the only one around it.
 
     Raises:
-        ContentError: it has another format, or a region is invalid.
+        ContentError: the file has another format, or a region is invalid.
     """
     return [_read(task) for task in TypeAdapter(tuple[_Task, ...]).validate_json(content)]
 

@@ -30,7 +30,7 @@ class MarkedImage:
     """Labelled shapes in one image.
 
     Attributes:
-        name: of the image, as the file has it.
+        name: name of the image, as the file has it.
         size: width, height [px].
         points: label and (2,) pixel of every click, in the order of the file.
         lines: label and (points, 2) pixels of every drawn line.

@@ -67,7 +67,7 @@ def find_method(name: str) -> Method:
     """Return a method by its name.
 
     Raises:
-        UsageError: there is none of this name.
+        UsageError: no method has this name.
     """
     if name not in METHODS:
         raise UsageError(

@@ -36,20 +36,21 @@ from worldpose.formats.baselines.result import (
 def read_hybrik(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of HybrIK's result, each frame in its camera's axes.
 
-    HybrIK: `pose.pkl` of several people, or `res.pk` of one; poses relative to the camera.
+    The result is `pose.pkl` of several people, or `res.pk` of one person. Its poses are relative
+    to the camera.
 
-    Layouts as written by NVlabs/GLAMR at commit 44f820c, pose_est/hybrik_demo/demo.py, which
-    runs HybrIK for all tracked people (`smpl_pose_quat_wroot` holds the elements of rotation
-    matrices, `smpl_beta`, `root_trans`, `kp_2d` px, `frames`), and by jeffffffli/HybrIK at
-    commit c281eee, scripts/demo_video.py (`pred_thetas` (n, 216) rotation matrices,
-    `pred_betas`, `transl`, `bbox` x0 y0 x1 y1 px, `img_path` numbered from 1).
+    NVlabs/GLAMR at commit 44f820c writes `pose.pkl` in pose_est/hybrik_demo/demo.py, which runs
+    HybrIK for all tracked people. It has `smpl_pose_quat_wroot` (the elements of rotation
+    matrices), `smpl_beta`, `root_trans`, `kp_2d` px and `frames`. jeffffffli/HybrIK at commit
+    c281eee writes `res.pk` in scripts/demo_video.py. It has `pred_thetas` (n, 216) rotation
+    matrices, `pred_betas`, `transl`, `bbox` x0 y0 x1 y1 px, and `img_path` numbered from 1.
 
     Args:
         path: `pose.pkl` or `res.pk`.
         model: body model to pose.
 
     Raises:
-        InputError: it is neither.
+        InputError: the file has neither of the two layouts.
     """
     content = read_pickled(path)
     single = isinstance(content, dict) and "pred_thetas" in content
@@ -120,10 +121,10 @@ _Row = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 def read_humans4d(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of 4DHumans' result in the images with a detection.
 
-    4DHumans (HMR2 with PHALP's tracks): `results/demo_<clip>.pkl`, poses relative to the
+    4DHumans (HMR2 with PHALP's tracks) writes `results/demo_<clip>.pkl`, with poses relative to the
     camera.
 
-    Layout as written by brjathu/PHALP at commit 96f7e6c, phalp/trackers/PHALP.py (`track`),
+    The layout is that of brjathu/PHALP at commit 96f7e6c, phalp/trackers/PHALP.py (`track`),
     which shubham-goel/4D-Humans at commit 6ec7965, track.py, runs with HMR2: joblib's file of a
     dictionary by image, with lists over people: `tid`, `tracked_time` (0 if detected in this
     image), `bbox` x y width height px, `camera` (3,) m, `smpl` with `global_orient` (1, 3, 3),

@@ -57,7 +57,7 @@ def get_part(where: str, content: object, *keys: object) -> Any:  # noqa: ANN401
     """Return the value at a path of keys in nested dictionaries.
 
     Raises:
-        InputError: names the first missing key.
+        InputError: a key is missing; the error names the first missing key.
     """
     for key in keys:
         if not isinstance(content, Mapping) or key not in content:
@@ -72,7 +72,7 @@ def as_floats(where: str, value: object) -> Floats:
     """Return numbers as an array of any shape.
 
     Raises:
-        InputError: they are not numbers.
+        InputError: the values are not numbers.
     """
     try:
         return np.asarray(value, dtype=np.float64)
@@ -120,7 +120,7 @@ def integer(where: str, value: object) -> int:
     """Return one integer, also if written as text.
 
     Raises:
-        InputError: it is not an integer.
+        InputError: the value is not an integer.
     """
     found = floats(where, value, ())
     if not np.isfinite(found) or found != np.round(found) or abs(found) > 2**53:
@@ -132,7 +132,7 @@ def require_ascending(where: str, frames: NDArray[np.int64]) -> NDArray[np.int64
     """Return frames after checking that they ascend.
 
     Raises:
-        InputError: they do not ascend, or are negative.
+        InputError: the frames do not ascend, or are negative.
     """
     if np.any(np.diff(frames) <= 0) or np.any(frames < 0):
         raise format_error(where, "frames that rise from 0", f"{frames[:8]}")
@@ -143,7 +143,7 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return some arrays of an npz file; others are ignored, pickled ones refused.
 
     Raises:
-        InputError: it is not an npz file, is too large, or lacks an array.
+        InputError: the file is not an npz file, is too large, or lacks an array.
     """
     try:
         with zipfile.ZipFile(path) as file:

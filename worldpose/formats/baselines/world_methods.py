@@ -40,9 +40,9 @@ from worldpose.formats.joints_file import read_poses
 def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of GLAMR's result, in the frames that contain them.
 
-    GLAMR: `grecon/<clip>_seed<n>.pkl`, a pickle of arrays by person, all in one world.
+    The file is `grecon/<clip>_seed<n>.pkl`, a pickle of arrays by person, all in one world.
 
-    Layout as written by NVlabs/GLAMR at commit 44f820c, global_recon/run_demo.py and
+    The layout is that of NVlabs/GLAMR at commit 44f820c, global_recon/run_demo.py and
     global_recon/models/global_recon_model.py (`init_data`, `optimize`): `person_data[id]` with
     `smpl_orient_world` (T, 3), `smpl_pose` (T, 69), `smpl_beta`, `root_trans_world` (T, 3),
     where the pelvis is, `scale` or None, `exist_frames` (T,) and `kp_2d` (T, 26, 2) px, 0 where
@@ -86,9 +86,9 @@ def read_glamr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
 def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> MethodResult:
     """Return the people of WHAM's result.
 
-    WHAM: `wham_output.pkl`, joblib's file by person, each in its own world.
+    The file is `wham_output.pkl`, a joblib file by person. Each person has a separate world.
 
-    Layout as written by yohanshin/WHAM at commit 2b54f77, demo.py: `pose_world` and `pose` (n,
+    The layout is that of yohanshin/WHAM at commit 2b54f77, demo.py: `pose_world` and `pose` (n,
     72), `trans_world` and `trans` (n, 3), `betas` (n, 10), `frame_ids` (n,). `trans_world` is
     the mid-hip (lib/models/smpl.py, `get_output`), `trans` is SMPL's own in camera axes; the
     focal length is the image diagonal (lib/vis/run_vis.py). Every trajectory begins at its own
@@ -131,9 +131,10 @@ def read_wham(path: Path, model: BodyModel, image_size: tuple[int, int]) -> Meth
 def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of GVHMR's results, one for each file in order of their names.
 
-    GVHMR: `hmr4d_results.pt`, torch's file of one person; a folder of such files for several.
+    The file `hmr4d_results.pt` is a torch file of one person; several people have a folder of such
+    files.
 
-    Layout as written by zju3dv/GVHMR at commit 44fbc19, tools/demo/demo.py and
+    The layout is that of zju3dv/GVHMR at commit 44fbc19, tools/demo/demo.py and
     hmr4d/model/gvhmr/gvhmr_pl_demo.py: `smpl_params_global` and `smpl_params_incam`, SMPL-X
     with `global_orient` (T, 3), `body_pose` (T, 63), `transl` (T, 3) and `betas` (T, 10), and
     `K_fullimg` (T, 3, 3) px. The method follows one person through the whole video, in a world
@@ -144,7 +145,7 @@ def read_gvhmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult
         model: body model to pose.
 
     Raises:
-        InputError: it is neither.
+        InputError: the path is neither such a file nor such a folder.
     """
     files = [path] if path.is_file() else sorted(path.rglob("*.pt"))
     # The method keeps other torch files in preprocess/.
@@ -184,9 +185,9 @@ def _read_gvhmr_track(file: Path, parameters: object) -> Track:
 def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of TRAM's result.
 
-    TRAM: a folder with `camera.npy` and `hps/hps_track_<n>.npy`, all people in one world.
+    The folder has `camera.npy` and `hps/hps_track_<n>.npy`, with all people in one world.
 
-    Layout as written by yufu-wang/tram at commit 4861c11, scripts/estimate_camera.py,
+    The layout is that of yufu-wang/tram at commit 4861c11, scripts/estimate_camera.py,
     scripts/estimate_humans.py and lib/models/hmr_vimo.py: numpy files that hold a dictionary;
     of the camera `world_cam_R` (T, 3, 3), `world_cam_T` (T, 3), `img_focal` and `img_center`
     px; of a person torch tensors `pred_rotmat` (n, 24, 3, 3), `pred_shape` (n, 10),
@@ -245,9 +246,9 @@ def read_tram(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
 def read_prompthmr(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """Return the people of PromptHMR's result.
 
-    PromptHMR: `results.pkl`, joblib's file, all people in one world.
+    The file is `results.pkl`, a joblib file with all people in one world.
 
-    Layout as written by yufu-wang/PromptHMR at commit ea85d0a, pipeline/pipeline.py and
+    The layout is that of yufu-wang/PromptHMR at commit ea85d0a, pipeline/pipeline.py and
     pipeline/world.py: `people[id]` with `frames` (n,), `bboxes` (n, 4) x0 y0 x1 y1 px and
     `smplx_world`, SMPL-X with `pose` (n, 165), `shape` and `trans` (n, 3); `camera.img_center`
     px is the principal point of the images, which the method downscales.
@@ -330,7 +331,7 @@ def read_slahmr(path: Path, model: BodyModel, phase: str) -> MethodResult:
 
     SLAHMR: a folder for each piece of the video.
 
-    Layout as written by vye16/slahmr at commit 58518fe, slahmr/run_opt.py,
+    The layout is that of vye16/slahmr at commit 58518fe, slahmr/run_opt.py,
     slahmr/optim/optimizers.py (`save_results`), slahmr/optim/output.py and
     slahmr/optim/moving_scene.py: in each run's folder `track_info.json` with the tracks' `index`
     and `vis_mask` and the intervals of images, and for each phase

@@ -53,7 +53,7 @@ class Minimum(Generic[S]):
     """Result of the loop.
 
     Attributes:
-        state: of minimum cost.
+        state: state of minimum cost.
         costs: at the start and after every accepted step.
         iterations: number of steps tried.
         converged: whether the stopping rule ended the loop.

@@ -30,7 +30,7 @@ class Evidence(NamedTuple):
     anchors: Floats
     """(points, 3) [m], world; means of the priors."""
     information: Floats
-    """(points,) [1/m^2] of the priors; 0 = none, infinite = the point is fixed."""
+    """(points,) [1/m^2], inverse variance of the prior; 0 = no prior, infinite = fixed point."""
     first_of: Integers
     """(points + 1,); observations of point p are `first_of[p]` to `first_of[p + 1]`."""
     camera_of: Integers
@@ -40,7 +40,7 @@ class Evidence(NamedTuple):
     weight: Floats
     """(n,) [1/px^2]."""
     scale: Floats
-    """(n,) of Cauchy's loss, in standard deviations; infinite = plain squares."""
+    """(n,) scale of Cauchy's loss, in standard deviations; infinite = squared loss."""
 
 
 class CameraEquations(NamedTuple):
@@ -71,11 +71,11 @@ def eliminate(
     Args:
         cameras: (cameras, 22).
         points: (points, 3) [m], world.
-        evidence: of all points.
+        evidence: evidence of all points.
         damping: Marquardt damping of the points.
         first: first point.
         last: last point, exclusive.
-        equations: of the cameras; `rows` is written, for these points alone, `blocks` and
+        equations: equations of the cameras; `rows` is written, for these points alone, `blocks` and
             `gradient` are added to.
     """
     columns, rows = equations.columns, equations.rows
@@ -137,7 +137,7 @@ def substitute(
     Args:
         cameras: (cameras, 22), before the step.
         points: (points, 3) [m], world, before it.
-        evidence: of all points.
+        evidence: evidence of all points.
         damping: as in the elimination.
         steps: (cameras, 12).
         trial: (points, 3) [m], written.
@@ -177,7 +177,7 @@ def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
     Args:
         cameras: (cameras, 22).
         points: (points, 3) [m], world.
-        evidence: of all points.
+        evidence: evidence of all points.
     """
     total = 0.0
     for p in range(len(points)):

@@ -25,8 +25,8 @@ class DetectorProfile(Record):
 
     name: str
     definition: float = 0.025
-    """From the anatomical joint to the detector's, along each axis of its limb [m]; the same for
-    all people and cameras."""
+    """Offset from the anatomical joint to the detector's joint, along each axis of its limb [m];
+    the same for all people and cameras."""
     personal: float = 0.006
     """The same, for each person [m]."""
     low_hips: float = 0.0
@@ -245,7 +245,7 @@ def detect_people(
     """Return the detections in a camera's images.
 
     Args:
-        detector: of the match.
+        detector: detector of the match.
         view: people in the camera's images.
         defined: pixels (frames, persons, 17, 2) of the joints as the detector defines them [px].
         image_size: width and height [px].

@@ -54,13 +54,13 @@ class Manner:
     """Style of one person's posture and gait.
 
     Attributes:
-        lean: of the trunk, forward [rad].
-        swing: of the arms, relative to the usual [1].
+        lean: forward lean of the trunk [rad].
+        swing: swing of the arms, relative to the usual [1].
         elbow: further bend of the elbows [rad].
-        splay: of the arms, outward [rad].
+        splay: outward angle of the arms [rad].
         stride: length of steps relative to the usual [1].
         sway: turning of pelvis and shoulders relative to the usual [1].
-        width: of the steps, as a share of the hips' width [1].
+        width: width of the steps, as a share of the hips' width [1].
     """
 
     lean: float
@@ -78,8 +78,8 @@ class Gesture:
 
     Attributes:
         kind: one of `GESTURES`.
-        time: of its peak [s].
-        length: from begin to end [s].
+        time: time of its peak [s].
+        length: duration from begin to end [s].
         strength: 1 = fully.
         side: the arm, 0 left, 1 right.
         towards: direction of an arm (forward, left, up).
@@ -146,7 +146,7 @@ def walk_posture(
         root: (frames, 2) middle of the hips in plan [m], world.
         heading: (frames,) direction that the body faces [rad].
         leg: its length [m].
-        manner: the person's.
+        manner: the person's style.
         gestures: the person's gestures.
         rng: draws the first step and the gaze.
     """

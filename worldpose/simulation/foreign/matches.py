@@ -90,12 +90,12 @@ class ForeignScene:
         truth: anatomical joints; `views` counts the cameras that see the joint.
         defined: joints as the detector defines them.
         people: bones, motion and joints of each person.
-        cameras: by id.
+        cameras: true cameras, by id.
         given: cameras of calibration.toml, by id; empty if they are to be clicked.
-        clicked: by id of a camera without calibration.
-        misnamed: by camera, by wrong name, the name of the point under it.
+        clicked: clicks, by id of a camera without calibration.
+        misnamed: name of the point under a wrongly named click, by camera and wrong name.
         reports: detections, by camera.
-        offsets: of the cameras' frame numbers, as stated [frame].
+        offsets: offsets of the cameras' frame numbers, as stated [frame].
         clock_offsets: clock offset of a camera's exposure, by id [frame].
         pitch: None in a hall.
         record: all other drawn values, for world.json.
@@ -130,7 +130,7 @@ def simulate_foreign_scene(
 
     Args:
         scenario: ranges.
-        seed: from 0.
+        seed: seed from 0.
         duration: [s], instead of the scenario's.
         cameras: number of them, instead of the scenario's.
         people: number of them, instead of the scenario's.
@@ -262,8 +262,8 @@ class _Space:
     """Where people move.
 
     Attributes:
-        center: (2,) of their area [m].
-        size: (2,) of their area [m].
+        center: (2,) center of their area [m].
+        size: (2,) size of their area [m].
         pitch: None in a hall.
         ground: height of the ground.
     """
@@ -390,7 +390,7 @@ def simulate_foreign_match(
 
     Args:
         scenario: ranges.
-        seed: from 0.
+        seed: seed from 0.
         out: absent or an empty folder; the write is atomic.
         duration: [s], instead of the scenario's.
         cameras: number of them, instead of the scenario's.

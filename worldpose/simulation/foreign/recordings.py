@@ -48,9 +48,9 @@ class Motion:
     """A recorded motion.
 
     Attributes:
-        name: of the file.
+        name: name of the file.
         fps: frame rate [1/s].
-        joints: by the names of `JOINTS` (frames, 3) [m], z up.
+        joints: joints (frames, 3) [m] by the names of `JOINTS`, z up.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Tracking:
     """A chunk of tracking data without gaps.
 
     Attributes:
-        name: of the file.
+        name: name of the file.
         clock: (rows,) [s], from 0.
         xy: (rows, players, 2) [m].
         players: their numbers in the file.

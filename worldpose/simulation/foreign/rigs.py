@@ -44,7 +44,7 @@ class RigCamera:
     """A static camera.
 
     Attributes:
-        camera: with OpenCV's five coefficients.
+        camera: camera with OpenCV's five coefficients.
         lens: its kind.
         mounting: its position, in words.
         beyond: amplitude [px], order and phase [rad] of the distortion beyond the five
@@ -240,7 +240,7 @@ class View:
 
     Attributes:
         pixels: (frames, persons, 17, 2) [px]; NaN behind the camera.
-        inside: (frames, persons, 17) in the image and not behind a pillar.
+        inside: (frames, persons, 17) joints in the image and not behind a pillar.
         hider: (frames, persons, 17) int16, the person in front of a joint, -1 for none.
         behind_self: (frames, persons, 17) behind the person's own trunk.
         size: (frames, persons) height of a standing person there [px].
@@ -364,9 +364,9 @@ def _is_behind_trunk(
 PAINTING: Final = 0.015
 """Error of painted points against the Laws of the Game, standard deviation along each axis [m]."""
 SURVEY: Final = 0.005
-"""Of a surveyed point, along each axis [m]."""
+"""Error of a surveyed point, along each axis [m]."""
 TAPE: Final = 0.02
-"""Of a length measured by tape [m]."""
+"""Error of a length measured by tape [m]."""
 CLICK: Final = (0.3, 1.1)
 """Spread of one person's clicks in an image of 1920 px, minimum and maximum [px]."""
 CLICK_TAIL: Final = 4.0
@@ -384,7 +384,7 @@ class Pitch:
     """True and stated positions of a pitch.
 
     Attributes:
-        painted: with the true position of every named point.
+        painted: pitch with the true position of every named point.
         stated: pitch.json.
         how: origin of the statement.
     """

@@ -43,7 +43,7 @@ class ForeignScenario(Record):
     kinds: tuple[float, float, float] = (0.6, 0.33, 0.07)
     """Shares of men, women and children [1]."""
     gestures: float = Field(default=5.0, ge=0)
-    """Of each person [1/min]."""
+    """Gestures of each person per minute [1/min]."""
     unsynchronised: float = Field(default=0.5, ge=0, le=1)
     """Share of matches in which cameras expose up to half a frame before or after the clock [1]."""
 

@@ -71,10 +71,10 @@ class Skeleton:
         stature: [m].
         thigh, shank, upper_arm, forearm: left and right [m].
         ankle: height of the ankle's centre above the sole [m].
-        trunk: from the middle of the hips to the base of the neck [m].
+        trunk: length from the middle of the hips to the base of the neck [m].
         hips, shoulders: distance between the joints' centres [m].
-        drop: from the neck's base down to the line of the shoulders [m].
-        neck: from the neck's base up to the ears [m].
+        drop: length from the neck's base down to the line of the shoulders [m].
+        neck: length from the neck's base up to the ears [m].
         head: size of the face relative to `FACE` [1].
     """
 
@@ -108,12 +108,12 @@ class Posture:
 
     Attributes:
         hips, shoulders: from right to left.
-        trunk: from the middle of the hips to the neck's base.
+        trunk: vector from the middle of the hips to the neck's base.
         head_up, gaze: axis of the head, and direction of the face.
         upper_arm, forearm, thigh, shank: (frames, 2, 3), left and right, towards the end of the
             limb.
-        height: (frames,) of the middle of the hips above the ankles' level on the ground, as a
-            share of the leg's length [1].
+        height: (frames,) height of the middle of the hips above the ankles' level on the ground, as
+            a share of the leg's length [1].
         planted: (frames, 2), left and right: the ankle does not move.
     """
 
@@ -181,7 +181,7 @@ def place_joints(
         skeleton: the person's bones.
         posture: directions relative to the heading.
         root: (frames, 2) middle of the hips in plan [m], world.
-        heading: (frames,) from the x axis towards y [rad].
+        heading: (frames,) angle from the x axis towards y [rad].
         fps: frame rate [1/s].
         ground: height of the ground under the feet.
     """

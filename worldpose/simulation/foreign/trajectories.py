@@ -66,10 +66,10 @@ def follow_tracks(
 
     Args:
         times: (samples,) desired [s].
-        clock: (rows,) of the tracking data [s].
+        clock: (rows,) clock of the tracking data [s].
         xy: (rows, 2) [m].
-        scale: (2,) of this pitch to the pitch of the data [1].
-        source: for the reference.
+        scale: (2,) scale of this pitch to the pitch of the data [1].
+        source: source of the data, for the reference.
     """
     step = times[1] - times[0]
     place = np.stack(
@@ -110,8 +110,8 @@ def wander(
     Args:
         times: (samples,) [s], evenly spaced.
         roles: one per person; duels are with the previous person in the list.
-        center: (2,) of the area [m].
-        size: (2,) of the area [m].
+        center: (2,) center of the area [m].
+        size: (2,) size of the area [m].
         obstacles: people with fixed trajectories; the others avoid them.
         rng: draws places, goals and speeds.
     """
