@@ -35,7 +35,7 @@ def load_stills(folder: Path, count: int | None = None, part: str = "all") -> li
     """Return labelled stills of a part, `count` of them evenly over their names; None = all."""
     files = [
         file
-        for file in sorted(folder.glob(f"*{PARTS[part]}*.jpg"))
+        for file in sorted(folder.glob(f"*{PARTS[part]}*.jpg".replace("**", "*")))
         if file.with_suffix(".txt").is_file()
     ]
     files = [file for file in files if file.with_suffix(".txt").read_text().strip()]
