@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results.best_results import (
+    PLANE,
     Origin,
     bodies_unit,
     broadcast_camera,
     camera_in_frames,
     clip_positions,
     fitted_bodies,
+    person_kinds,
     placed_joints,
     static_cameras,
 )
@@ -30,6 +32,7 @@ from worldpose.dataset.manifest import (
     read_manifest,
     released_files,
     write_frame_rates,
+    write_kinds,
     write_manifest,
     write_origins,
 )
@@ -267,7 +270,10 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
 
 def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """Write formats like `export`, also for a release, whose manifest has the frame rate."""
+    """Write formats like `export`, also for a release, whose manifest has the frame rate.
+
+    If a broadcast camera alone films people, kinds.json tells that they are not triangulated.
+    """
     for form in forms:
         if form not in EXPORTS:
             raise UsageError(
@@ -283,7 +289,12 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
             found="formats that all write cameras/<clip>.npz",
             todo="Export them into different folders.",
         )
-    return [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+    written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+    on_plane = [clip for clip in origin.clips if f"{PLANE}/{clip}" in origin.run]
+    if on_plane:
+        kinds = {clip: person_kinds(origin.run, clip) for clip in on_plane}
+        written.append(write_kinds(out, kinds))
+    return written
 
 
 def _keep(store: Store, origin: Origin, name: str) -> None:

@@ -54,6 +54,7 @@ from worldpose.body_fitting.solver import (
 )
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
+from worldpose.tracking.ground_tracks import CORRELATION_S
 
 HIPS: Final = (11, 12)
 """Hips in COCO-17; the place on the pitch is below their middle."""
@@ -63,8 +64,6 @@ MIN_GAIN: Final = 0.75
 """A body turned half round contradicts the estimates if it misses the keypoints by less than this
 share of what the body as estimated does [1]: sides of limbs and bends tell front from back. In two
 simulated worlds 1.5 to 3.4 for estimates as they are, and 0.4 to 0.6 for turned ones."""
-PLACE_TIME_S: Final = 0.5
-"""Correlation time of the errors of a smoothed place [s]: about a stride."""
 MONOCULAR_TIME_S: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 START_WINDOW_S: Final = 0.2
@@ -354,7 +353,7 @@ class _Clip:
         )
         known = np.isfinite(spread)
         # Two hips share the distance.
-        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + PLACE_TIME_S * fps)) * known
+        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + CORRELATION_S * fps)) * known
         by_place = np.zeros_like(by_ray)
         outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
         by_place[:, HIPS] = (weight[:, None, None] * outer)[:, None]
