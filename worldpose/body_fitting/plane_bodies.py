@@ -24,7 +24,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.body_fit import BodyFit, FittedArrays
-from worldpose.body_fitting.bones import DEFINITION
+from worldpose.body_fitting.bones import DEFINITION, shorten_limbs
 from worldpose.body_fitting.monocular import (
     PRIOR_SPREAD,
     MonocularEstimates,
@@ -92,6 +92,10 @@ FOOT_BIAS_M: Final = 0.03
 """Error of a foot's height that lasts for a clip [m]: where the detector sees the ankle, and the
 height of the ankle above the pitch. Divided by the slope of the line of sight it is an error of the
 distance."""
+
+LEAN_STD: Final = 0.08
+"""Error of a whole body's lean along the line of sight that lasts for a clip [rad]: 5 degrees. From
+one side a lean and a size look alike, and monocular methods lean all people the same way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +186,8 @@ def fit_bodies_on_plane(
 ) -> PlaneBodies:
     """Return the bodies of people whom one camera alone sees (S1-S4 without triangulation).
 
-    The covariance contains the distance that the feet leave open, and the foot's bias over the
-    slope of the line of sight. Joints in depth are as uncertain as the monocular angles.
+    The covariance contains the distance that the feet leave open, the foot's bias over the slope of
+    the line of sight, and a lean. Joints in depth are as uncertain as the monocular angles.
 
     Args:
         model: the body.
@@ -225,13 +229,13 @@ def fit_bodies_on_plane(
         start = replace(own.start, betas=shapes.people[person].betas)
         start = stand_on_ground(solver, start, own.place)
         rows = np.arange(span.start, span.stop)
-        track = clip.track(
-            person, rows, evidence.fps, settings.acceleration_m_s2, settings.pose_weight
-        )
+        track = clip.track(person, rows, evidence.fps, for_shape=False)
         pose, solved = solver.search(track, start, shapes.offsets)
         information = factor_information(solved, pose, shapes.offsets)
         result.put(solver, person, span, pose, information, shapes)
-        result.covariance[span, person] += clip.depth_covariance(person, own)
+        result.covariance[span, person] += clip.depth_covariance(
+            person, own, result.joints[span, person]
+        )
         result.guided[span, person] = clip.agreeing[span, person]
         result.drop(person, span, own.gone)
         turned[span, person] = clip.turn_round(track, start, shapes.offsets)
@@ -310,10 +314,15 @@ class _Clip:
         person: int,
         rows: NDArray[np.int64],
         fps: float,
-        acceleration: float,
-        pose_weight: float,
+        *,
+        for_shape: bool,
     ) -> Track:
-        """Return the evidence of a person in some frames, `rows`, at the rate `fps` [1/s]."""
+        """Return the evidence of a person in some frames, `rows`, at the rate `fps` [1/s].
+
+        For the shape, smoothness and pose prior hardly count, and limbs are shortened by the
+        contribution of the keypoints' noise, as those of triangulated people are.
+        """
+        settings = self.solver.settings
         prior = MonocularPrior(
             self.poses.orient[rows, person],
             self.poses.angles[rows, person],
@@ -323,16 +332,18 @@ class _Clip:
         )
         return Track(
             self.solver.chained,
-            self._observe(person, rows, fps),
+            self._observe(person, rows, fps, shorten=for_shape),
             self.solver.prior,
-            self.solver.settings,
+            settings,
             fps,
-            acceleration,
-            pose_weight,
+            settings.shape_acceleration_m_s2 if for_shape else settings.acceleration_m_s2,
+            settings.shape_pose_weight if for_shape else settings.pose_weight,
             monocular_prior=prior,
         )
 
-    def _observe(self, person: int, rows: NDArray[np.int64], fps: float) -> Evidence:
+    def _observe(
+        self, person: int, rows: NDArray[np.int64], fps: float, *, shorten: bool
+    ) -> Evidence:
         """Return lines of sight of the keypoints, and the distance of the hips by the place."""
         evidence, settings = self.evidence, self.solver.settings
         camera = evidence.camera[rows]
@@ -344,7 +355,10 @@ class _Clip:
         variance = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2 + pixel**2
         variance = variance / np.clip(evidence.confidence[rows, person], 1e-3, 1.0)
         seen = np.isfinite(points).all(axis=-1) & np.isfinite(variance)
-        variance = np.where(seen, variance, 1.0) * (1.0 + settings.noise_time_s * fps)
+        variance = np.where(seen, variance, 1.0)
+        if shorten:
+            points = shorten_limbs(points, across * variance[..., None, None])
+        variance *= 1.0 + settings.noise_time_s * fps
         by_ray = np.where(seen[..., None, None], across / variance[..., None, None], 0.0)
 
         sight, place = self._sight(person, rows)
@@ -386,13 +400,7 @@ class _Clip:
         pieces = []
         for part in spread_intervals(len(own.place), fps, settings):
             rows = np.arange(part.start, part.stop)[::stride]
-            track = self.track(
-                person,
-                rows + own.span.start,
-                fps / stride,
-                settings.shape_acceleration_m_s2,
-                settings.shape_pose_weight,
-            )
+            track = self.track(person, rows + own.span.start, fps / stride, for_shape=True)
             start = own.start
             pose = Pose(start.transl[rows], start.orient[rows], start.angles[rows], start.betas)
             pieces.append(Piece(person, track, pose))
@@ -408,18 +416,28 @@ class _Clip:
         pose, _ = self.solver.search(replace(track, monocular_prior=prior), pose, offsets)
         return np.asarray(self.solver.chained.differentiate(pose.parameters()).keypoints)
 
-    def depth_covariance(self, person: int, own: _Person) -> Floats:
-        """Return the covariance (frames of the span, 1, 3, 3) [m^2] that all frames share.
+    def depth_covariance(self, person: int, own: _Person, joints: Floats) -> Floats:
+        """Return the covariance (frames, 17, 3, 3) [m^2] that all frames of a person share.
 
-        It is the calibration's, and the foot's bias over the slope of the line of sight.
+        It is the calibration's, the foot's bias over the slope of the line of sight, and that of a
+        lean of the whole body, by which joints move along their lines of sight.
+
+        Args:
+            person: the person.
+            own: frames and places of the person.
+            joints: (frames, 17, 3) [m], world, in the frames of the span.
         """
         rows = np.arange(own.span.start, own.span.stop)
         sight, place = self._sight(person, rows)
-        offset = place - self.evidence.camera[rows].center
+        centers = self.evidence.camera[rows].center
+        offset = place - centers
         slope = -offset[:, 2] / np.linalg.norm(offset[:, :2], axis=-1)
-        along = (FOOT_BIAS_M / slope)[:, None, None] ** 2 * sight[:, :, None] * sight[:, None]
-        along[:, :2, :2] += self.evidence.calibration[rows, person]
-        return np.asarray(along[:, None])
+        shared = (FOOT_BIAS_M / slope)[:, None, None] ** 2 * sight[:, :, None] * sight[:, None]
+        shared[:, :2, :2] += self.evidence.calibration[rows, person]
+        line = joints - centers[:, None]
+        line /= np.linalg.norm(line, axis=-1, keepdims=True)
+        line *= LEAN_STD * (joints[..., 2:] - place[:, None, 2:])
+        return np.asarray(shared[:, None] + line[..., :, None] * line[..., None, :])
 
 
 def stand_on_ground(solver: Solver, pose: Pose, place: Floats) -> Pose:
