@@ -9,7 +9,7 @@ REFITTING = BODY_FITTING.model_copy(
     update={
         "stage": "refitting",
         "about": "Every person's body, fitted again with keypoints of the broadcast camera and "
-        "shapes of other clips; or the bodies of people whom the broadcast camera alone films.",
+        "shapes of other clips; or the bodies of people that the broadcast camera alone films.",
         "arrays": (
             *BODY_FITTING.arrays,
             ArrayLayout(
@@ -35,7 +35,7 @@ REFITTING = BODY_FITTING.model_copy(
                 dtype="int16",
                 unit="1",
                 missing="0",
-                about="1 where the broadcast camera shows the joint; only of people whom no static "
+                about="1 where the broadcast camera shows the joint; only of people that no static "
                 "camera films",
                 chunk_dim="frame",
             ),
@@ -43,7 +43,7 @@ REFITTING = BODY_FITTING.model_copy(
         "optional": ("views",),
         "attributes": {
             **BODY_FITTING.attributes,
-            "without_body": "people whom no static camera films and who have no body: id to reason",
+            "without_body": "people that no static camera films and who have no body: id to reason",
         },
     }
 )

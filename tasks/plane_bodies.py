@@ -30,7 +30,7 @@ from worldpose.store import ResultWriter, Store
 
 
 def publish_plane_bodies(store: Store, work: Work, result: ResultWriter) -> None:
-    """Fit and write the bodies of the clip's people whom the broadcast camera alone films."""
+    """Fit and write the bodies of the clip's people that the broadcast camera alone films."""
     sources: dict[str, Any] = work.recipe.sources
     path = Path(work.folder) / sources["estimates"]
     estimates = read_monocular(path)

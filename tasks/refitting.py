@@ -1,6 +1,6 @@
 """Task of stage `refitting`: bodies refitted with the broadcast camera and other clips' shapes.
 
-Without static cameras: bodies of the people whom the broadcast camera alone films.
+Without static cameras: bodies of the people that the broadcast camera alone films.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def joint_tracks(
 ) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
-    People whom a broadcast camera alone films have the joints of their bodies; all joints are NaN
+    People that a broadcast camera alone films have the joints of their bodies; all joints are NaN
     if none has a body. Triangulated joints have the detector's definition always.
 
     Raises:
@@ -121,7 +121,7 @@ def person_kinds(run: Run, clip: str) -> dict[int, str]:
 def clip_positions(run: Run, clip: str) -> Positions:
     """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet.
 
-    Bodies of people whom a broadcast camera alone films stand where their feet do: kind plane.
+    Bodies of people that a broadcast camera alone films stand where their feet do: kind plane.
     """
     tracks, (tracking, known) = joint_tracks(run, clip), tracked_people(run, clip)
     person = tracking["person"].values.astype(np.int64)

@@ -76,7 +76,18 @@ def export_joints(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_coco(origin: Origin, out: Path) -> list[Path]:
-    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several."""
+    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several.
+
+    Raises:
+        UsageError: the match has no static cameras.
+    """
+    if not origin.spec.static_cameras:
+        raise UsageError(
+            "--format coco",
+            expected="a match with static cameras, whose keypoints this format holds",
+            found="a match with a broadcast camera alone",
+            todo="Choose another format, such as joints.",
+        )
     written = []
     for clip in origin.clips:
         tracks = origin.tracks(clip)

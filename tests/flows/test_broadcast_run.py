@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from command_line import succeed
+from command_line import succeed, worldpose
 
 import worldpose as library
 from worldpose.video import VideoReader
@@ -81,6 +81,10 @@ def test_a_broadcast_camera_alone_gives_places_and_with_estimates_bodies(server,
     assert "Broadcast camera" in page
     assert "body from keypoints px" in page
     assert "and no body" not in page
+
+    refused = worldpose("export", name, *project, "--format", "coco", "--out", tmp_path / "coco")
+    assert refused.code == 2
+    assert "a match with a broadcast camera alone" in refused.err
 
     turn_upside_down(given, left_of=700.0)
     answer = succeed("run", match, *project)

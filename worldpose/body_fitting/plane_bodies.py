@@ -1,4 +1,4 @@
-"""Bodies of people whom one camera alone sees: monocular poses, placed on the pitch by the feet.
+"""Bodies of people that one camera alone sees: monocular poses, placed on the pitch by the feet.
 
 No view determines the distance of such a person. The feet give it, since they stand on the pitch; a
 monocular method gives the pose, turned into the world by the calibrated camera; the image's
@@ -184,7 +184,7 @@ def fit_bodies_on_plane(
     ground: Ground,
     settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
 ) -> PlaneBodies:
-    """Return the bodies of people whom one camera alone sees (S1-S4 without triangulation).
+    """Return the bodies of people that one camera alone sees (S1-S4 without triangulation).
 
     The covariance contains the distance that the feet leave open, the foot's bias over the slope of
     the line of sight, and a lean. Joints in depth are as uncertain as the monocular angles.

@@ -1,4 +1,4 @@
-"""Bodies of people whom one camera alone sees, from monocular poses and places on the pitch."""
+"""Bodies of people that one camera alone sees, from monocular poses and places on the pitch."""
 
 from __future__ import annotations
 
