@@ -106,7 +106,7 @@ def outside(settings: RefittingSettings) -> dict[str, JsonValue]:
     return body_fitting.digest_of_model(settings.body_model)
 
 
-def filtered(match: Match, unit: str) -> tuple[str, ...]:
+def filtering_inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the filtering results of the clip's detections; none without static cameras."""
     return tracking.filtering_inputs(match, unit) if match.has_static_cameras else ()
 
@@ -118,7 +118,7 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=filtered,
+    previous_pass_inputs=filtering_inputs,
     late_inputs=tracking.found_again,
     external_inputs=outside,
 )

@@ -296,8 +296,7 @@ class _Clip:
         place = self.evidence.place[:, person]
         known, at = np.isfinite(place).all(axis=-1), np.flatnonzero(self.agreeing[:, person])
         frames = np.arange(len(place))
-        nearest = np.abs(frames[:, None] - at).argmin(axis=1)
-        covered = known & (np.abs(frames - at[nearest]) <= MAX_BRIDGED_S * fps)
+        covered = known & (_distance_to(at, frames) <= MAX_BRIDGED_S * fps)
         first, last = np.flatnonzero(covered)[[0, -1]]
         span = slice(int(first), int(last) + 1)
         own = frames[span]
@@ -536,6 +535,13 @@ def _contradiction(misfit: Floats, turned: Floats) -> str | None:
     return None
 
 
+def _distance_to(at: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distance of each of `frames` from the nearest of the rising frames `at`."""
+    after = at[np.searchsorted(at, frames).clip(max=len(at) - 1)]
+    before = at[(np.searchsorted(at, frames, side="right") - 1).clip(min=0)]
+    return np.minimum(np.abs(frames - before), np.abs(after - frames))
+
+
 def _smooth_poses(
     poses: MonocularPoses,
     person: int,
@@ -554,9 +560,11 @@ def _smooth_poses(
     """
     orient = np.empty((len(frames), 3, 3))
     angles = np.empty((len(frames), SIZE))
-    for row, frame in enumerate(frames):
-        away = np.abs(at - frame)
-        near = at[away <= max(reach, int(away.min()))]
+    width = np.maximum(reach, _distance_to(at, frames))
+    first = np.searchsorted(at, frames - width)
+    last = np.searchsorted(at, frames + width, side="right")
+    for row in range(len(frames)):
+        near = at[first[row] : last[row]]
         turns = poses.orient[near, person]
         weight = np.ones(len(near))
         for _ in range(3):
