@@ -539,7 +539,7 @@ def _distance_to(at: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np
     """Return the distance of each of `frames` from the nearest of the rising frames `at`."""
     after = at[np.searchsorted(at, frames).clip(max=len(at) - 1)]
     before = at[(np.searchsorted(at, frames, side="right") - 1).clip(min=0)]
-    return np.minimum(np.abs(frames - before), np.abs(after - frames))
+    return np.asarray(np.minimum(np.abs(frames - before), np.abs(after - frames)))
 
 
 def _smooth_poses(
