@@ -9,7 +9,7 @@ REFITTING = BODY_FITTING.model_copy(
     update={
         "stage": "refitting",
         "about": "Every person's body, fitted again with keypoints of the broadcast camera and "
-        "shapes of other clips.",
+        "shapes of other clips; or the bodies of people that the broadcast camera alone films.",
         "arrays": (
             *BODY_FITTING.arrays,
             ArrayLayout(
@@ -29,6 +29,21 @@ REFITTING = BODY_FITTING.model_copy(
                 missing="none",
                 about="other clips contributed to the person's shape",
             ),
+            ArrayLayout(
+                name="views",
+                dims=("frame", "person", "joint"),
+                dtype="int16",
+                unit="1",
+                missing="0",
+                about="1 where the broadcast camera shows the joint; only of people that no static "
+                "camera films",
+                chunk_dim="frame",
+            ),
         ),
+        "optional": ("views",),
+        "attributes": {
+            **BODY_FITTING.attributes,
+            "without_body": "people that no static camera films and who have no body: id to reason",
+        },
     }
 )

@@ -107,7 +107,7 @@ def fit_people(
         template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
         ground = people.clip.raise_pitch(template).height
     settings = BodyFittingSettings.model_validate(recipe.settings)
-    model = _body(settings.body_model, sources["body_model_sha256"])
+    model = find_same_body(settings.body_model, sources["body_model_sha256"])
     alone = find_ray_constraints(people.clip.cameras, people.detections, people.joints)
     fit = fit_bodies(
         model,
@@ -133,8 +133,9 @@ def publish_fit(
     model: BodyModel,
     fit: BodyFit,
     further: Mapping[str, NDArray[Any]] | None = None,
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write bodies, the arrays in `further`, and their metrics."""
+    """Write bodies, the arrays in `further`, the group's other attributes, and their metrics."""
     result.write(
         layout,
         arrays={
@@ -151,7 +152,7 @@ def publish_fit(
             **(further or {}),
         },
         coordinates={"frame": people.detections.frame, "person": people.person},
-        attributes={"body_model": model.name},
+        attributes={"body_model": model.name, **(attributes or {})},
     )
     far = far_offsets(fit.offsets, people.common_bias)
     if far:
@@ -169,7 +170,7 @@ def publish_fit(
     result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))
 
 
-def _body(name: str, sha256: str | None) -> BodyModel:
+def find_same_body(name: str, sha256: str | None) -> BodyModel:
     """Return the body model of the run plan."""
     if sha256 is not None and digest_of_body(name) != sha256:
         raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -29,17 +30,9 @@ def broadcast_tracking(work: Work) -> str:
     store = Store.open(work.project)
     sources: dict[str, Any] = work.recipe.sources
     first, count = sources["first_frame"], sources["frame_count"]
-    inputs = {name.partition("/")[0]: name for name in work.recipe.inputs}
-    calibrated = open_input(store, work, inputs["broadcast_calibration"])
-    camera = inputs.get("broadcast_pooling")
-    moving = calibrated if camera is None else open_input(store, work, camera)
-    detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
-    detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
-    # The surface that the calibration found: people stand on it as the markings lie on it.
-    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SURFACE}
-    known = {name: value for name, value in surface.items() if value is not None}
-    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"] | known))
-    positions = _locate_people(detections, moving, pitch)
+    filmed = open_broadcast(store, work)
+    detections, pitch = filmed.detections, filmed.pitch
+    positions = _locate_people(detections, filmed.camera, pitch)
     size = (pitch.length, pitch.width)
     tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
     index = tracks.detection_index[:, 0]
@@ -63,10 +56,11 @@ def broadcast_tracking(work: Work) -> str:
                 "tracks": [_track(number, seen, first) for number, seen in enumerate(index.T)],
             },
         )
-        if sources["has_estimates"]:
+        if index.shape[1] and not sources["has_estimates"]:
             result.warnings.append(
-                f"{work.recipe.name}: the monocular poses of the clip are not used, as bodies need "
-                "people that static cameras triangulate. Add static cameras, or take the file out."
+                f"{work.recipe.name}: people have places on the pitch and no bodies. To get bodies "
+                f"from one camera, save a monocular method's poses as estimates/{work.recipe.unit}"
+                ".npz in the match folder, and run again."
             )
         result.figures["people"] = float(index.shape[1])
         if found:
@@ -80,6 +74,38 @@ def broadcast_tracking(work: Work) -> str:
                 "there. Check the camera in the report, and the detections."
             )
     return work.key
+
+
+@dataclass(frozen=True, eq=False)
+class BroadcastInputs:
+    """The broadcast camera of a clip, and what it sees.
+
+    Attributes:
+        detections: stored detections of the clip's frames.
+        camera: the stored moving camera, at the pooled position if there is one.
+        pitch: surface under the feet, as the calibration found it.
+    """
+
+    detections: xr.Dataset
+    camera: xr.Dataset
+    pitch: PitchTemplate
+
+
+def open_broadcast(store: Store, work: Work) -> BroadcastInputs:
+    """Read the broadcast camera and its detections in the clip of `work`."""
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    inputs = {name.partition("/")[0]: name for name in work.recipe.inputs}
+    calibrated = open_input(store, work, inputs["broadcast_calibration"])
+    camera = inputs.get("broadcast_pooling")
+    moving = calibrated if camera is None else open_input(store, work, camera)
+    detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
+    detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
+    # The surface that the calibration found: people stand on it as the markings lie on it.
+    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SURFACE}
+    known = {name: value for name, value in surface.items() if value is not None}
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"] | known))
+    return BroadcastInputs(detections, moving, pitch)
 
 
 def _locate_people(

@@ -1,4 +1,7 @@
-"""Task of stage `refitting`: bodies refitted with the broadcast camera and other clips' shapes."""
+"""Task of stage `refitting`: bodies refitted with the broadcast camera and other clips' shapes.
+
+Without static cameras: bodies of the people that the broadcast camera alone films.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from data_contracts.arrays import Floats
 from data_contracts.refitting import REFITTING
 from data_contracts.work import Work
 from tasks.body_fitting import fit_people, open_people, publish_fit
+from tasks.plane_bodies import publish_plane_bodies
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
     BodyFittingSettings,
@@ -40,6 +44,10 @@ def refitting(work: Work) -> str:
     """Publish bodies and their keypoints; return the key."""
     store = Store.open(work.project)
     unit = work.recipe.unit
+    if f"broadcast_tracking/{unit}" in work.recipe.inputs:
+        with store.publish(work) as result:
+            publish_plane_bodies(store, work, result)
+        return work.key
     before = store.manifest(
         work.recipe.match_id, "body_fitting", unit, work.recipe.inputs[f"body_fitting/{unit}"]
     ).recipe
@@ -60,7 +68,7 @@ def refitting(work: Work) -> str:
         recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
         pooled = np.isin(np.arange(len(people.person)), list(known))
         further = {"recognised": recognised, "pooled": pooled}
-        publish_fit(result, REFITTING, people, model, fit, further)
+        publish_fit(result, REFITTING, people, model, fit, further, {"without_body": {}})
         moved = np.linalg.norm(fit.joints - joints, axis=-1)
         result.figures["recognised"] = float(recognised.sum())
         result.figures["pooled"] = float(pooled.sum())

@@ -205,7 +205,7 @@ def _next_command(record: RunRecord) -> str:
         return f"worldpose why {record.match_id}, which says what failed and why"
     if record.waiting:
         return f"worldpose review serve, to decide; then worldpose run {record.match_id} again"
-    if "body_fitting" in {name.partition("/")[0] for name in record.results}:
+    if {"body_fitting", "broadcast_tracking"} & {n.partition("/")[0] for n in record.results}:
         return f"worldpose report {record.match_id}"
     return f"worldpose run {record.match_id}, for the stages after these"
 

@@ -144,6 +144,10 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
         )
         titles = (f">{_BODIES[name][0]}" for name in columns)
         tables.append(Table(clip_title(clip), (">person", *titles), rows))
+        without = run[unit].attrs.get("without_body") or {}
+        if without:
+            heading = f"{clip_title(clip)}: people with a place on the pitch and no body"
+            tables.append(Table(heading, (">person", "reason"), tuple(without.items())))
     return tables
 
 

@@ -122,7 +122,8 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             "People",
             tuple(people_tables(run, clips, match.folder.spec.fps)),
             "Triangulated: joints and body in 3D. Plane: placed on the pitch by the feet, where "
-            "too few cameras see the person. Mixed: both, in different frames.",
+            "too few cameras see the person; a body of such a person comes from the poses of a "
+            "monocular method. Mixed: both, in different frames.",
         ),
         extent_section(run, match),
         Section(

@@ -63,14 +63,15 @@ def joint_tracks(
 ) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
-    All joints are NaN of people that only a broadcast camera films. Triangulated joints have the
-    detector's definition always.
+    People that a broadcast camera alone films have the joints of their bodies; all joints are NaN
+    if none has a body. Triangulated joints have the detector's definition always.
 
     Raises:
         UsageError: the run has no such result.
     """
     stages = [name for name in reversed(JOINT_STAGES) if f"{name}/{clip}" in run]
-    if stage is None and not stages and f"{PLANE}/{clip}" in run:
+    on_plane = f"{PLANE}/{clip}" in run
+    if stage is None and on_plane and not (stages and run[f"{stages[0]}/{clip}"].sizes["person"]):
         tracked = run[f"{PLANE}/{clip}"]
         index = tracked["detection_index"].values
         return JointTracks(
@@ -88,10 +89,12 @@ def joint_tracks(
             todo="Run the match to the end first.",
         )
     result = run[f"{stages[0]}/{clip}"]
-    seen = placed_joints(run, clip) if stages[0] in BODY_STAGES else result
+    fitted = stages[0] in BODY_STAGES and not on_plane
+    seen = placed_joints(run, clip) if fitted else result
     joints, covariance = result["joints"].values, result["covariance"].values
     if stages[0] in BODY_STAGES and definition == "detector":
         joints = perceived_joints(joints, result["joint_offsets"].values)
+    if fitted and definition == "detector":
         covariance = perceived_covariance(covariance, seen["common_bias"].values)
     return JointTracks(
         frames=result["frame"].values,
@@ -116,7 +119,10 @@ def person_kinds(run: Run, clip: str) -> dict[int, str]:
 
 
 def clip_positions(run: Run, clip: str) -> Positions:
-    """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet."""
+    """Return the people of one clip on the pitch: the mid-hip of their joints, or their feet.
+
+    Bodies of people that a broadcast camera alone films stand where their feet do: kind plane.
+    """
     tracks, (tracking, known) = joint_tracks(run, clip), tracked_people(run, clip)
     person = tracking["person"].values.astype(np.int64)
     xy = np.full((len(tracks.frames), len(person), 2), np.nan)
@@ -132,6 +138,8 @@ def clip_positions(run: Run, clip: str) -> Positions:
         xy[on_plane] = feet["ground"].values[on_plane]
         covariance[on_plane] = feet["ground_covariance"].values[on_plane]
         height = feet["ground_height"].values.astype(np.float64)
+    if f"{PLANE}/{clip}" in run:
+        on_plane = np.isfinite(xy[..., 0])
     names = [known[one].name or "" for one in person.tolist()]
     return Positions(tracks.frames, person, names, on_plane, xy, covariance, height)
 

@@ -212,7 +212,7 @@ class BodiesOfBoth:
 
 def bodies_of_both(a: Run, b: Run) -> Iterator[BodiesOfBoth]:
     """Yield the clips whose bodies differ between two runs."""
-    clips = {unit.partition("/")[2] for unit in a if unit.startswith("body_fitting/")}
+    clips = {unit.partition("/")[2] for unit in a if unit.partition("/")[0] in BODY_STAGES}
     for clip in sorted(clips):
         one, other = bodies_unit(a, clip), bodies_unit(b, clip)
         if other not in b or a.record.results[one] == b.record.results[other]:

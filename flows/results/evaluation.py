@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from data_contracts.evaluation import Evaluation
@@ -95,6 +95,9 @@ def score(
         tracks, laid = _laid_over(Path(reference), estimate.joints, rate, marker_map)
         truth = Side(tracks, {})
     spec = None if match is None else match.spec
+    is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
+    if is_broadcast and truth.joints is not None:  # `views` counts static cameras
+        truth = replace(truth, joints=replace(truth.joints, views=None))
     true_cameras = cameras_of(reference, truth, spec)
     if match_in is not None and match_in not in true_cameras:
         raise UsageError(

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from data_contracts.pin import Pin
 from data_contracts.release import BaselineSettings, ReleasedClip, ReleaseManifest
 from flows.results.best_results import (
+    PLANE,
     Origin,
     bodies_unit,
     broadcast_camera,
     camera_in_frames,
     clip_positions,
     fitted_bodies,
+    person_kinds,
     placed_joints,
     static_cameras,
 )
@@ -30,6 +32,7 @@ from worldpose.dataset.manifest import (
     read_manifest,
     released_files,
     write_frame_rates,
+    write_kinds,
     write_manifest,
     write_origins,
 )
@@ -73,7 +76,18 @@ def export_joints(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_coco(origin: Origin, out: Path) -> list[Path]:
-    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several."""
+    """Write `<camera>.json` for each static camera, in `<clip>/` if there are several.
+
+    Raises:
+        UsageError: the match has no static cameras.
+    """
+    if not origin.spec.static_cameras:
+        raise UsageError(
+            "--format coco",
+            expected="a match with static cameras, whose keypoints this format holds",
+            found="a match with a broadcast camera alone",
+            todo="Choose another format, such as joints.",
+        )
     written = []
     for clip in origin.clips:
         tracks = origin.tracks(clip)
@@ -267,7 +281,10 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
 
 def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
-    """Write formats like `export`, also for a release, whose manifest has the frame rate."""
+    """Write formats like `export`, also for a release, whose manifest has the frame rate.
+
+    If a broadcast camera alone films people, kinds.json tells that they are not triangulated.
+    """
     for form in forms:
         if form not in EXPORTS:
             raise UsageError(
@@ -283,7 +300,12 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
             found="formats that all write cameras/<clip>.npz",
             todo="Export them into different folders.",
         )
-    return [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+    written = [path for form in dict.fromkeys(forms) for path in EXPORTS[form](origin, out)]
+    on_plane = [clip for clip in origin.clips if f"{PLANE}/{clip}" in origin.run]
+    if on_plane:
+        kinds = {clip: person_kinds(origin.run, clip) for clip in on_plane}
+        written.append(write_kinds(out, kinds))
+    return written
 
 
 def _keep(store: Store, origin: Origin, name: str) -> None:

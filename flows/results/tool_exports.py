@@ -78,7 +78,11 @@ def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
     if stage in BODY_STAGES:
         model = origin.run[f"{stage}/{clip}"].attrs["body_model"]
         owner = "detector sees" if origin.definition == "detector" else "model has"
-        return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them"
+        alone = ", from one camera by feet on the pitch and a monocular method's poses"
+        how = alone if f"{PLANE}/{clip}" in origin.run else ""
+        return f"COCO-17 keypoints of the fitted body {model}, where the {owner} them{how}"
+    if stage == PLANE:
+        return "none: people are placed on the pitch by their feet"
     return "COCO-17 keypoints of the detector, triangulated"
 
 

@@ -26,13 +26,18 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
 
 
 def outside(settings: BodyFittingSettings) -> dict[str, JsonValue]:
+    """Return the digest of an installed body model."""
+    return digest_of_model(settings.body_model)
+
+
+def digest_of_model(name: str) -> dict[str, JsonValue]:
     """Return the digest of an installed body model.
 
     It is None for the open body, which is part of the code and so of the code's digest.
     """
-    if settings.body_model == OPEN_BODY:
+    if name == OPEN_BODY:
         return {"body_model_sha256": None}
-    return {"body_model_sha256": digest_of_body(settings.body_model)}
+    return {"body_model_sha256": digest_of_body(name)}
 
 
 STAGE = Stage(

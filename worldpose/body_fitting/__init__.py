@@ -29,6 +29,11 @@ if TYPE_CHECKING:
         place_monocular_poses,
         read_monocular,
     )
+    from worldpose.body_fitting.plane_bodies import (
+        PlaneBodies,
+        PlaneEvidence,
+        fit_bodies_on_plane,
+    )
     from worldpose.body_fitting.ray_constraints import (
         RayConstraints,
         constrain_to_rays,
@@ -47,12 +52,15 @@ __all__ = [
     "ClipEvidence",
     "MonocularEstimates",
     "MonocularPoses",
+    "PlaneBodies",
+    "PlaneEvidence",
     "RayConstraints",
     "Shape",
     "constrain_to_rays",
     "far_offsets",
     "find_ray_constraints",
     "fit_bodies",
+    "fit_bodies_on_plane",
     "fit_shape",
     "identify_people",
     "measure_bones",
@@ -85,6 +93,11 @@ __getattr__ = import_on_use(
             "MonocularPoses",
             "place_monocular_poses",
             "read_monocular",
+        ),
+        "worldpose.body_fitting.plane_bodies": (
+            "PlaneBodies",
+            "PlaneEvidence",
+            "fit_bodies_on_plane",
         ),
         "worldpose.body_fitting.ray_constraints": (
             "RayConstraints",

@@ -167,7 +167,7 @@ def fit_bodies(
         known_shapes or {},
         fps,
     )
-    result = _Result.empty(model, frames, persons, bias)
+    result = FittedArrays.empty(model, frames, persons, bias)
     for person, span in spans.items():
         pose, factor = solver.solve_poses(
             by_person[person], shapes.people[person], shapes.offsets, fps
@@ -190,7 +190,7 @@ def fit_bodies(
 
 
 def _monocular_priors(
-    result: _Result,
+    result: FittedArrays,
     joint_seen: NDArray[np.bool_],
     covariance: Floats,
     estimates: MonocularPoses,
@@ -228,7 +228,7 @@ def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Result:
+class FittedArrays:
     """Arrays of a fit in progress."""
 
     betas: Floats
@@ -243,7 +243,11 @@ class _Result:
     common_bias: Floats
 
     @classmethod
-    def empty(cls, model: BodyModel, frames: int, persons: int, common_bias: Floats) -> _Result:
+    def empty(
+        cls, model: BodyModel, frames: int, persons: int, common_bias: Floats
+    ) -> FittedArrays:
+        """Return arrays without any body."""
+
         def nan(*shape: int) -> Floats:
             return np.full(shape, np.nan)
 

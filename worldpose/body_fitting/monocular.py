@@ -189,7 +189,8 @@ def place_monocular_poses(
     known = np.isfinite(image)
     low = np.where(known, image, np.inf).min(axis=2, initial=np.inf)
     high = np.where(known, image, -np.inf).max(axis=2, initial=-np.inf)
-    middle, height = 0.5 * (low + high), high[..., 1] - low[..., 1]
+    with np.errstate(invalid="ignore"):  # without a camera, inf - inf
+        middle, height = 0.5 * (low + high), high[..., 1] - low[..., 1]
     for place in np.flatnonzero(np.isin(frame, estimates.frame)):
         rows = np.flatnonzero(estimates.frame == frame[place])
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -11,7 +11,7 @@ seconds of each person are used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -96,12 +96,7 @@ class Solver:
             ]
             searched = guided if costs[1] < costs[0] else searched
         pose, track = searched
-        damped = replace(
-            track,
-            acceleration=track.acceleration * ACCELERATION_WEIGHT**0.5,
-            contacts=None if track.contacts is None else track.contacts.of(evidence.known),
-        )
-        return pose, factor(damped.equations(pose, offsets, bordered=False).blocks)
+        return pose, factor_information(track, pose, offsets)
 
     def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
         """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
@@ -158,6 +153,16 @@ def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
     )
 
 
+def factor_information(track: Track, pose: Pose, offsets: Floats) -> BandedFactor:
+    """Return the factor of the information matrix of a solved track's poses."""
+    damped = replace(
+        track,
+        acceleration=track.acceleration * ACCELERATION_WEIGHT**0.5,
+        contacts=None if track.contacts is None else track.contacts.of(track.evidence.known),
+    )
+    return factor(damped.equations(pose, offsets, bordered=False).blocks)
+
+
 def factor(blocks: Floats) -> BandedFactor:
     """Return the factor of blocks with a little damping.
 
@@ -198,7 +203,7 @@ class Shapes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
+class Piece:
     """An interval of a person's track, with its current bodies."""
 
     person: int
@@ -209,7 +214,7 @@ class _Piece:
 def fit_shapes(
     solver: Solver, people: Mapping[int, Joints], known: Mapping[int, Shape], fps: float
 ) -> Shapes:
-    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well.
+    """Return betas and the detector's offsets of people with triangulated joints.
 
     Args:
         solver: body, prior, settings and ground.
@@ -217,14 +222,28 @@ def fit_shapes(
         known: shapes of some persons from other clips; the others start from the prior.
         fps: [1/s].
     """
-    settings, count = solver.settings, solver.chained.model.shapes
-    prior_shape = Shape(np.zeros(count), np.eye(count) / settings.shape_weight)
-    prior_shapes = {person: known.get(person, prior_shape) for person in people}
     pieces = [
         piece
         for person, (joints, covariance) in people.items()
         for piece in _sample_pieces(solver, person, joints, covariance, fps)
     ]
+    return solve_shapes(solver, people, pieces, known)
+
+
+def solve_shapes(
+    solver: Solver, people: Iterable[int], pieces: Sequence[Piece], known: Mapping[int, Shape]
+) -> Shapes:
+    """Return all persons' betas and the detector's offsets, by Gauss-Newton over poses as well.
+
+    Args:
+        solver: body, prior, settings and ground.
+        people: the persons.
+        pieces: intervals of their tracks; a person without any keeps the prior shape.
+        known: shapes of some persons from other clips; the others start from the prior.
+    """
+    settings, count = solver.settings, solver.chained.model.shapes
+    prior_shape = Shape(np.zeros(count), np.eye(count) / settings.shape_weight)
+    prior_shapes = {person: known.get(person, prior_shape) for person in people}
     found = dict(prior_shapes)
     unknowns = np.zeros(MIRRORED_OFFSETS.shape[-1])
     spread = settings.bias_std_m**2 * np.eye(len(unknowns))
@@ -294,7 +313,7 @@ def fit_shapes(
 
 def _sample_pieces(
     solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
-) -> list[_Piece]:
+) -> list[Piece]:
     """Return intervals of a person's track for shape estimation, with initial bodies."""
     settings, model = solver.settings, solver.chained.model
     stride = max(1, int(fps / settings.shape_rate_hz))
@@ -303,7 +322,7 @@ def _sample_pieces(
     bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
     pieces = []
-    for part in _spread_intervals(len(joints), fps, settings):
+    for part in spread_intervals(len(joints), fps, settings):
         some, sure = joints[part][::stride], covariance[part][::stride]
         if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
             continue
@@ -318,11 +337,11 @@ def _sample_pieces(
             settings.shape_pose_weight,
         )
         pose = Pose(*start_poses(model, betas, interpolate_gaps(some), solver.prior), betas)
-        pieces.append(_Piece(person, track, pose))
+        pieces.append(Piece(person, track, pose))
     return pieces
 
 
-def _spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
+def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
     """Return evenly spread intervals of `frames`, `shape_time_s` in total; all frames if fewer."""
     if frames <= settings.shape_time_s * fps:
         return [slice(0, frames)]

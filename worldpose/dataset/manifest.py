@@ -74,6 +74,35 @@ FRAME_RATES: Final = "frame_rates.json"
 _RATES = TypeAdapter(dict[str, PositiveFloat])
 
 
+KINDS: Final = "kinds.json"
+"""File with the kind of every person: triangulated, mixed or plane."""
+_KINDS = TypeAdapter(dict[str, dict[str, str]])
+
+
+def write_kinds(folder: Path, kinds: Mapping[str, Mapping[int, str]]) -> Path:
+    """Add the kinds of clips' people, by clip and id, to those in the folder; return the file.
+
+    Raises:
+        InputError: the existing file has another format.
+    """
+    path = folder / KINDS
+    try:
+        known = _KINDS.validate_json(path.read_bytes()) if path.is_file() else {}
+    except ValidationError as error:
+        raise InputError(
+            str(path),
+            expected="clips and the kinds of their people by id",
+            found=str(error.errors()[0]["msg"]),
+            todo="Remove the file, and export again.",
+        ) from error
+    known |= {
+        clip: {str(person): kind for person, kind in of.items()} for clip, of in kinds.items()
+    }
+    with whole_file(path) as draft:
+        draft.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    return path
+
+
 def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
     """Add clips' frames per second [1/s] to the folder's existing ones; return the file.
 

@@ -53,8 +53,8 @@ class Positions:
         frames: (frames,) match frames.
         person: (persons,) ids.
         names: (persons,) roster id; empty where not known.
-        on_plane: (frames, persons), whether the place is that of the feet alone, else the mid-hip
-            of triangulated joints.
+        on_plane: (frames, persons), whether the feet alone give the place, or that of a body fitted
+            in one camera's image; else it is the mid-hip of triangulated joints.
         xy: (frames, persons, 2) [m], world; NaN where missing.
         covariance: (frames, persons, 2, 2) [m^2].
         height: (persons,) [m]; NaN where not known.

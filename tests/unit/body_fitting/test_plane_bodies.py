@@ -1,0 +1,258 @@
+"""Bodies of people that one camera alone sees, from monocular poses and places on the pitch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+from walking_bodies import KEYPOINTS, MODEL, walker
+
+from worldpose.body import BodyParameters
+from worldpose.body_fitting import PlaneEvidence, fit_bodies_on_plane
+from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
+from worldpose.body_fitting.objective import ankle_height
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
+
+FPS, FRAMES = 25.0, 30
+CENTER = np.array([0.0, -60.0, 14.0])
+PLACE_STD = np.array([0.08, 0.30])
+"""Errors of places across and along the line of sight [m]."""
+
+
+def turn(*vector):
+    return Rigid.from_rotvec(np.array(vector), np.zeros(3)).rotation
+
+
+def panning_camera(frames):
+    """A camera 60 m beside the pitch, 14 m up, that pans past the origin."""
+    pan = np.linspace(-0.03, 0.08, frames)
+    down = np.arctan2(CENTER[2] - 1.0, -CENTER[1])
+    x = np.stack([np.cos(pan), np.sin(pan), 0.0 * pan], axis=-1)
+    ahead = np.stack([-np.sin(pan), np.cos(pan), 0.0 * pan], axis=-1)
+    z = np.cos(down) * ahead - np.sin(down) * np.array([0.0, 0.0, 1.0])
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    return Camera(
+        focal=np.full((frames, 2), 3500.0),
+        principal_point=np.tile([959.5, 539.5], (frames, 1)),
+        distortion=np.zeros((frames, 5)),
+        cam_from_world=Rigid(rotation, -rotation @ CENTER),
+        image_size=np.array([1920, 1080]),
+    )
+
+
+class Clip:
+    """Two people who walk on flat ground, their estimates and detections."""
+
+    def __init__(self, seed, *, frames=FRAMES, errors=None, speed=1.0):
+        rng = np.random.default_rng(seed)
+        walkers = [walker(frames, rng, fps=FPS) for _ in range(2)]
+        values = []
+        for k, body in enumerate(walkers):
+            joints = KEYPOINTS(body)
+            lowest = joints[:, 15:17, 2].min(axis=1)
+            transl = body.transl + [-3.0 + 6.0 * k, 4.0 * k, 0.0]
+            transl[:, 2] += ankle_height(MODEL, body.betas[0]) - lowest
+            values.append((body.betas, body.global_orient, body.body_pose, transl))
+        self.bodies = BodyParameters(*(np.stack(v, axis=1) for v in zip(*values, strict=True)))
+        self.truth = KEYPOINTS(self.bodies)
+        self.camera = panning_camera(frames)
+        drawn = estimate_bodies(
+            MODEL, self.bodies, self.camera, FPS, errors or MonocularErrors(), rng
+        )
+        self.estimates = parse_monocular(drawn, "estimates")
+        flat = self.truth.reshape(frames, -1, 3)
+        image = self.camera.project(flat).reshape(frames, 2, 17, 2)
+        slow, quick = rng.normal(0.0, 1.2, (1, 2, 17, 2)), rng.normal(0.0, 1.2, image.shape)
+        self.keypoints = image + slow + quick
+        hips = self.truth[:, :, 11:13, :2].mean(axis=2)
+        sight = hips - CENTER[:2]
+        sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+        across = np.stack([sight[..., 1], -sight[..., 0]], axis=-1)
+        axes = np.stack([across, sight], axis=-1)
+        off = rng.normal(0.0, PLACE_STD, (1, 2, 2))
+        self.place = hips + (axes @ off[..., None])[..., 0]
+        self.covariance = axes @ np.diag(PLACE_STD**2) @ np.swapaxes(axes, -1, -2)
+
+    def evidence(self, **changes):
+        given = {
+            "camera": self.camera,
+            "number": np.arange(len(self.truth)),
+            "keypoints": self.keypoints,
+            "confidence": np.full(self.truth.shape[:3], 0.9),
+            "place": self.place,
+            "place_covariance": self.covariance,
+            "calibration": np.zeros_like(self.covariance),
+            "fps": FPS,
+        }
+        return PlaneEvidence(**{**given, **changes})
+
+    def fit(self, estimates=None, **changes):
+        estimates = self.estimates if estimates is None else estimates
+        return fit_bodies_on_plane(
+            MODEL, self.evidence(**changes), estimates, lambda x, y: 0.0 * (x + y)
+        )
+
+    def errors(self, joints):
+        return np.linalg.norm(joints - self.truth, axis=-1)
+
+    def rows_of(self, person):
+        """Rows of the estimates that show a person."""
+        image = self.camera.project(self.truth.reshape(len(self.truth), -1, 3))
+        middle = image.reshape(len(self.truth), 2, 17, 2).mean(axis=2)
+        center, frame = self.estimates.center, self.estimates.frame
+        return np.linalg.norm(middle[frame] - center[:, None], axis=-1).argmin(axis=1) == person
+
+
+def some_rows(estimates, kept):
+    return MonocularEstimates(
+        estimates.frame[kept], estimates.rotations[kept], estimates.center[kept], estimates.cropped
+    )
+
+
+def centred(clip, joints):
+    off = joints - clip.truth
+    return np.linalg.norm(off - off.mean(axis=2, keepdims=True), axis=-1)
+
+
+def test_fitted_bodies_are_nearer_to_the_truth_than_placed_ones():
+    placed, fitted, around = [], [], []
+    for seed in range(4):
+        clip = Clip(seed)
+        bodies = clip.fit()
+        assert bodies.missing == (None, None)
+        assert np.isfinite(bodies.fit.joints).all()
+        placed.append(clip.errors(bodies.placed))
+        fitted.append(clip.errors(bodies.fit.joints))
+        around.append((centred(clip, bodies.placed), centred(clip, bodies.fit.joints)))
+    assert np.nanmean(fitted) < 0.75 * np.nanmean(placed)
+    before, after = (np.nanmean([pair[k] for pair in around]) for k in (0, 1))
+    assert before > 0.12
+    assert after < 0.07
+
+
+def test_regions_hold_the_truth_and_are_long_in_depth():
+    inside, ratios = [], []
+    for seed in range(4, 8):
+        clip = Clip(seed)
+        fit = clip.fit().fit
+        off = fit.joints - clip.truth
+        square = (off * np.linalg.solve(fit.covariance, off[..., None])[..., 0]).sum(axis=-1)
+        inside.append(square < chdtri(3, 0.05))
+        sight = clip.truth[:, :, 11] - CENTER
+        sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+        hips = fit.covariance[:, :, 11]
+        along = np.einsum("fpa,fpab,fpb->fp", sight, hips, sight)
+        ratios.append(along / hips[..., 0, 0])
+    assert np.mean(inside) > 0.9
+    assert np.median(ratios) > 4.0
+
+
+def test_a_wrong_size_a_lean_and_half_turns_hardly_matter():
+    rng = np.random.default_rng(0)
+    clip = Clip(8, errors=MonocularErrors(size=0.4))
+    rotations = clip.estimates.rotations.copy()
+    rotations[:, 0] = turn(np.radians(8.0), 0.0, 0.0) @ rotations[:, 0]
+    turned = rng.random(len(rotations)) < 0.05
+    rotations[turned, 0] = rotations[turned, 0] @ turn(0.0, np.pi, 0.0)
+    usual, leaning = clip.fit(), clip.fit(replace(clip.estimates, rotations=rotations))
+    assert leaning.missing == (None, None)
+    assert np.nanmean(centred(clip, leaning.placed)) > 0.15
+    assert np.mean(centred(clip, leaning.fit.joints)) < 0.08
+    assert np.mean(clip.errors(leaning.fit.joints)) < 1.5 * np.mean(clip.errors(usual.fit.joints))
+
+
+def test_a_person_without_estimates_has_no_body_and_changes_no_other():
+    clip = Clip(9)
+    bodies = clip.fit(some_rows(clip.estimates, clip.rows_of(0)))
+    assert bodies.missing == (None, "no monocular estimate lies at the person's keypoints")
+    assert np.isfinite(bodies.fit.joints[:, 0]).all()
+    for array in (bodies.fit.joints, bodies.fit.covariance, bodies.fit.parameters.transl):
+        assert np.isnan(array[:, 1]).all()
+    assert np.isnan(bodies.fit.betas[1]).all()
+    assert not bodies.views[:, 1].any()
+
+
+def test_no_estimate_at_all_leaves_all_people_without_bodies():
+    clip = Clip(9)
+    bodies = clip.fit(some_rows(clip.estimates, np.zeros(len(clip.estimates.frame), bool)))
+    assert all("no monocular estimate" in reason for reason in bodies.missing)
+    assert np.isnan(bodies.fit.joints).all()
+    assert bodies.fit.offsets.shape == (17, 3)
+
+
+@pytest.mark.parametrize("case", ["upside down", "turned round"])
+def test_estimates_that_contradict_the_keypoints_are_refused_with_the_reason(case):
+    clip = Clip(10)
+    rotations = clip.estimates.rotations.copy()
+    wrong = clip.rows_of(1)
+    if case == "upside down":
+        rotations[wrong, 0] = turn(0.0, 0.0, np.pi) @ rotations[wrong, 0]
+    else:
+        rotations[wrong, 0] = rotations[wrong, 0] @ turn(0.0, np.pi, 0.0)
+    bodies = clip.fit(replace(clip.estimates, rotations=rotations))
+    assert bodies.missing[0] is None
+    assert "the keypoints" in bodies.missing[1]
+    assert np.isnan(bodies.fit.joints[:, 1]).all()
+    assert np.isnan(bodies.fit.betas_covariance[1]).all()
+    assert np.isfinite(bodies.fit.joints[:, 0]).all()
+
+
+def test_one_frame_gives_a_body():
+    clip = Clip(11, frames=1, errors=MonocularErrors(missed=0.0))
+    bodies = clip.fit()
+    assert bodies.missing == (None, None)
+    assert np.isfinite(bodies.fit.covariance).all()
+    assert np.mean(centred(clip, bodies.fit.joints)) < np.mean(centred(clip, bodies.placed))
+
+
+def test_missing_values_leave_gaps_and_no_failure():
+    clip = Clip(12)
+    rotations = clip.estimates.rotations.copy()
+    rotations[::5] = np.nan
+    keypoints, place = clip.keypoints.copy(), clip.place.copy()
+    keypoints[5:8, 0] = np.nan
+    keypoints[:, 1, 9:11] = np.nan
+    place[:4, 1] = np.nan
+    focal = clip.camera.focal.copy()
+    focal[12] = np.nan
+    bodies = clip.fit(
+        replace(clip.estimates, rotations=rotations),
+        keypoints=keypoints,
+        place=place,
+        camera=replace(clip.camera, focal=focal),
+    )
+    assert bodies.missing == (None, None)
+    assert np.isnan(bodies.fit.joints[:4, 1]).all()
+    assert np.isfinite(bodies.fit.joints[:, 0]).all()
+    assert np.isfinite(bodies.fit.covariance[4:, 1]).all()
+    np.testing.assert_array_equal(np.flatnonzero(bodies.fit.filled[:, 0]), [5, 6, 7])
+    assert not bodies.views[5:8, 0].any()
+    assert not bodies.views[:, 1, 9:11].any()
+    assert np.nanmean(centred(clip, bodies.fit.joints)) < 0.08
+
+
+def test_frames_far_from_any_estimate_have_no_body():
+    clip = Clip(13, errors=MonocularErrors(missed=0.0))
+    bodies = clip.fit(some_rows(clip.estimates, clip.estimates.frame < 10))
+    assert np.isfinite(bodies.fit.joints[:22]).all()  # half a second after the last estimate
+    assert np.isnan(bodies.fit.joints[22:]).all()
+    assert not bodies.fit.guided[10:].any()
+
+
+def test_a_calibration_that_all_frames_share_is_not_averaged_away():
+    clip = Clip(14)
+    sure = clip.fit().fit.covariance
+    calibration = np.zeros_like(clip.covariance)
+    calibration[..., 0, 0] = 0.2**2
+    unsure = clip.fit(calibration=calibration).fit.covariance
+    np.testing.assert_allclose(unsure[..., 0, 0] - sure[..., 0, 0], 0.04, rtol=1e-6)
+
+
+def test_arrays_of_different_people_are_refused():
+    clip = Clip(15)
+    with pytest.raises(InputError, match="the same frames and persons"):
+        clip.evidence(keypoints=clip.keypoints[:, :1])

@@ -1,0 +1,577 @@
+"""Bodies of people that one camera alone sees: monocular poses, placed on the pitch by the feet.
+
+No view determines the distance of such a person. The feet give it, since they stand on the pitch; a
+monocular method gives the pose, turned into the world by the calibrated camera; the image's
+keypoints correct both across the line of sight. The fit is that of triangulated people (S1-S3) with
+other evidence: lines of sight instead of joints, and places on the pitch with their covariance.
+Betas of a monocular method are not used: its size of a person is a guess, and betas of two body
+models are not comparable. The keypoints at the distance of the feet give the size.
+
+A person without estimates, or with estimates that contradict the keypoints, has no body. The place
+on the pitch remains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Flags, Floats
+from data_contracts.conventions import COCO17
+from worldpose.body import BodyModel, fold_keypoints
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body_fitting.body_fit import BodyFit, FittedArrays
+from worldpose.body_fitting.bones import DEFINITION, shorten_limbs
+from worldpose.body_fitting.monocular import (
+    PRIOR_SPREAD,
+    MonocularEstimates,
+    MonocularPoses,
+    MonocularPrior,
+    place_monocular_poses,
+)
+from worldpose.body_fitting.objective import (
+    ANKLES,
+    JOINT_SPREAD,
+    MIN_INFORMATION,
+    Evidence,
+    Ground,
+    Pose,
+    Track,
+    ankle_height,
+)
+from worldpose.body_fitting.pose_space import SIZE, load_pose_prior
+from worldpose.body_fitting.ray_constraints import constrain_to_rays
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.body_fitting.solver import (
+    Piece,
+    Solver,
+    factor_information,
+    solve_shapes,
+    spread_intervals,
+)
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
+from worldpose.tracking.ground_tracks import CORRELATION_S
+
+HIPS: Final = (11, 12)
+"""Hips in COCO-17; the place on the pitch is below their middle."""
+PIXEL_STD: Final = 1.0
+"""Standard deviation of a keypoint in the image [px], in addition to `ray_std_m`."""
+MIN_GAIN: Final = 0.75
+"""A body turned half round contradicts the estimates if it misses the keypoints by less than this
+share of what the body as estimated does [1]: sides of limbs and bends tell front from back. In two
+simulated worlds 1.5 to 3.4 for estimates as they are, and 0.4 to 0.6 for turned ones."""
+MONOCULAR_TIME_S: Final = 0.5
+"""Correlation time of monocular pose errors [s]: images hardly change."""
+START_WINDOW_S: Final = 0.2
+"""Monocular poses so near in time make a start [s]: single frames with a wrong pose drop out."""
+MAX_BRIDGED_S: Final = 0.5
+"""Frames farther than this from any monocular pose of the person have no body [s]."""
+MIN_KEYPOINTS: Final = 6
+"""Fewest keypoints of a frame that judge an estimate [1]."""
+MAX_MISFIT: Final = 0.85
+"""An estimate whose keypoints miss the detected ones by more contradicts them, after alignment of
+position and size [root mean square, relative to that of the keypoints about their middle]. In two
+simulated worlds 0.2 to 0.6 with angles off by 8 degrees, up to 0.8 with 15 degrees, 0.9 to 1 for
+bodies that lie or stand on their heads."""
+MIN_AGREEING: Final = 0.5
+"""Least share of a person's estimates that agree with the keypoints [1]."""
+KEYPOINT_STD: Final = 0.07
+"""Standard deviation of a keypoint per axis in the same measure [1]: 2 % of the person's height, as
+keypoints lie 0.28 heights from their middle."""
+MAX_FITTED_MISFIT: Final = 2.0
+"""Most misfit of a fitted body, median over frames, relative to the noise of keypoints [1]. In the
+two worlds 0.7 to 1.1, also where estimates are poor, and 1.6 to 5 where bodies look the other way
+or stand on their heads."""
+STEPS: Final = 10
+"""Gauss-Newton steps: a start from monocular poses is farther away than one from joints."""
+FOOT_BIAS_M: Final = 0.03
+"""Error of a foot's height that lasts for a clip [m]: where the detector sees the ankle, and the
+height of the ankle above the pitch. Divided by the slope of the line of sight it is an error of the
+distance."""
+
+LEAN_STD: Final = 0.08
+"""Error of a whole body's lean along the line of sight that lasts for a clip [rad]: 5 degrees. From
+one side a lean and a size look alike, and monocular methods lean all people the same way."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneEvidence:
+    """Observations of people by one camera, static or moving, and their places on the pitch.
+
+    Attributes:
+        camera: batch (frames,); NaN where unknown.
+        number: (frames,), numbers of the images in the camera's video, as the estimates have them.
+        keypoints: (frames, persons, 17, 2) [px], COCO-17; NaN where not seen.
+        confidence: (frames, persons, 17) in (0, 1]; NaN where not seen.
+        place: (frames, persons, 2) [m], world, below the mid-hip; NaN where unknown.
+        place_covariance: (frames, persons, 2, 2) [m^2].
+        calibration: (frames, persons, 2, 2) [m^2], part of it that the camera's calibration causes,
+            which all frames share.
+        fps: [1/s].
+
+    Raises:
+        InputError: the shapes do not match.
+    """
+
+    camera: Camera
+    number: NDArray[np.int64]
+    keypoints: Floats
+    confidence: Floats
+    place: Floats
+    place_covariance: Floats
+    calibration: Floats
+    fps: float
+
+    def __post_init__(self) -> None:
+        shape = self.place.shape[:-1]
+        found = (
+            self.keypoints.shape,
+            self.confidence.shape,
+            self.place.shape,
+            self.place_covariance.shape,
+            self.calibration.shape,
+            self.number.shape,
+            self.camera.batch_shape,
+        )
+        expected = (
+            (*shape, 17, 2),
+            (*shape, 17),
+            (*shape, 2),
+            (*shape, 2, 2),
+            (*shape, 2, 2),
+            shape[:1],
+            shape[:1],
+        )
+        if len(shape) != 2 or found != expected:
+            raise InputError(
+                "bodies on the plane",
+                expected="keypoints (frames, persons, 17, 2), confidence (frames, persons, 17), "
+                "place (frames, persons, 2) with covariance, and as many cameras as frames",
+                found=", ".join(map(str, found)),
+                todo="Give all arrays for the same frames and persons.",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneBodies:
+    """Bodies of people on the plane.
+
+    Attributes:
+        fit: the bodies, of all persons; NaN for a person or frame without a body.
+        placed: (frames, persons, 17, 3) [m], world: joints of the mean body in the monocular pose,
+            with its lower ankle on the ground at the person's place; the input of the fit.
+        views: (frames, persons, 17), 1 where the image shows the joint of a body.
+        missing: (persons,), why a person has no body; None = the person has one.
+        misfit: (frames, persons), distance of an estimate from the keypoints, relative to the
+            person's size [1]; NaN without an estimate.
+    """
+
+    fit: BodyFit
+    placed: Floats
+    views: NDArray[np.int64]
+    missing: tuple[str | None, ...]
+    misfit: Floats
+
+
+def fit_bodies_on_plane(
+    model: BodyModel,
+    evidence: PlaneEvidence,
+    estimates: MonocularEstimates,
+    ground: Ground,
+    settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
+) -> PlaneBodies:
+    """Return the bodies of people that one camera alone sees (S1-S4 without triangulation).
+
+    The covariance contains the distance that the feet leave open, the foot's bias over the slope of
+    the line of sight, and a lean. Joints in depth are as uncertain as the monocular angles.
+
+    Args:
+        model: the body.
+        evidence: keypoints, places and the camera.
+        estimates: monocular poses in the camera's images.
+        ground: height of the surface under the feet, in a world with z up.
+        settings: expected errors of detectors, bodies and motion.
+    """
+    frames, persons = evidence.place.shape[:2]
+    settings = settings.model_copy(update={"steps": max(settings.steps, STEPS)})
+    keypoints = fold_keypoints(model, COCO17)
+    solver = Solver(ChainedKeypoints.of(keypoints), load_pose_prior(), settings, ground)
+    lifted = _lift_keypoints(evidence)
+    poses = place_monocular_poses(estimates, evidence.camera, evidence.number, lifted)
+    mean = Pose(
+        np.zeros((frames, 3)),
+        np.zeros((frames, 3)),
+        np.zeros((frames, SIZE)),
+        np.zeros(model.shapes),
+    )
+    placed = np.full((frames, persons, 17, 3), np.nan)
+    for person in range(persons):
+        known = Rigid(poses.orient[:, person], np.zeros(3))
+        pose = replace(mean, orient=known.rotvec, angles=poses.angles[:, person])
+        standing = stand_on_ground(solver, pose, evidence.place[:, person])
+        placed[:, person] = keypoints(standing.parameters())
+    misfit, _ = _misfit(placed, evidence)
+    missing = [_objection(misfit[:, person]) for person in range(persons)]
+    clip = _Clip(solver, evidence, lifted, poses, misfit <= MAX_MISFIT)
+    people = {
+        person: clip.open_person(person) for person in range(persons) if missing[person] is None
+    }
+    pieces = [piece for person, own in people.items() for piece in clip.sample_pieces(person, own)]
+    shapes = solve_shapes(solver, people, pieces, {})
+    result = FittedArrays.empty(model, frames, persons, np.full(17, DEFINITION))
+    turned = np.full(placed.shape, np.nan)
+    for person, own in people.items():
+        span = own.span
+        start = replace(own.start, betas=shapes.people[person].betas)
+        start = stand_on_ground(solver, start, own.place)
+        rows = np.arange(span.start, span.stop)
+        track = clip.track(person, rows, evidence.fps, for_shape=False)
+        pose, solved = solver.search(track, start, shapes.offsets)
+        information = factor_information(solved, pose, shapes.offsets)
+        result.put(solver, person, span, pose, information, shapes)
+        result.covariance[span, person] += clip.depth_covariance(
+            person, own, result.joints[span, person]
+        )
+        result.guided[span, person] = clip.agreeing[span, person]
+        result.drop(person, span, own.gone)
+        turned[span, person] = clip.turn_round(track, start, shapes.offsets)
+    fitted, noise = _misfit(result.joints, evidence)
+    other, _ = _misfit(turned, evidence)
+    for person in people:
+        missing[person] = _contradiction(
+            fitted[:, person] / noise[:, person], other[:, person] / noise[:, person]
+        )
+        if missing[person] is not None:
+            result.betas[person], result.betas_covariance[person] = np.nan, np.nan
+            result.drop(person, slice(0, frames), np.ones(frames, dtype=np.bool_))
+    body = np.isfinite(result.joints[..., 0, 0])
+    seen = np.isfinite(evidence.keypoints).all(axis=-1) & body[..., None]
+    result.filled[:] = body & ~seen.any(axis=-1)
+    fit = result.fit(shapes)
+    return PlaneBodies(fit, placed, seen.astype(np.int64), tuple(missing), misfit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Person:
+    """A person to fit.
+
+    Attributes:
+        span: frames of the person's bodies.
+        gone: (frames of `span`,), without a place, or too far from any estimate.
+        place: (frames of `span`, 2) [m], without gaps.
+        start: monocular poses, smoothed, on the ground at the places.
+    """
+
+    span: slice
+    gone: Flags
+    place: Floats
+    start: Pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Clip:
+    """Evidence and monocular poses of a clip.
+
+    Attributes:
+        solver: body, prior, settings and ground.
+        evidence: observations.
+        lifted: (frames, persons, 17, 3) [m], keypoints at the distance of the places.
+        poses: monocular poses.
+        agreeing: (frames, persons), poses that agree with the keypoints.
+    """
+
+    solver: Solver
+    evidence: PlaneEvidence
+    lifted: Floats
+    poses: MonocularPoses
+    agreeing: Flags
+
+    def open_person(self, person: int) -> _Person:
+        """Return a person's frames, and the poses to start from."""
+        fps = self.evidence.fps
+        place = self.evidence.place[:, person]
+        known, at = np.isfinite(place).all(axis=-1), np.flatnonzero(self.agreeing[:, person])
+        frames = np.arange(len(place))
+        covered = known & (_distance_to(at, frames) <= MAX_BRIDGED_S * fps)
+        first, last = np.flatnonzero(covered)[[0, -1]]
+        span = slice(int(first), int(last) + 1)
+        own = frames[span]
+        place = np.stack([np.interp(own, frames[known], axis[known]) for axis in place.T], axis=-1)
+        orient, angles = _smooth_poses(self.poses, person, at, own, START_WINDOW_S * fps)
+        betas = np.zeros(self.solver.chained.model.shapes)
+        start = stand_on_ground(
+            self.solver, Pose(np.zeros_like(orient), orient, angles, betas), place
+        )
+        return _Person(span, ~covered[span], place, start)
+
+    def track(
+        self,
+        person: int,
+        rows: NDArray[np.int64],
+        fps: float,
+        *,
+        for_shape: bool,
+    ) -> Track:
+        """Return the evidence of a person in some frames, `rows`, at the rate `fps` [1/s].
+
+        For the shape, smoothness and pose prior hardly count, and limbs are shortened by the
+        contribution of the keypoints' noise, as those of triangulated people are.
+        """
+        settings = self.solver.settings
+        prior = MonocularPrior(
+            self.poses.orient[rows, person],
+            self.poses.angles[rows, person],
+            self.agreeing[rows, person],
+            np.eye(3 + SIZE) / PRIOR_SPREAD**2,
+            1.0 + MONOCULAR_TIME_S * fps,
+        )
+        return Track(
+            self.solver.chained,
+            self._observe(person, rows, fps, shorten=for_shape),
+            self.solver.prior,
+            settings,
+            fps,
+            settings.shape_acceleration_m_s2 if for_shape else settings.acceleration_m_s2,
+            settings.shape_pose_weight if for_shape else settings.pose_weight,
+            monocular_prior=prior,
+        )
+
+    def _observe(
+        self, person: int, rows: NDArray[np.int64], fps: float, *, shorten: bool
+    ) -> Evidence:
+        """Return lines of sight of the keypoints, and the distance of the hips by the place."""
+        evidence, settings = self.evidence, self.solver.settings
+        camera = evidence.camera[rows]
+        keypoints, expected = evidence.keypoints[rows, person], self.lifted[rows, person]
+        rays = constrain_to_rays(camera, keypoints[:, None], expected[:, None])
+        points, across = rays.points[:, 0], rays.across[:, 0]
+        reach = np.linalg.norm(points - camera.center[:, None], axis=-1)
+        pixel = PIXEL_STD * reach / camera.focal.mean(axis=-1)[:, None]
+        variance = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2 + pixel**2
+        variance = variance / np.clip(evidence.confidence[rows, person], 1e-3, 1.0)
+        seen = np.isfinite(points).all(axis=-1) & np.isfinite(variance)
+        variance = np.where(seen, variance, 1.0)
+        if shorten:
+            points = shorten_limbs(points, across * variance[..., None, None])
+        variance *= 1.0 + settings.noise_time_s * fps
+        by_ray = np.where(seen[..., None, None], across / variance[..., None, None], 0.0)
+
+        sight, place = self._sight(person, rows)
+        spread = np.einsum(
+            "fa,fab,fb->f", sight[:, :2], evidence.place_covariance[rows, person], sight[:, :2]
+        )
+        known = np.isfinite(spread)
+        # Two hips share the distance.
+        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + CORRELATION_S * fps)) * known
+        by_place = np.zeros_like(by_ray)
+        outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
+        by_place[:, HIPS] = (weight[:, None, None] * outer)[:, None]
+        joints = np.where(seen[..., None], points, np.nan)
+        hips = joints[:, HIPS]
+        target = np.broadcast_to(place[:, None], hips.shape)
+        hips = np.where(np.isfinite(hips), hips, target)
+        information = by_ray + by_place
+        moved = np.linalg.solve(
+            information[:, HIPS] + MIN_INFORMATION * np.eye(3),
+            by_place[:, HIPS] @ np.nan_to_num(target - hips)[..., None],
+        )[..., 0]
+        joints[:, HIPS] = hips + moved
+        information[~np.isfinite(joints).all(axis=-1)] = 0.0
+        return Evidence(joints, information)
+
+    def _sight(self, person: int, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Return the horizontal directions of sight (rows, 3) and the places (rows, 3) [m]."""
+        xy = self.evidence.place[rows, person]
+        assert self.solver.ground is not None
+        place = np.concatenate([xy, self.solver.ground(xy[:, 0], xy[:, 1])[:, None]], axis=1)
+        sight = place - self.evidence.camera[rows].center
+        sight[:, 2] = 0.0
+        return sight / np.linalg.norm(sight, axis=-1, keepdims=True), place
+
+    def sample_pieces(self, person: int, own: _Person) -> list[Piece]:
+        """Return intervals of a person's track for shape estimation, with initial bodies."""
+        settings, fps = self.solver.settings, self.evidence.fps
+        stride = max(1, int(fps / settings.shape_rate_hz))
+        pieces = []
+        for part in spread_intervals(len(own.place), fps, settings):
+            rows = np.arange(part.start, part.stop)[::stride]
+            track = self.track(person, rows + own.span.start, fps / stride, for_shape=True)
+            start = own.start
+            pose = Pose(start.transl[rows], start.orient[rows], start.angles[rows], start.betas)
+            pieces.append(Piece(person, track, pose))
+        return pieces
+
+    def turn_round(self, track: Track, start: Pose, offsets: Floats) -> Floats:
+        """Return joints (frames, 17, 3) [m] of the body fitted to estimates turned half round."""
+        assert track.monocular_prior is not None
+        half = Rigid.from_rotvec([0.0, np.pi, 0.0], np.zeros(3)).rotation
+        prior = replace(track.monocular_prior, orient=track.monocular_prior.orient @ half)
+        orient = Rigid.from_rotvec(start.orient, np.zeros(3)).rotation @ half
+        pose = replace(start, orient=Rigid(orient, np.zeros(3)).rotvec)
+        pose, _ = self.solver.search(replace(track, monocular_prior=prior), pose, offsets)
+        return np.asarray(self.solver.chained.differentiate(pose.parameters()).keypoints)
+
+    def depth_covariance(self, person: int, own: _Person, joints: Floats) -> Floats:
+        """Return the covariance (frames, 17, 3, 3) [m^2] that all frames of a person share.
+
+        It is the calibration's, the foot's bias over the slope of the line of sight, and that of a
+        lean of the whole body, by which joints move along their lines of sight.
+
+        Args:
+            person: the person.
+            own: frames and places of the person.
+            joints: (frames, 17, 3) [m], world, in the frames of the span.
+        """
+        rows = np.arange(own.span.start, own.span.stop)
+        sight, place = self._sight(person, rows)
+        centers = self.evidence.camera[rows].center
+        offset = place - centers
+        slope = -offset[:, 2] / np.linalg.norm(offset[:, :2], axis=-1)
+        shared = (FOOT_BIAS_M / slope)[:, None, None] ** 2 * sight[:, :, None] * sight[:, None]
+        shared[:, :2, :2] += self.evidence.calibration[rows, person]
+        line = joints - centers[:, None]
+        line /= np.linalg.norm(line, axis=-1, keepdims=True)
+        line *= LEAN_STD * (joints[..., 2:] - place[:, None, 2:])
+        return np.asarray(shared[:, None] + line[..., :, None] * line[..., None, :])
+
+
+def stand_on_ground(solver: Solver, pose: Pose, place: Floats) -> Pose:
+    """Return a pose with its mid-hip above `place` (frames, 2) [m], lower ankle on the ground."""
+    assert solver.ground is not None
+    model = solver.chained.model
+    pose = replace(pose, transl=np.zeros_like(pose.transl))
+    joints = solver.chained.differentiate(pose.parameters()).keypoints
+    xy = place - joints[:, HIPS, :2].mean(axis=1)
+    feet = joints[:, ANKLES, :2] + xy[:, None]
+    floor = solver.ground(feet[..., 0], feet[..., 1]) + ankle_height(model, pose.betas)
+    up = (floor - joints[:, ANKLES, 2]).max(axis=1)
+    return replace(pose, transl=np.concatenate([xy, up[:, None]], axis=1))
+
+
+def _lift_keypoints(evidence: PlaneEvidence) -> Floats:
+    """Return the keypoints (frames, persons, 17, 3) [m] at the distance of their person's place."""
+    frames, persons = evidence.place.shape[:2]
+    rays = evidence.camera.unproject(evidence.keypoints.reshape(frames, -1, 2))
+    directions = rays.directions.reshape(frames, persons, 17, 3)
+    origins = np.broadcast_to(rays.origins, rays.directions.shape).reshape(directions.shape)
+    reach = np.linalg.norm(evidence.place[:, :, None] - origins[..., :2], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = reach / np.linalg.norm(directions[..., :2], axis=-1)
+    return np.asarray(origins + along[..., None] * directions)
+
+
+def _misfit(joints: Floats, evidence: PlaneEvidence) -> tuple[Floats, Floats]:
+    """Return the distance (frames, persons) of bodies from the keypoints, and that of noise [1].
+
+    Both are root mean squares relative to that of the keypoints about their middle. Position and
+    size in the image do not count, as the place and the mean body are not exact.
+
+    Args:
+        joints: (frames, persons, 17, 3) [m], world.
+        evidence: keypoints and camera.
+    """
+    frames = len(joints)
+    image = evidence.camera.project(joints.reshape(frames, -1, 3)).reshape(*joints.shape[:3], 2)
+    both = np.asarray(
+        np.isfinite(image).all(axis=-1) & np.isfinite(evidence.keypoints).all(axis=-1)
+    )
+    count = both.sum(axis=-1)
+    ours, seen = (_centre(points, both) for points in (image, evidence.keypoints))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = (ours * seen).sum(axis=(-1, -2)) / (ours**2).sum(axis=(-1, -2))
+        away = seen - np.maximum(size, 0.0)[..., None, None] * ours
+        extent = np.sqrt((seen**2).sum(axis=(-1, -2)))
+        misfit = np.sqrt((away**2).sum(axis=(-1, -2))) / extent
+        noise = np.sqrt(2.0 * (KEYPOINT_STD**2 + count * (PIXEL_STD / extent) ** 2))
+    return np.where(count >= MIN_KEYPOINTS, misfit, np.nan), noise
+
+
+def _centre(points: Floats, counted: Flags) -> Floats:
+    """Return points (frames, persons, 17, 2) relative to the middle of those counted, else 0."""
+    kept = np.where(counted[..., None], points, 0.0)
+    middle = kept.sum(axis=2) / np.maximum(counted.sum(axis=2), 1)[..., None]
+    return np.where(counted[..., None], kept - middle[:, :, None], 0.0)
+
+
+def _objection(misfit: Floats) -> str | None:
+    """Return why a person gets no body, if so, by the misfit (frames,) of the estimates."""
+    compared = misfit[np.isfinite(misfit)]
+    if not len(compared):
+        return "no monocular estimate lies at the person's keypoints"
+    share = float(np.mean(compared <= MAX_MISFIT))
+    if share < MIN_AGREEING:
+        return (
+            f"the monocular estimates contradict the keypoints in {1.0 - share:.0%} of their "
+            f"{len(compared)} frames"
+        )
+    return None
+
+
+def _contradiction(misfit: Floats, turned: Floats) -> str | None:
+    """Return why a person's fitted body is refused, if so.
+
+    Args:
+        misfit: (frames,), of the fitted body, relative to the noise of keypoints.
+        turned: (frames,), of the body turned half round.
+    """
+    compared = np.isfinite(misfit) & np.isfinite(turned)
+    if not compared.any():
+        return f"no frame has a body and {MIN_KEYPOINTS} keypoints"
+    middle, other = float(np.median(misfit[compared])), float(np.median(turned[compared]))
+    if middle > MAX_FITTED_MISFIT:
+        return (
+            f"the body fitted to the monocular estimates misses the keypoints by {middle:.1f} "
+            f"times their noise (at most {MAX_FITTED_MISFIT:g})"
+        )
+    if other < MIN_GAIN * middle:
+        return (
+            "the monocular estimates contradict the keypoints, which show the person turned half "
+            f"round (misfit {middle:.1f} times their noise, turned {other:.1f})"
+        )
+    return None
+
+
+def _distance_to(at: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distance of each of `frames` from the nearest of the rising frames `at`."""
+    after = at[np.searchsorted(at, frames).clip(max=len(at) - 1)]
+    before = at[(np.searchsorted(at, frames, side="right") - 1).clip(min=0)]
+    return np.asarray(np.minimum(np.abs(frames - before), np.abs(after - frames)))
+
+
+def _smooth_poses(
+    poses: MonocularPoses,
+    person: int,
+    at: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    reach: float,
+) -> tuple[Floats, Floats]:
+    """Return robust means of a person's orientations (frames, 3) and angles (frames, 30) [rad].
+
+    Args:
+        poses: monocular poses.
+        person: the person.
+        at: frames with poses to use.
+        frames: frames of the result.
+        reach: half of the window [frame]; farther from any pose, the nearest one counts.
+    """
+    orient = np.empty((len(frames), 3, 3))
+    angles = np.empty((len(frames), SIZE))
+    width = np.maximum(reach, _distance_to(at, frames))
+    first = np.searchsorted(at, frames - width)
+    last = np.searchsorted(at, frames + width, side="right")
+    for row in range(len(frames)):
+        near = at[first[row] : last[row]]
+        turns = poses.orient[near, person]
+        weight = np.ones(len(near))
+        for _ in range(3):
+            u, _, vt = np.linalg.svd(np.einsum("n,nab->ab", weight, turns))
+            u[:, -1] *= np.linalg.det(u @ vt)
+            mean = u @ vt
+            off = np.linalg.norm(Rigid(turns @ mean.T, np.zeros(3)).rotvec, axis=-1)
+            weight = 1.0 / (1.0 + (off / PRIOR_SPREAD) ** 2)
+        orient[row], angles[row] = mean, np.median(poses.angles[near, person], axis=0)
+    return Rigid(orient, np.zeros(3)).rotvec, angles
