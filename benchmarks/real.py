@@ -126,7 +126,8 @@ def track_sides(
 ) -> tuple[Metrics, list[NDArray[np.float64]]]:
     """Return metrics of the calibrations, and where each camera alone places people.
 
-    Without clicks both cameras are proposed from their videos. Places are (frames, persons, 2) [m] of each side; NaN where missing.
+    Without clicks both cameras are proposed from their videos. Places are (frames, persons, 2) [m]
+    of each side; NaN where missing.
     """
     match = work / "match"
     static_pair.write_static_pair(folder, match, first_frame=0, frame_count=frames, clicked=clicked)

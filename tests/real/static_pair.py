@@ -66,7 +66,7 @@ def write_static_pair(
     correct_labels=True,
     clicked=True,
 ):
-    """Write the match folder: both videos or one, their clicks or the cameras' side, and one clip."""
+    """Write the match folder: both videos or one, their clicks or their side, and one clip."""
     annotations = folder / "annotations" / "static_calibration"
     (folder / "videos").mkdir(parents=True)
     if clicked:
