@@ -121,13 +121,16 @@ def score_clicks(folder: Path, side: str, count: int | None) -> Metrics:
     }
 
 
-def track_sides(folder: Path, frames: int, work: Path) -> tuple[Metrics, list[NDArray[np.float64]]]:
+def track_sides(
+    folder: Path, frames: int, work: Path, *, clicked: bool = True
+) -> tuple[Metrics, list[NDArray[np.float64]]]:
     """Return metrics of the calibrations, and where each camera alone places people.
 
-    Places are (frames, persons, 2) [m] of each side; NaN where missing.
+    Without clicks both cameras are proposed from their videos. Places are (frames, persons, 2) [m]
+    of each side; NaN where missing.
     """
     match = work / "match"
-    static_pair.write_static_pair(folder, match, first_frame=0, frame_count=frames)
+    static_pair.write_static_pair(folder, match, first_frame=0, frame_count=frames, clicked=clicked)
     store = Store.create(work / "project")
     name, (keys,) = run_in_process(store, match, "detection", 1, {})
 
@@ -190,18 +193,26 @@ def score_static_pair(folder: Path, frames: int | None) -> Metrics:
     )
     count = whole if frames is None else min(frames, whole)
     metrics: Metrics = {side: score_clicks(folder, side, frames) for side in static_pair.SIDES}
-    with tempfile.TemporaryDirectory() as temporary:
-        calibrated, (left, right) = track_sides(folder, count, Path(temporary))
-    metrics |= calibrated
+    for clicked in (True, False):
+        with tempfile.TemporaryDirectory() as temporary:
+            found, (left, right) = track_sides(folder, count, Path(temporary), clicked=clicked)
+        found |= _score_feet(left, right)
+        metrics |= found if clicked else {"without_clicks": found}
+    return metrics
+
+
+def _score_feet(left: NDArray[np.float64], right: NDArray[np.float64]) -> Metrics:
+    """Return distances of the same feet under the clock offset that fits best."""
     offsets = np.arange(-MAX_OFFSET_FRAMES, MAX_OFFSET_FRAMES + 0.05, 0.1)
     by_offset = [pair_feet(left, right, float(offset)) for offset in offsets]
     by_offset = [frames for frames in by_offset if frames]
     best = min(by_offset, key=lambda frames: _quantile(np.concatenate(frames), 0.5, np.inf))
     pairs = np.concatenate(best)
-    metrics["feet_m_median"] = _quantile(pairs, 0.5, math.nan)
-    metrics["feet_m_p95"] = _quantile(pairs, 0.95, math.nan)
-    metrics["people_per_frame"] = len(pairs) / len(best)
-    return metrics
+    return {
+        "feet_m_median": _quantile(pairs, 0.5, math.nan),
+        "feet_m_p95": _quantile(pairs, 0.95, math.nan),
+        "people_per_frame": len(pairs) / len(best),
+    }
 
 
 def _quantile(values: NDArray[np.float64], share: float, otherwise: float) -> float:

@@ -27,6 +27,10 @@ TEAM_SIZE: Final = 11
 """Players of a team on the pitch (Laws of the Game, 3)."""
 
 
+Side = Literal["near", "far", "left", "right"]
+"""Side of the pitch, seen from the main camera, which is near."""
+
+
 class CameraSpec(Record):
     """One camera of the match folder."""
 
@@ -44,6 +48,9 @@ class CameraSpec(Record):
     """Video file or folder of images, relative to the match folder."""
     still: str | None = None
     """One image of a static camera without a video, relative to the match folder."""
+    side: Side | None = None
+    """Side of the pitch on which the camera stands. With it a camera without clicks is calibrated
+    from its image: the pitch looks the same after half a turn, and the side decides."""
 
 
 class ClipSpec(Record):

@@ -1,4 +1,4 @@
-"""Task of stage `static_calibration`: one given camera, or one calibrated from clicks."""
+"""Task of stage `static_calibration`: one camera that is given, clicked, or proposed."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from worldpose.static_calibration import (
     CalibrationReport,
     StaticCalibrationSettings,
     calibrate_camera,
+    calibrate_without_clicks,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
@@ -57,22 +58,33 @@ def static_calibration(work: Work) -> str:
                 attributes=given_attributes(work.recipe.unit),
             )
             return work.key
-        ((file, clicked),) = sources["clicked"].items()
         width, height = sources["image_size"]
         pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
         settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
         picture = _still(work)
         lens = sources.get("lens")
+        known = None if lens is None else LensCalibration.model_validate(lens)
         try:
-            calibration = calibrate_camera(
-                pitch,
-                clicked_markings(clicked),
-                (width, height),
-                picture=picture,
-                settings=settings,
-                where=file,
-                lens=None if lens is None else LensCalibration.model_validate(lens),
-            )
+            if sources["clicked"]:
+                ((file, clicked),) = sources["clicked"].items()
+                calibration = calibrate_camera(
+                    pitch,
+                    clicked_markings(clicked),
+                    (width, height),
+                    picture=picture,
+                    settings=settings,
+                    where=file,
+                    lens=known,
+                )
+            else:
+                calibration = calibrate_without_clicks(
+                    pitch,
+                    _require_picture(work.recipe.unit, picture),
+                    side=sources["side"],
+                    settings=settings,
+                    where=f"image of {work.recipe.unit}",
+                    lens=known,
+                )
         except InputError as error:  # a failed calibration of one camera must not end the match
             reason = str(error)
             attributes = left_out_attributes(work.recipe.unit, reason)
@@ -87,6 +99,22 @@ def static_calibration(work: Work) -> str:
         )
         result.figures.update(_figures(calibration.report))
     return work.key
+
+
+def _require_picture(camera_id: str, picture: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    """Return the camera's image.
+
+    Raises:
+        InputError: no image of its video can be read.
+    """
+    if picture is None:
+        raise InputError(
+            f"image of {camera_id}",
+            expected="a still, or a readable image in the video",
+            found="none",
+            todo="Add a still to match.yaml, or click the markings.",
+        )
+    return picture
 
 
 def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:

@@ -446,9 +446,7 @@ def ingest(
 
 def _tell_unclicked(match: Match) -> None:
     """Print what has to be clicked before the match can run."""
-    known = {**match.folder.calibrations, **match.folder.clicked}
-    missing = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
-    missing += unclicked_clips(match.folder)
+    missing = [*match.folder.to_click, *unclicked_clips(match.folder)]
     if missing and match.folder.pitch is None:
         line(
             f"no calibration of {', '.join(missing)}: add them to calibration.toml (a match "

@@ -38,7 +38,7 @@ from worldpose.dataset.manifest import (
 )
 from worldpose.errors import UsageError
 from worldpose.formats import coco_dataset, write_coco, write_joints
-from worldpose.formats.baselines.inputs import (
+from worldpose.formats.baselines.result import (
     write_baseline_settings,
     write_slahmr_cameras,
     write_tracks,

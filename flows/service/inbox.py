@@ -350,9 +350,7 @@ def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arriv
         return change_state(arrival, "incomplete", f"{error.filename}: {error.strerror}")
     except Exception as error:  # an unforeseen error; nothing was registered
         return change_state(arrival, "refused", str(InternalError.wrap(arrival.name, error)))
-    known = {**match.folder.calibrations, **match.folder.clicked}
-    unclicked = [each.id for each in match.folder.spec.static_cameras if each.id not in known]
-    unclicked += unclicked_clips(match.folder)
+    unclicked = [*match.folder.to_click, *unclicked_clips(match.folder)]
     if unclicked:
         reason = f"to be clicked on the review pages first: {', '.join(unclicked)}"
         return change_state(arrival, "taken", reason, match_id=match.match_id)

@@ -57,15 +57,25 @@ SIDES = {"left": 4, "right": 0}
 
 
 def write_static_pair(
-    data, folder, *, sides=tuple(SIDES), first_frame=8, frame_count=10, correct_labels=True
+    data,
+    folder,
+    *,
+    sides=tuple(SIDES),
+    first_frame=8,
+    frame_count=10,
+    correct_labels=True,
+    clicked=True,
 ):
-    """Write the match folder: both videos or one, their clicks, and one clip."""
+    """Write the match folder: both videos or one, their clicks or their side, and one clip."""
     annotations = folder / "annotations" / "static_calibration"
-    annotations.mkdir(parents=True)
-    (folder / "videos").mkdir()
+    (folder / "videos").mkdir(parents=True)
+    if clicked:
+        annotations.mkdir(parents=True)
     points = {}
     for side in sides:
         shutil.copy(data / f"{side}_camera.mp4", folder / "videos" / f"{side}.mp4")
+        if not clicked:
+            continue
         places, pixels = read_clicks(data, side, correct_labels=correct_labels)
         laws = law_points(LENGTH, WIDTH)
         points |= {name: list(place) for name, place in places.items() if name not in laws}
@@ -74,7 +84,8 @@ def write_static_pair(
     pitch = {"length": LENGTH, "width": WIDTH, "crown": CROWN, "points": points}
     (folder / "pitch.json").write_text(json.dumps(pitch))
     cameras = "".join(
-        f"  - {{id: {side}, width: {SIZE[0]}, height: {SIZE[1]}, offset_frames: {SIDES[side]}}}\n"
+        f"  - {{id: {side}, width: {SIZE[0]}, height: {SIZE[1]}, offset_frames: {SIDES[side]}"
+        f"{'' if clicked else ', side: near'}}}\n"
         for side in sides
     )
     (folder / "match.yaml").write_text(

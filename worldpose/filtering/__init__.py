@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
-    from worldpose.filtering.held_out import HeldOut, measure_held_out
     from worldpose.filtering.judging import (
+        HeldOut,
         Judgement,
         Spread,
         TriangulatedDetections,
         judge_detections,
         learn_keypoint_spread,
+        measure_held_out,
     )
     from worldpose.filtering.settings import FilteringSettings
     from worldpose.filtering.systematic_errors import (
@@ -55,11 +56,9 @@ __all__ = [
 __getattr__ = import_on_use(
     __name__,
     {
-        "worldpose.filtering.held_out": (
+        "worldpose.filtering.judging": (
             "HeldOut",
             "measure_held_out",
-        ),
-        "worldpose.filtering.judging": (
             "Judgement",
             "Spread",
             "TriangulatedDetections",

@@ -61,6 +61,18 @@ class MatchFolder:
     lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
 
+    @property
+    def to_click(self) -> tuple[str, ...]:
+        """Static cameras without calibration and clicks that cannot be proposed either.
+
+        A proposal needs the camera's side, its image and the pitch.
+        """
+        known = {*self.calibrations, *self.clicked}
+        if self.pitch is not None:
+            seen = {*self.stills, *self.videos}
+            known |= {each.id for each in self.spec.cameras if each.side and each.id in seen}
+        return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
+
 
 def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
     """Return the validated content of a match folder, without opening videos, stills, detections.
@@ -126,7 +138,7 @@ def _read_match(folder: Path) -> MatchFolder:
 
 
 def require_calibrated(match: MatchFolder) -> None:
-    """Raise InputError for a match with a static camera without calibration and clicks.
+    """Raise InputError for a match with a static camera that has to be clicked.
 
     A match without static cameras needs clicked key frames, in one clip at least.
 
@@ -136,14 +148,15 @@ def require_calibrated(match: MatchFolder) -> None:
     if not match.spec.static_cameras:
         _require_key_frames(match)
     known = {**match.calibrations, **match.clicked}
-    missing = [camera.id for camera in match.spec.static_cameras if camera.id not in known]
+    missing = match.to_click
     if missing:
         needed = f"Add the missing cameras to {match.folder / 'calibration.toml'}"
         if match.pitch is not None:
             needed = (
                 f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or click "
                 f"on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
-                "add the camera to calibration.toml"
+                "give the camera a side (near, far, left, right) in match.yaml, so that its image "
+                "is calibrated without clicks; or add the camera to calibration.toml"
             )
         raise InputError(
             str(match.folder),

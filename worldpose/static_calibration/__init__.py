@@ -1,6 +1,7 @@
 """Static calibration: a camera from the pitch markings in its image (C1-C5).
 
-Input: a pitch template, clicked points and drawn markings. Output: a camera and its covariance.
+Input: a pitch template, clicked points and drawn markings, or an image alone. Output: a camera and
+its covariance.
 """
 
 from typing import TYPE_CHECKING
@@ -15,6 +16,12 @@ if TYPE_CHECKING:
         CameraEstimate,
         project_with_jacobian,
         step_camera,
+    )
+    from worldpose.static_calibration.proposal import (
+        MarkingSupport,
+        Proposal,
+        calibrate_without_clicks,
+        propose_camera,
     )
     from worldpose.static_calibration.report import (
         CalibrationReport,
@@ -37,10 +44,13 @@ __all__ = [
     "CameraPrior",
     "GroundErrorMap",
     "MarkingResidual",
+    "MarkingSupport",
     "PointResidual",
+    "Proposal",
     "StaticCalibration",
     "StaticCalibrationSettings",
     "calibrate_camera",
+    "calibrate_without_clicks",
     "calibration_arrays",
     "calibration_attributes",
     "calibration_coordinates",
@@ -49,6 +59,7 @@ __all__ = [
     "image_problems",
     "left_out_attributes",
     "project_with_jacobian",
+    "propose_camera",
     "step_camera",
 ]
 
@@ -65,6 +76,12 @@ __getattr__ = import_on_use(
             "CameraEstimate",
             "project_with_jacobian",
             "step_camera",
+        ),
+        "worldpose.static_calibration.proposal": (
+            "MarkingSupport",
+            "Proposal",
+            "calibrate_without_clicks",
+            "propose_camera",
         ),
         "worldpose.static_calibration.report": (
             "CalibrationReport",

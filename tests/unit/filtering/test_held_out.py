@@ -6,7 +6,7 @@ from planted_errors import plant
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.filtering import measure_held_out
-from worldpose.filtering.held_out import FARTHEST
+from worldpose.filtering.judging import FARTHEST
 from worldpose.triangulation import TriangulationSettings
 
 SETTINGS = TriangulationSettings()

@@ -6,12 +6,13 @@ motion, no noise, no camera placement; estimators are measured on it and never t
 """
 
 from worldpose.simulation.foreign.matches import (
+    FOREIGN_SCENARIOS,
+    ForeignScenario,
     ForeignScene,
     simulate_foreign_match,
     simulate_foreign_scene,
 )
 from worldpose.simulation.foreign.recordings import Recordings, read_recordings
-from worldpose.simulation.foreign.scenarios import FOREIGN_SCENARIOS, ForeignScenario
 
 __all__ = [
     "FOREIGN_SCENARIOS",

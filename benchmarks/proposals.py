@@ -1,0 +1,276 @@
+"""Prints how many cameras are calibrated without a click, and how many of those are wrong.
+
+    python benchmarks/proposals.py simulation [SCENARIO ...] [--surveys 4] [--first 0]
+    python benchmarks/proposals.py lines DATA [--count 100] [--drop 0.2] [--clutter 4] [--first 0]
+    python benchmarks/proposals.py images FILE ... [--out FOLDER]
+
+simulation: rendered stills of the static cameras of simulated stadiums. Ground: the true pixel of a
+player's place, back through the calibrated camera onto the pitch.
+
+lines: lines that people drew into broadcast images (`wc14/lines.json`, `sn22_lines/lines.json`),
+without their names, as paint; some are dropped, and random segments are added. A camera is wrong if
+half of the drawn lines are farther than 5 px of 960 from their marking.
+
+images: files, each with one line and an overlay in the folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from static_accuracy import ground_errors
+
+from data_contracts.arrays import Floats
+from data_contracts.match import Side
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.simulation.renderer import render_pitch
+from worldpose.static_calibration import Proposal, calibrate_without_clicks, propose_camera
+from worldpose.static_calibration.paint_segments import Ridges, guess_lens, straighten_paint
+from worldpose.static_calibration.proposal import propose_from_paint
+
+SIZE = (1280, 720)
+"""Width, height of the images of drawn lines [px]."""
+RIGHT_PX = 5.0
+"""Largest distance of a drawn line from its marking, at a width of 960 [px]."""
+WRONG_M = 0.5
+"""Median ground error from which an accepted camera is wrong [m]."""
+SIDES = {"top": "far", "bottom": "near"}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One image.
+
+    Attributes:
+        name: of the image.
+        accepted: whether the camera is used without a click.
+        error: median ground error [m], or median distance of lines [px].
+        seconds: time.
+        reason: why it is not accepted.
+    """
+
+    name: str
+    accepted: bool
+    error: float
+    seconds: float
+    reason: str = ""
+
+
+def side_of(camera: Camera, pitch: PitchTemplate) -> Side:
+    """Return the side of the pitch on which a camera stands."""
+    x, y = camera.center[:2] / [pitch.length, pitch.width]
+    if abs(y) > abs(x):
+        return "near" if y < 0.0 else "far"
+    return "left" if x < 0.0 else "right"
+
+
+def simulate(scenario: str, seeds: range) -> Iterator[Outcome]:
+    """Yield the outcomes of all static cameras of some surveys."""
+    settings = SCENARIOS[scenario].model_copy(update={"duration": 0.2, "broadcast": None})
+    painted = PitchTemplate.from_spec(settings.pitch)
+    for seed in seeds:
+        scene = simulate_scene(settings, seed)
+        pitch = PitchTemplate.from_spec(scene.surveyed)
+        places = scene.truth.joints[::3, :, 15:17].mean(axis=2).reshape(-1, 3)
+        places[:, 2] = painted.height(places[:, 0], places[:, 1])
+        for name, true in scene.cameras.items():
+            still = render_pitch(true, painted, scene.truth.joints[0], seed)
+            start = time.perf_counter()
+            label = f"{scenario} {seed} {name}"
+            try:
+                found = calibrate_without_clicks(pitch, still, side=side_of(true, pitch))
+            except InputError as refused:
+                seconds = time.perf_counter() - start
+                yield Outcome(label, False, np.nan, seconds, refused.found)
+                continue
+            seconds = time.perf_counter() - start
+            off = ground_errors(found.estimate.camera, true, places, painted)
+            yield Outcome(label, True, float(np.median(off)) if len(off) else 0.0, seconds)
+
+
+def law_name(drawn: str) -> str | None:
+    """Return the template's name of a line of the SoccerNet vocabulary; None for goals."""
+    if drawn == "Middle line":
+        return "halfway_line"
+    if drawn.startswith("Circle"):
+        where = drawn.split()[1]
+        return "center_circle" if where == "central" else f"penalty_arc_{where}"
+    words = drawn.split()
+    if drawn.startswith("Side line"):
+        end = SIDES.get(words[2])
+        return f"touch_line_{end}" if end else f"goal_line_{words[2]}"
+    if words[0] in ("Big", "Small"):
+        area = "penalty_area" if words[0] == "Big" else "goal_area"
+        return f"{area}_{words[2]}_{SIDES.get(words[3], 'front')}"
+    return None
+
+
+def as_ridges(lines: Sequence[Floats]) -> Ridges:
+    """Return pixels (m, 2) along polylines, with normals."""
+    points, normals = [], []
+    for line in lines:
+        for start, end in pairwise(line):
+            length = float(np.linalg.norm(end - start))
+            if length < 1.0:
+                continue
+            share = np.arange(0.0, length) / length
+            points.append(start + share[:, None] * (end - start))
+            angle = np.arctan2(end[1] - start[1], end[0] - start[0]) + 0.5 * np.pi
+            normals.append(np.full(len(share), angle % np.pi))
+    places = np.concatenate(points)
+    inside = ((places >= 0.0) & (places <= np.array(SIZE) - 1.0)).all(axis=1)
+    return Ridges(places[inside], np.concatenate(normals)[inside])
+
+
+def line_error(camera: Camera, drawn: Mapping[str, Floats], pitch: PitchTemplate) -> float:
+    """Return the median over drawn lines of the distance from their marking [px of 960].
+
+    The pitch's halves may be exchanged.
+    """
+    medians = []
+    for turn in (1.0, -1.0):
+        errors = []
+        for name, line in drawn.items():
+            pixels = camera.project(pitch.marking_points(name, 0.25) * [turn, turn, 1.0])
+            pixels = pixels[np.isfinite(pixels).all(axis=1)]
+            if len(pixels) < 2:
+                errors.append(np.inf)
+                continue
+            away = np.linalg.norm(line[:, None] - pixels, axis=-1).min(axis=1)
+            errors.append(float(np.median(away)) * 960.0 / SIZE[0])
+        medians.append(float(np.median(errors)))
+    return min(medians)
+
+
+def drawn_lines(data: Path, arguments: argparse.Namespace) -> Iterator[Outcome]:
+    """Yield the outcomes of drawn lines."""
+    pitch = PitchTemplate.standard()
+    listed = {}
+    for name in ("wc14", "sn22_lines"):
+        for key, lines in json.loads((data / name / "lines.json").read_text()).items():
+            listed[f"{name} {key}"] = lines
+    order = np.random.default_rng(0).permutation(sorted(listed))
+    for key in order[arguments.first : arguments.first + arguments.count]:
+        rng = np.random.default_rng(list(key.encode()))
+        drawn = {
+            law: np.array(line) * SIZE
+            for name, line in listed[key].items()
+            if (law := law_name(name)) in pitch.marking_names and law is not None
+        }
+        shown = [line for line in drawn.values() if rng.random() >= arguments.drop]
+        for _ in range(arguments.clutter):
+            start = rng.uniform([0.0, 0.3 * SIZE[1]], SIZE)
+            angle, length = rng.uniform(0.0, np.pi), rng.uniform(50.0, 200.0)
+            way = length * np.array([np.cos(angle), 0.4 * np.sin(angle)])
+            shown.append(np.stack([start, start + way]))
+        start_time = time.perf_counter()
+        whole = np.ones(SIZE[::-1], np.bool_)
+        paint = straighten_paint(as_ridges(shown), whole, guess_lens(0.0, SIZE), 1.0)
+        proposal = propose_from_paint([paint], pitch, side="near")
+        seconds = time.perf_counter() - start_time
+        if proposal is None:
+            yield Outcome(key, False, np.nan, seconds, "no camera fits")
+            continue
+        error = line_error(proposal.camera, drawn, pitch)
+        yield Outcome(key, proposal.is_clear, error, seconds, describe(proposal))
+
+
+def describe(proposal: Proposal) -> str:
+    """Return a proposal's evidence in one line."""
+    return (
+        f"margin {proposal.margin:.0f}, {proposal.found:.0%} on paint, "
+        f"{proposal.explained:.0%} explained"
+    )
+
+
+def images(files: Sequence[Path], out: Path | None) -> Iterator[Outcome]:
+    """Yield the outcomes of images, and write overlays."""
+    pitch = PitchTemplate.standard()
+    places = pitch.sample_lines(0.25).points_world
+    for file in files:
+        picture = cv2.imread(str(file))
+        if picture is None:
+            raise SystemExit(f"expected {file} to be an image")
+        start = time.perf_counter()
+        try:
+            proposal = propose_camera(
+                np.asarray(picture[..., ::-1].copy(), np.uint8), pitch, side="near"
+            )
+        except InputError as refused:
+            yield Outcome(file.name, False, np.nan, time.perf_counter() - start, refused.found)
+            continue
+        seconds = time.perf_counter() - start
+        yield Outcome(file.name, proposal.is_clear, np.nan, seconds, describe(proposal))
+        if out is not None:
+            pixels = proposal.camera.project(places)
+            for x, y in pixels[np.isfinite(pixels).all(axis=1)]:
+                if 0 <= x < picture.shape[1] and 0 <= y < picture.shape[0]:
+                    cv2.circle(picture, (round(x), round(y)), 1, (0, 0, 255), -1)
+            out.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(out / f"{file.stem}.png"), picture)
+
+
+def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
+    """Print the share that is accepted, and the errors among those."""
+    accepted = np.array([each.accepted for each in outcomes])
+    errors = np.array([each.error for each in outcomes])
+    seconds = np.median([each.seconds for each in outcomes])
+    print(f"{len(outcomes)} images, {accepted.mean():.1%} accepted, {seconds:.1f} s (median)")
+    known = accepted & np.isfinite(errors)
+    if known.any():
+        wrong = int(np.count_nonzero(errors[known] > limit))
+        print(
+            f"error of the accepted [{unit}]: median {np.median(errors[known]):.3g}, "
+            f"95 % {np.quantile(errors[known], 0.95):.3g}; {wrong} wrong (over {limit:g})"
+        )
+    refused = ~accepted & np.isfinite(errors)
+    if refused.any():
+        right = int(np.count_nonzero(errors[refused] <= limit))
+        print(f"{right} of {int(refused.sum())} that are not accepted are right")
+
+
+def main() -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("part", choices=("simulation", "lines", "images"))
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--surveys", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--drop", type=float, default=0.2)
+    parser.add_argument("--clutter", type=int, default=4)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    if arguments.part == "simulation":
+        seeds = range(arguments.first, arguments.first + arguments.surveys)
+        parts = [simulate(name, seeds) for name in arguments.names or ("match",)]
+        limit, unit = WRONG_M, "m"
+    elif arguments.part == "lines":
+        parts = [drawn_lines(Path(name), arguments) for name in arguments.names]
+        limit, unit = RIGHT_PX, "px"
+    else:
+        parts = [images([Path(name) for name in arguments.names], arguments.out)]
+        limit, unit = RIGHT_PX, "px"
+    outcomes = []
+    for part in parts:
+        for each in part:
+            state = "accepted" if each.accepted else "unclear"
+            measured = f"{each.error:.3g} {unit}, {each.seconds:.1f} s"
+            print(f"{each.name}: {state}, {measured} {each.reason}", flush=True)
+            outcomes.append(each)
+    summarize(outcomes, limit, unit)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,456 @@
+"""Candidate cameras from segments of paint, and their fit to the paint (C2).
+
+A triple of segments, two along one axis of the pitch and one along the other, with names from the
+template and a camera without roll, determines a camera. The search over names is exhaustive. A
+score compares the markings that a camera predicts with the paint; refinement moves them onto it.
+
+All cameras are those of the straight copy of `PaintMap`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.line_samples import LineSamples
+from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
+
+_TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
+"""Tilts below the horizon to try [rad]."""
+_LEVEL: Final = np.radians(5.0)
+"""Deviation of two segments from a right angle, or from parallels, on the pitch [rad]."""
+_SEGMENTS: Final = 12
+"""Maximum segments to name, those with the most paint [1]."""
+_BEYOND: Final = (0.15, 1.5)
+"""Reach of a segment beyond its marking: share of its length [1], and [m]."""
+_HEIGHTS: Final = (1.8, 80.0)
+"""Heights of cameras above the pitch [m]."""
+_FARTHEST: Final = 200.0
+"""Distance of a camera from the centre spot in plan [m]."""
+_INSIDE: Final = 1.0
+"""Distance of a camera from the outer lines inside of the pitch [m]."""
+_FOUND: Final = 0.7
+"""Probability that a visible marking is found at one place [1]: players, shadows and wear hide
+the rest."""
+_BY_CHANCE: Final = 0.05
+"""Probability that paint is near a place without a marking [1]."""
+INDEPENDENT: Final = 1.0 / 32.0
+"""Length of a marking that counts as one observation, in image widths [1]: what hides paint has
+this size."""
+_ITERATIONS: Final = 4
+"""Steps of each stage [1]."""
+_ROLL_STD: Final = 0.015
+"""Standard deviation of the roll while candidates are refined [rad]."""
+_BEND_STD: Final = (0.005, 0.02)
+"""Standard deviation of the displacement of the image corner by k1 while candidates are refined,
+relative to the corner's distance from the middle [1], in images that look straight and in others:
+less than of an unknown lens, so that a wrong name does not bend the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Cameras with square pixels and the principal point in the middle of the working image.
+
+    Attributes:
+        rotations: (k, 3, 3) world to camera.
+        centers: (k, 3) [m], world.
+        focals: (k,) [px].
+        radial: (k,) k1 [1].
+    """
+
+    rotations: Floats
+    centers: Floats
+    focals: Floats
+    radial: Floats
+
+    def __len__(self) -> int:
+        return len(self.focals)
+
+    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Candidates:
+        return Candidates(
+            self.rotations[index], self.centers[index], self.focals[index], self.radial[index]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SeenMarkings:
+    """Samples of markings in the images of candidates.
+
+    Attributes:
+        pixels: (k, n, 2) [px] from the middle of the image.
+        normals: (k, n) angles across the projected markings [rad].
+        lengths: (k, n) length of marking per sample [px]; 0 outside of the image.
+        distances: (k, n) to paint of this direction [px]; infinite outside of the pitch's area.
+        nearest: (k, n) this paint's index in `PaintMap.points`.
+    """
+
+    pixels: Floats
+    normals: Floats
+    lengths: Floats
+    distances: Floats
+    nearest: NDArray[np.int32]
+
+
+def join_candidates(*parts: Candidates) -> Candidates:
+    """Return all candidates in one record."""
+    return Candidates(
+        np.concatenate([part.rotations for part in parts]),
+        np.concatenate([part.centers for part in parts]),
+        np.concatenate([part.focals for part in parts]),
+        np.concatenate([part.radial for part in parts]),
+    )
+
+
+def _straight_lines(pitch: PitchTemplate) -> tuple[Floats, Floats]:
+    """Return painted lines along x (n, 3) as y, first and last x, and along y (m, 3) [m]."""
+    along: tuple[list[list[float]], list[list[float]]] = ([], [])
+    for line in pitch.lines.values():
+        start, end = pitch.points[line.start], pitch.points[line.end]
+        reach = np.abs(end - start)[:2]
+        for axis in (0, 1):
+            if reach[1 - axis] < 0.02 * reach[axis]:
+                first, last = sorted((start[axis], end[axis]))
+                place = 0.5 * (start[1 - axis] + end[1 - axis])
+                along[axis].append([float(place), float(first), float(last)])
+    return np.array(along[0]).reshape(-1, 3), np.array(along[1]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Triples:
+    """Segments a, b along one axis, c along the other, in the ground frame of a level camera.
+
+    The ground frame has its origin below the camera, at a height of 1; first axis to the right,
+    second axis forward.
+
+    Attributes:
+        focals: (k,) [px].
+        tilts: (k,) [rad].
+        along: (k, 2) unit vector of a and b.
+        offsets: (k, 2) of a and b across it [1].
+        reach: (k, 2, 2) ends of a and b along it, rising [1].
+        offset: (k,) of c along it [1].
+        across: (k, 2) ends of c across it, rising [1].
+    """
+
+    focals: Floats
+    tilts: Floats
+    along: Floats
+    offsets: Floats
+    reach: Floats
+    offset: Floats
+    across: Floats
+
+
+def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
+    """Return the cameras with a roll of all triples of segments under all names that fit them."""
+    x_lines, y_lines = _straight_lines(pitch)
+    half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
+    found: list[Floats] = []
+    for triples in _ground_triples(paint, focals, roll):
+        for axis, (pair, third) in enumerate(((x_lines, y_lines), (y_lines, x_lines))):
+            # The normal of a line along x points to y; that of a line along y, to -x.
+            sign = 1.0 if axis == 0 else -1.0
+            for first, second in permutations(pair, 2):
+                gap = triples.offsets[:, 0] - triples.offsets[:, 1]
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    height = sign * (first[0] - second[0]) / gap
+                tall = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1])
+                for other in third:
+                    kept = np.flatnonzero(tall)
+                    up = height[kept]
+                    beside = sign * first[0] - up * triples.offsets[kept, 0]
+                    ahead = other[0] - up * triples.offset[kept]
+                    place = (ahead, beside) if axis == 0 else (-beside, ahead)
+                    fits = np.hypot(*place) < _FARTHEST
+                    fits &= (np.abs(place[0]) > half[0]) | (np.abs(place[1]) > half[1])
+                    for index, line in enumerate((first, second)):
+                        ends = triples.reach[kept, index] * up[:, None] + ahead[:, None]
+                        fits &= _within(ends, line[1:])
+                    ends = triples.across[kept] * up[:, None] + beside[:, None]
+                    fits &= _within(ends, other[1:] if axis == 0 else -other[:0:-1])
+                    kept, up = kept[fits], up[fits]
+                    if not len(kept):
+                        continue
+                    along = triples.along[kept]
+                    normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+                    axes = (along, normal) if axis == 0 else (-normal, along)
+                    found.append(
+                        np.column_stack(
+                            [
+                                triples.focals[kept],
+                                triples.tilts[kept],
+                                up,
+                                *axes,
+                                place[0][fits],
+                                place[1][fits],
+                            ]
+                        )
+                    )
+    level = _level_cameras(np.concatenate([np.empty((0, 9)), *found]))
+    return replace(level, rotations=_about_axis(roll) @ level.rotations)
+
+
+def _about_axis(roll: float) -> Floats:
+    """Return the turn (3, 3) of a camera about its axis."""
+    cosine, sine = np.cos(roll), np.sin(roll)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _within(ends: Floats, line: Floats) -> NDArray[np.bool_]:
+    """Return whether segments with ends (k, 2) lie on a marking from line[0] to line[1]."""
+    beyond = _BEYOND[0] * (ends[:, 1] - ends[:, 0]) + _BEYOND[1]
+    return np.asarray((ends[:, 0] > line[0] - beyond) & (ends[:, 1] < line[1] + beyond))
+
+
+def _level_cameras(rows: Floats) -> Candidates:
+    """Return cameras on the near side of rows (k, 9).
+
+    Args:
+        rows: focal length, tilt, height, right and forward component of the pitch's x and y axis,
+            x, y.
+    """
+    turn = np.where(rows[:, 8:] > 0.0, -1.0, 1.0)
+    focals, tilts, up = rows[:, :3].T
+    zero = np.zeros(len(rows))
+    right = np.stack([*(turn * rows[:, [3, 5]]).T, zero], axis=-1)
+    forward = np.stack([*(turn * rows[:, [4, 6]]).T, zero], axis=-1)
+    down = np.array([0.0, 0.0, -1.0])
+    cosine, sine = np.cos(tilts)[:, None], np.sin(tilts)[:, None]
+    rotations = np.stack(
+        [right, down * cosine - forward * sine, forward * cosine + down * sine], axis=1
+    )
+    centers = np.stack([*(turn * rows[:, 7:]).T, up], axis=-1)
+    return Candidates(rotations, centers, focals, zero)
+
+
+def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Triples]:
+    """Yield triples at all focal lengths and tilts, one segment's direction after another's."""
+    width, height = paint.size
+    middle = 0.5 * np.array([width - 1, height - 1])
+    ends = (paint.segments[:_SEGMENTS] - middle) @ _about_axis(roll)[:2, :2]
+    if len(ends) < 3:
+        return
+    focal, tilt = (part.ravel() for part in np.meshgrid(focals * width, _TILTS, indexing="ij"))
+    cosine, sine = np.cos(tilt)[:, None, None], np.sin(tilt)[:, None, None]
+    away = focal[:, None, None]
+    depth = ends[None, ..., 1] * cosine + away * sine
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = ends[None, ..., 0] / depth
+        forward = (away * cosine - ends[None, ..., 1] * sine) / depth
+    below: NDArray[np.bool_] = np.asarray((depth > 1e-3 * away).all(axis=-1))
+    ground = np.stack([right, forward], axis=-1)  # (g, n, 2 ends, 2)
+    step = ground[:, :, 1] - ground[:, :, 0]
+    angle = np.arctan2(step[..., 1], step[..., 0])
+    count = len(ends)
+    for reference in range(count):
+        turned = angle - angle[:, reference : reference + 1]
+        usable = below & below[:, reference : reference + 1]
+        parallel = usable & (np.abs((turned + 0.5 * np.pi) % np.pi - 0.5 * np.pi) < _LEVEL)
+        square = usable & (np.abs(turned % np.pi - 0.5 * np.pi) < _LEVEL)
+        parallel[:, reference] = False
+        # The reference is a, or it is c.
+        g, b, c = np.nonzero(parallel[:, :, None] & square[:, None, :])
+        g2, a2, b2 = np.nonzero(
+            square[:, :, None] & square[:, None, :] & np.tri(count, k=-1, dtype=np.bool_)
+        )
+        a = np.append(np.full(len(g), reference), a2)
+        b, c = np.append(b, b2), np.append(c, np.full(len(g2), reference))
+        direction = np.append(angle[g, reference], angle[g2, reference] + 0.5 * np.pi)
+        g = np.append(g, g2)
+        along = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+        both = ground[g[:, None], np.stack([a, b], axis=-1)]  # (k, 2, 2 ends, 2)
+        third = ground[g, c]
+        yield _Triples(
+            focal[g],
+            tilt[g],
+            along,
+            np.einsum("ksei,ki->ks", both, normal) / 2.0,
+            np.sort(np.einsum("ksei,ki->kse", both, along), axis=-1),
+            np.einsum("kei,ki->k", third, along) / 2.0,
+            np.sort(np.einsum("kei,ki->ke", third, normal), axis=-1),
+        )
+
+
+def _homogeneous(points: Floats) -> Floats:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def _project(candidates: Candidates, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return pixels (k, n, 2) from the middle of the image, and whether they exist."""
+    local = np.einsum("kij,knj->kni", candidates.rotations, points - candidates.centers[:, None])
+    depth = local[..., 2]
+    front = depth > 1.0
+    flat = local[..., :2] / np.where(front, depth, 1.0)[..., None]
+    square = (flat**2).sum(-1)
+    radial = candidates.radial[:, None]
+    front &= 1.0 + 3.0 * radial * square > 0.0  # before the lens folds
+    stretch = (1.0 + radial * square) * candidates.focals[:, None]
+    return flat * stretch[..., None], front
+
+
+def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> SeenMarkings:
+    """Return the samples in the images of candidates, with the paint nearest to them."""
+    width, height = paint.size
+    places = samples.points_world
+    step = 0.25
+    pixels, front = _project(candidates, places)
+    ahead, ahead_front = _project(candidates, places + step * samples.along_world)
+    way = ahead - pixels
+    normals = np.arctan2(way[..., 1], way[..., 0]) + 0.5 * np.pi
+    spacing = _sample_spacing(samples)
+    image = pixels + 0.5 * np.array([width - 1, height - 1])
+    inside = front & ahead_front & (image > 1.0).all(-1) & (image < [width - 2, height - 2]).all(-1)
+    lengths = np.where(inside, np.hypot(way[..., 0], way[..., 1]) / step * spacing, 0.0)
+    # A marking that runs towards the camera does not count for more than its image.
+    lengths = np.minimum(lengths, 60.0)
+    at = np.where(inside[..., None], image, 0.0).astype(np.int64)
+    orientation = np.round(normals / np.pi * ORIENTATIONS).astype(np.int64) % ORIENTATIONS
+    index = (orientation, at[..., 1], at[..., 0])
+    on_pitch = paint.area[at[..., 1], at[..., 0]]
+    distances = np.where(on_pitch, paint.distances[index], np.inf)
+    return SeenMarkings(pixels, normals, lengths, distances, paint.nearest[index])
+
+
+def _sample_spacing(samples: LineSamples) -> Floats:
+    """Return the length of marking (n,) that each sample stands for [m]."""
+    steps = np.linalg.norm(np.diff(samples.points_world, axis=0), axis=-1)
+    inner = np.diff(samples.marking) == 0
+    spacing = np.zeros(len(samples.marking))
+    spacing[:-1] += 0.5 * steps * inner
+    spacing[1:] += 0.5 * steps * inner
+    return spacing
+
+
+def score_candidates(
+    paint: PaintMap, samples: LineSamples, candidates: Candidates, spread: float
+) -> Floats:
+    """Return log probability ratios (k,) of the paint, with each camera against without.
+
+    Args:
+        paint: of the image.
+        samples: of the markings.
+        candidates: (k,) cameras.
+        spread: standard deviation of a marking's distance from its paint [px].
+    """
+    gain, loss = np.log(_FOUND / _BY_CHANCE), np.log((1.0 - _FOUND) / (1.0 - _BY_CHANCE))
+    scores = np.zeros(len(candidates))
+    for first in range(0, len(candidates), 1000):
+        part = slice(first, first + 1000)
+        seen = project_markings(paint, samples, candidates[part])
+        found = np.exp(-0.5 * np.minimum(seen.distances / spread, 10.0) ** 2)
+        worth = loss + (gain - loss) * found
+        scores[part] = (seen.lengths * worth).sum(axis=1) / (INDEPENDENT * paint.size[0])
+    return scores
+
+
+def refine_candidates(
+    paint: PaintMap,
+    samples: LineSamples,
+    candidates: Candidates,
+    radii: Sequence[float],
+    free: tuple[bool, bool],
+) -> Candidates:
+    """Return candidates moved so that their markings lie on the nearest paint of their direction.
+
+    Gauss-Newton steps with Cauchy weights. The paint's distance across the marking is the residual.
+
+    Args:
+        paint: of the image.
+        samples: of the markings.
+        candidates: starts.
+        radii: distances within which paint attracts a marking, one stage after another [px].
+        free: whether focal length and k1 are solved for.
+    """
+    rolls = candidates.rotations[:, 0, 2]
+    for radius in radii:
+        for _ in range(_ITERATIONS):
+            step, usable = _step(paint, samples, candidates, rolls, radius, free)
+            candidates, rolls = _move(candidates, step)[usable], rolls[usable]
+            if not len(candidates):
+                return candidates
+    return candidates
+
+
+def _step(
+    paint: PaintMap,
+    samples: LineSamples,
+    candidates: Candidates,
+    rolls: Floats,
+    radius: float,
+    free: tuple[bool, bool],
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return steps (k, 8): rotation, center, log focal length, k1; and whether they exist."""
+    seen = project_markings(paint, samples, candidates)
+    width, height = paint.size
+    middle = 0.5 * np.array([width - 1, height - 1])
+    target = paint.points[seen.nearest] - middle
+    across = np.stack([np.cos(seen.normals), np.sin(seen.normals)], axis=-1)
+    residual = ((target - seen.pixels) * across).sum(-1)
+    used = (seen.distances < radius) & (seen.lengths > 0.0)
+    weight = np.where(used, np.minimum(seen.lengths, 20.0) / 8.0, 0.0)
+    weight /= 1.0 + (residual / (radius / 3.0)) ** 2
+    residual = np.where(used, residual, 0.0)
+    local = np.einsum(
+        "kij,knj->kni", candidates.rotations, samples.points_world - candidates.centers[:, None]
+    )
+    depth = np.where(used, local[..., 2], 1.0)
+    x, y = np.where(used, local[..., 0], 0.0) / depth, np.where(used, local[..., 1], 0.0) / depth
+    square, radial = x**2 + y**2, candidates.radial[:, None]
+    focal = candidates.focals[:, None]
+    stretch = 1.0 + radial * square
+    # Derivative of the pixel, along the normal, by the flat place (x, y).
+    nx, ny = across[..., 0], across[..., 1]
+    inward = 2.0 * radial * (x * nx + y * ny)
+    by_x, by_y = focal * (stretch * nx + inward * x), focal * (stretch * ny + inward * y)
+    by_point = np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=-1) / depth[..., None]
+    point = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
+    radially = focal * (x * nx + y * ny)
+    rows = np.concatenate(
+        [
+            np.cross(point, by_point),
+            -np.einsum("kni,kij->knj", by_point, candidates.rotations),
+            (stretch * radially)[..., None],
+            (square * radially)[..., None],
+        ],
+        axis=-1,
+    )
+    weighted = rows * weight[..., None]
+    system = np.einsum("kni,knj->kij", weighted, rows)
+    right = np.einsum("kni,kn->ki", weighted, residual)
+    corner = (0.5 * np.hypot(width, height) / candidates.focals) ** 2
+    bend = _BEND_STD[int(bool(paint.lens.distortion.any()))]
+    radial_info = (corner / bend) ** 2 if free[1] else np.full(len(candidates), 1e12)
+    damping = np.tile([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 4.0 if free[0] else 1e12, 0.0], (len(x), 1))
+    damping[:, 7] = radial_info
+    system += damping[:, :, None] * np.eye(8)
+    if free[1]:
+        right[:, 7] -= radial_info * candidates.radial
+    # The roll is the height of the camera's right axis; it turns by the rotation step.
+    roll, turning = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(x), 8))
+    turning[:, 1], turning[:, 2] = candidates.rotations[:, 2, 2], -candidates.rotations[:, 1, 2]
+    system += turning[:, :, None] * turning[:, None, :] / _ROLL_STD**2
+    right -= turning * roll[:, None] / _ROLL_STD**2
+    step = np.linalg.solve(system, right[..., None])[..., 0]
+    usable = (np.count_nonzero(used, axis=1) >= 12) & np.isfinite(step).all(axis=1)
+    usable &= candidates.centers[:, 2] + step[:, 5] > 1.0
+    return np.where(usable[:, None], step, 0.0), usable
+
+
+def _move(candidates: Candidates, step: Floats) -> Candidates:
+    """Return candidates after a step (k, 8)."""
+    turned = np.array([cv2.Rodrigues(turn)[0] for turn in step[:, :3]]).reshape(-1, 3, 3)
+    return Candidates(
+        turned @ candidates.rotations,
+        candidates.centers + step[:, 3:6],
+        candidates.focals * np.exp(np.clip(step[:, 6], -0.3, 0.3)),
+        candidates.radial + step[:, 7],
+    )

@@ -1,0 +1,483 @@
+"""Cameras and markings proposed from an image alone, without a click (C2).
+
+Straight segments of paint are the evidence. A triple of them, two along one axis of the pitch and
+one along the other, with names from the template and a level camera, determines a camera. Every
+plausible assignment gives a candidate; the paint that it explains, and the markings that it
+predicts and the image lacks, decide. The best candidates are refined on the nearest paint.
+
+The pitch looks the same after half a turn. The side on which the camera stands decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats, Image
+from data_contracts.cameras import LensCalibration
+from data_contracts.match import Side
+from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.camera_candidates import (
+    INDEPENDENT,
+    Candidates,
+    SeenMarkings,
+    join_candidates,
+    name_triples,
+    project_markings,
+    refine_candidates,
+    score_candidates,
+)
+from worldpose.static_calibration.line_samples import LineSamples, sample_markings
+from worldpose.static_calibration.paint_segments import PaintMap, find_paint
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
+
+_FOCALS: Final = np.geomspace(0.45, 5.0, 13)
+"""Focal lengths to try, in image widths [1]."""
+_ROLLS: Final = ((0.0,), (-0.14, -0.07, 0.07, 0.14))
+"""Rolls to try, and those to try as well while the proposal is not clear [rad]: cameras on masts
+hang 4 to 8 degrees off the level."""
+_CLEAR: Final = 25.0
+"""Minimum margin of a clear proposal [1]."""
+MIN_MARGIN: Final = 25.0
+"""Minimum margin of a proposal to be used without a click [1]."""
+MIN_FOUND: Final = 0.6
+"""Minimum share of its markings on paint [1]."""
+MIN_EXPLAINED: Final = 0.4
+"""Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
+two lines."""
+_AGREES: Final = 0.01
+"""Maximum median displacement of markings by the calibration, in image widths [1]."""
+_TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
+_COARSE: Final = (6.0, 8.0)
+_SAMPLED: Final = (2.5, 6.0)
+_FINE: Final = (1.0, 2.0)
+"""Spacing of samples [m], and standard deviation of their distance from paint [px]: for all
+candidates, for good ones, and for refined ones."""
+_GOOD: Final = 8000
+"""Candidates to judge on closer samples [1]."""
+_REFINED: Final = 60
+"""Candidates to refine [1]."""
+_RADII: Final = (25.0, 12.0, 6.0, 5.0)
+"""Distances within which paint attracts a marking, one stage after another [px]."""
+_POLISHED: Final = (10, (15.0, 8.0, 5.0, 5.0))
+"""Best different candidates to refine once more [1], with k1 free from the start, and distances of
+the stages [px]."""
+_SAME: Final = 8.0
+"""Median displacement of the markings below which two cameras are the same proposal [px]."""
+_DRAWN: Final = 40
+"""Maximum pixels to draw along a marking [1]."""
+_ON_PAINT: Final = 4.0
+"""Maximum distance of a marking from its paint [px]."""
+
+
+@dataclass(frozen=True)
+class MarkingSupport:
+    """How much of one marking the image shows.
+
+    Attributes:
+        name: line or arc of the template.
+        visible_px: length of the marking in the straight copy of the image [px].
+        found: share of it on paint [1].
+    """
+
+    name: str
+    visible_px: float
+    found: float
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A camera found without a click, and the evidence for it.
+
+    Attributes:
+        camera: pose, focal length and k1; no covariance: a calibration from `drawn` has one.
+        drawn: pixels on the paint of every marking that was found.
+        markings: what was expected and found, the longest first.
+        score: log probability ratio to an image without a pitch [1].
+        margin: score above the best other camera [1].
+        found: share of the expected markings on paint, by length [1].
+        explained: share of the segments' length on a marking [1].
+    """
+
+    camera: Camera
+    drawn: ClickedMarkings
+    markings: tuple[MarkingSupport, ...]
+    score: float
+    margin: float
+    found: float
+    explained: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the proposal may be used without a click."""
+        enough = self.found >= MIN_FOUND and self.explained >= MIN_EXPLAINED
+        return self.margin >= MIN_MARGIN and enough
+
+
+def propose_camera(
+    picture: Image,
+    pitch: PitchTemplate,
+    *,
+    side: Side,
+    prior: CameraPrior | None = None,
+    lens: LensCalibration | None = None,
+    where: str = "image",
+) -> Proposal:
+    """Return the camera that explains the paint of an image best.
+
+    Args:
+        picture: (height, width, 3) RGB.
+        pitch: the stadium's template.
+        side: where the camera stands.
+        prior: heights, distances, focal lengths; the defaults if None.
+        lens: a lens that was calibrated before.
+        where: file or camera, for messages.
+
+    Raises:
+        InputError: there is no grass, or too little paint for a camera.
+
+    Note:
+        The homography of line correspondences follows Hartley and Zisserman 2004, chapter 8; the
+        search over names is exhaustive.
+    """
+    height, width = picture.shape[:2]
+    given = None if lens is None else _lens_camera(lens, (width, height))
+    paints = find_paint(picture, given, where)
+    found = propose_from_paint(paints, pitch, side=side, prior=prior, lens=given)
+    if found is None:
+        raise InputError(
+            where,
+            expected="at least three straight markings, one of them across the others",
+            found="paint that fits no camera",
+            todo=_TO_CLICK,
+        )
+    return found
+
+
+def propose_from_paint(
+    paints: Iterable[PaintMap],
+    pitch: PitchTemplate,
+    *,
+    side: Side,
+    prior: CameraPrior | None = None,
+    lens: Camera | None = None,
+) -> Proposal | None:
+    """Return the camera that explains the paint of an image best, or None.
+
+    Args:
+        paints: paint under every lens that the image may have, the likely one first.
+        pitch: the stadium's template.
+        side: where the camera stands.
+        prior: heights, distances, focal lengths; the defaults if None.
+        lens: the lens if it is known.
+    """
+    found = _rank_under_lenses(paints, pitch, prior or CameraPrior(), lens)
+    if found is None:
+        return None
+    paint, ranked, scores = found
+    samples, best = sample_markings(pitch, _FINE[0]), _stand_on(ranked[:1], side)
+    seen = project_markings(paint, samples, best)
+    markings, drawn = _support(paint, samples, seen)
+    lengths = seen.lengths[0]
+    on_paint = (lengths * (seen.distances[0] < _ON_PAINT)).sum() / max(lengths.sum(), 1e-9)
+    return Proposal(
+        _to_camera(best, paint),
+        drawn,
+        markings,
+        float(scores[0]),
+        float(scores[0] - max(0.0, *scores[1:2])),
+        float(on_paint),
+        _explained(paint, seen),
+    )
+
+
+def calibrate_without_clicks(
+    pitch: PitchTemplate,
+    picture: Image,
+    *,
+    side: Side,
+    settings: StaticCalibrationSettings | None = None,
+    where: str = "image",
+    lens: LensCalibration | None = None,
+) -> StaticCalibration:
+    """Return the camera of an image, its covariance and its report, from the image alone.
+
+    The markings of a clear proposal are calibrated as if they had been drawn. The calibration has
+    to agree with the proposal.
+
+    Args:
+        pitch: the stadium's template.
+        picture: (height, width, 3) RGB.
+        side: where the camera stands.
+        settings: noise, prior and thresholds; the defaults if None.
+        where: file or camera, for messages.
+        lens: a lens that was calibrated before; None = not known.
+
+    Raises:
+        InputError: the image shows too little, other cameras explain it nearly as well, or the
+            calibration disagrees with the proposal; the message says what to click.
+    """
+    stated = settings or StaticCalibrationSettings()
+    proposal = propose_camera(picture, pitch, side=side, prior=stated.prior, lens=lens, where=where)
+    if not proposal.is_clear:
+        raise _unclear(proposal, where)
+    height, width = picture.shape[:2]
+    calibration = calibrate_camera(
+        pitch,
+        proposal.drawn,
+        (width, height),
+        picture=picture,
+        settings=stated,
+        where=where,
+        lens=lens,
+    )
+    places = pitch.sample_lines(_FINE[0]).points_world
+    pixels, others = (
+        camera.project(places) for camera in (proposal.camera, calibration.estimate.camera)
+    )
+    inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
+    moved = float(np.median(np.linalg.norm(pixels - others, axis=1)[inside]))
+    if not moved < _AGREES * width:
+        raise InputError(
+            where,
+            expected="the calibration close to the proposal of the image",
+            found=f"markings {moved:.0f} px apart (median)",
+            todo=_TO_CLICK,
+        )
+    decision = (
+        f"markings proposed from the image: {proposal.found:.0%} of their length on paint, "
+        f"{proposal.margin:.0f} above other cameras"
+    )
+    report = calibration.report
+    report = replace(report, decisions=(decision, *report.decisions))
+    return replace(calibration, report=report)
+
+
+def _unclear(proposal: Proposal, where: str) -> InputError:
+    lacking = [each.name for each in proposal.markings if each.found < 0.5]
+    return InputError(
+        where,
+        expected=f"one camera that explains the paint (margin {MIN_MARGIN:g}, "
+        f"{MIN_FOUND:.0%} of the markings on paint, {MIN_EXPLAINED:.0%} of the paint on markings)",
+        found=f"margin {proposal.margin:.0f}, {proposal.found:.0%} and {proposal.explained:.0%}; "
+        f"not found: {', '.join(lacking[:4]) or 'nothing, but other cameras fit as well'}",
+        todo=_TO_CLICK,
+    )
+
+
+def _rank_under_lenses(
+    paints: Iterable[PaintMap], pitch: PitchTemplate, prior: CameraPrior, lens: Camera | None
+) -> tuple[PaintMap, Candidates, Floats] | None:
+    """Return the paint under the lens that explains it best, its cameras and their scores."""
+    best: tuple[PaintMap, Candidates, Floats] | None = None
+    for paint in paints:
+        focals = _FOCALS if lens is None else np.array([paint.focal / paint.size[0]])
+        ranked, scores = rank_cameras(paint, pitch, prior, focals)
+        if len(ranked) and (best is None or scores[0] > best[2][0]):
+            best = (paint, ranked, scores)
+        if best is not None and best[2][0] - max(0.0, *best[2][1:2]) > _CLEAR:
+            break
+    return best
+
+
+def rank_cameras(
+    paint: PaintMap, pitch: PitchTemplate, prior: CameraPrior, focals: Floats = _FOCALS
+) -> tuple[Candidates, Floats]:
+    """Return different cameras, the best first, all on the near side, and their scores (k,).
+
+    Args:
+        paint: paint of the image.
+        pitch: the template.
+        prior: heights, distances, focal lengths.
+        focals: focal lengths to try, in image widths [1]; a single one is kept.
+    """
+    best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
+    if len(scores) and scores[0] - max(0.0, *scores[1:2]) > _CLEAR:
+        return best, scores
+    rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
+    return _order(
+        paint,
+        sample_markings(pitch, _FINE[0]),
+        join_candidates(best, rolled),
+        np.append(scores, others),
+    )
+
+
+def _rank_rolled(
+    paint: PaintMap,
+    pitch: PitchTemplate,
+    prior: CameraPrior,
+    focals: Floats,
+    rolls: Sequence[float],
+) -> tuple[Candidates, Floats]:
+    """Return different cameras near some rolls, the best first, and their scores (k,)."""
+    found = join_candidates(*(name_triples(paint, pitch, focals, roll) for roll in rolls))
+    if not len(found):
+        return found, np.zeros(0)
+    for (spacing, spread), count in ((_COARSE, _GOOD), (_SAMPLED, 10 * _REFINED)):
+        if len(found) > count or spacing == _SAMPLED[0]:
+            samples = sample_markings(pitch, spacing)
+            scores = score_candidates(paint, samples, found, spread) + _log_prior(
+                found, prior, paint.size
+            )
+            found = found[np.argsort(-scores, kind="stable")[:count]]
+    samples = sample_markings(pitch, _FINE[0])
+    found = _thin_out(found)
+    for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
+        free = (len(focals) > 1, bends and len(focals) > 1)
+        found = refine_candidates(paint, samples, found[:count], radii, free)
+        scores = score_candidates(paint, samples, found, _FINE[1]) + _log_prior(
+            found, prior, paint.size
+        )
+        found, scores = _order(paint, samples, found, scores)
+    return found, scores
+
+
+def _order(
+    paint: PaintMap, samples: LineSamples, found: Candidates, scores: Floats
+) -> tuple[Candidates, Floats]:
+    """Return different cameras, the best first, and their scores (k,)."""
+    order = np.argsort(-scores, kind="stable")
+    found, scores = found[order], scores[order]
+    different = _different(paint, samples, found)
+    return found[different], scores[different]
+
+
+def _log_prior(candidates: Candidates, prior: CameraPrior, size: tuple[int, int]) -> Floats:
+    """Return log densities (k,) of heights, distances and focal lengths, up to a constant."""
+    deviations = (
+        np.log(candidates.centers[:, 2] / prior.height_m) / prior.log_height_std,
+        np.log(np.linalg.norm(candidates.centers[:, :2], axis=1) / prior.distance_m)
+        / prior.log_distance_std,
+        np.log(candidates.focals / (size[0] * prior.focal)) / prior.log_focal_std,
+    )
+    return np.asarray(-0.5 * np.square(deviations).sum(axis=0))
+
+
+def _thin_out(candidates: Candidates) -> Candidates:
+    """Return candidates that differ from all before, at most as many as will be refined."""
+    centers = candidates.centers
+    near = np.maximum(5.0, 0.1 * np.linalg.norm(centers, axis=1))[:, None]
+    places = np.concatenate(
+        [
+            centers / near,
+            10.0 * candidates.rotations[:, 2],
+            5.0 * np.log(candidates.focals)[:, None],
+        ],
+        axis=1,
+    )
+    kept: list[int] = []
+    for index, place in enumerate(places):
+        if len(kept) == _REFINED:
+            break
+        if not kept or (np.abs(places[kept] - place).max(axis=1) > 1.0).all():
+            kept.append(index)
+    return candidates[np.array(kept, dtype=np.int64)]
+
+
+def _different(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
+    """Return indices of the candidates whose markings lie elsewhere than those of all before."""
+    seen = project_markings(paint, samples, candidates)
+    visible = seen.lengths > 0.0
+    kept: list[int] = []
+    for index in range(len(candidates)):
+        for before in kept:
+            either = visible[index] & visible[before]
+            moved = np.linalg.norm(seen.pixels[index] - seen.pixels[before], axis=-1)[either]
+            shared = np.count_nonzero(either) > 0.8 * np.count_nonzero(visible[before])
+            if shared and len(moved) and np.median(moved) < _SAME:
+                break
+        else:
+            kept.append(index)
+    return np.array(kept, dtype=np.int64)
+
+
+def _stand_on(candidates: Candidates, side: Side) -> Candidates:
+    """Return candidates on one side of the pitch: themselves, or turned by half a turn about z."""
+    axis, sign = {"near": (1, -1.0), "far": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}[side]
+    turn = np.where(candidates.centers[:, axis] * sign < 0.0, -1.0, 1.0)[:, None]
+    half = np.concatenate([turn, turn, np.ones_like(turn)], axis=1)
+    return replace(
+        candidates,
+        rotations=candidates.rotations * half[:, None, :],
+        centers=candidates.centers * half,
+    )
+
+
+def _support(
+    paint: PaintMap, samples: LineSamples, seen: SeenMarkings
+) -> tuple[tuple[MarkingSupport, ...], ClickedMarkings]:
+    """Return each visible marking's support, and the pixels of those that were found."""
+    support, drawn = [], []
+    for index, name in enumerate(samples.names):
+        mine = (samples.marking == index) & (seen.lengths[0] > 0.0)
+        length = float(seen.lengths[0, mine].sum())
+        if length < _ON_PAINT:
+            continue
+        on = mine & (seen.distances[0] < _ON_PAINT)
+        found = float(seen.lengths[0, on].sum()) / length
+        support.append(MarkingSupport(name, length, found))
+        if found * length < INDEPENDENT * paint.size[0] or found < 0.5:
+            continue
+        nearest = np.unique(seen.nearest[0, on])
+        chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _DRAWN)).astype(np.int64)
+        pixels = paint.origins[nearest[chosen]]
+        drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
+    support.sort(key=lambda each: -each.visible_px)
+    return tuple(support), ClickedMarkings(drawn=tuple(drawn))
+
+
+def _explained(paint: PaintMap, seen: SeenMarkings) -> float:
+    """Return the share of the segments' length that lies on a projected marking [1]."""
+    width, height = paint.size
+    canvas = np.ones((height, width), np.uint8)
+    image = seen.pixels[0][seen.lengths[0] > 0.0] + 0.5 * np.array([width - 1, height - 1])
+    for x, y in image:
+        cv2.circle(canvas, (round(x), round(y)), 1, 0, -1)
+    away = cv2.distanceTransform(canvas, cv2.DIST_L2, 5)
+    total = on = 0.0
+    for start, end in paint.segments:
+        count = max(2, int(np.linalg.norm(end - start)))
+        x, y = np.linspace(start, end, count).T
+        row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
+        # Samples of markings are up to tens of pixels apart.
+        on += float((away[row.astype(int), column.astype(int)] < 3.0 * _ON_PAINT).sum())
+        total += count
+    return on / max(total, 1.0)
+
+
+def _lens_camera(lens: LensCalibration, size: tuple[int, int]) -> Camera:
+    return Camera(
+        focal=np.array([lens.focal_px, lens.focal_px]),
+        principal_point=np.array(lens.principal_point_px),
+        distortion=np.array(lens.distortion),
+        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
+        image_size=np.array(size),
+    )
+
+
+def _to_camera(candidates: Candidates, paint: PaintMap) -> Camera:
+    """Return the first candidate, a camera of the straight copy, as a camera of the image."""
+    rotation, center = candidates.rotations[0], candidates.centers[0]
+    stretch = float(candidates.focals[0]) / paint.focal
+    k1, k2, p1, p2, k3 = paint.lens.distortion
+    # The lens of a camera `stretch` times as long has the same curvature in pixels.
+    powers = stretch ** np.array([2.0, 4.0, 1.0, 1.0, 6.0])
+    distortion = np.array([k1, k2, p1, p2, k3]) * powers
+    distortion[0] += candidates.radial[0]
+    return replace(
+        paint.lens,
+        focal=paint.lens.focal * stretch,
+        distortion=distortion,
+        cam_from_world=Rigid(rotation, -rotation @ center),
+    )
