@@ -1,0 +1,212 @@
+"""Cameras found in an image alone, against the camera that an image was rendered with."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.static_calibration import ClickedMarkings
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation.renderer import render_pitch
+from worldpose.simulation.scene import look_at
+from worldpose.static_calibration import calibrate_without_clicks, propose_camera
+from worldpose.static_calibration.camera_candidates import (
+    Candidates,
+    project_markings,
+    refine_candidates,
+    score_candidates,
+)
+from worldpose.static_calibration.line_samples import sample_markings
+from worldpose.static_calibration.paint_segments import (
+    Ridges,
+    find_paint,
+    guess_lens,
+    straighten_paint,
+)
+from worldpose.static_calibration.proposal import propose_from_paint
+
+PITCH = PitchTemplate.standard()
+SAMPLES = sample_markings(PITCH, 1.0)
+SIZE = (1280, 720)
+
+
+def camera(center=(-24.0, -60.0, 22.0), aim=(-33.0, -2.0, 0.0), focal=1300.0):
+    return Camera(
+        focal=np.array([focal, focal]),
+        principal_point=0.5 * (np.array(SIZE) - 1.0),
+        distortion=np.array([-0.05, 0.0, 0.0, 0.0, 0.0]),
+        cam_from_world=look_at(np.array(center), np.array(aim), 0.005),
+        image_size=np.array(SIZE),
+    )
+
+
+@cache
+def still(center=(-24.0, -60.0, 22.0)):
+    return render_pitch(camera(center), PITCH, None, 3)
+
+
+def feet():
+    x, y = np.meshgrid(np.linspace(-50.0, -15.0, 8), np.linspace(-25.0, 25.0, 8))
+    return np.stack([x.ravel(), y.ravel(), PITCH.height(x, y).ravel()], axis=-1)
+
+
+def misplaced(found, true):
+    """Distances on the pitch [m] between places and the back-projections of their true pixels."""
+    places = feet()
+    pixels = true.project(places)
+    seen = ((pixels > 0.0) & (pixels < true.image_size - 1.0)).all(axis=-1)
+    rays = found.unproject(pixels[seen])
+    reach = (places[seen, 2] - rays.origins[:, 2]) / rays.directions[:, 2]
+    met = rays.origins + reach[:, None] * rays.directions
+    return np.linalg.norm(met - places[seen], axis=-1)
+
+
+def ridges(true, names, pitch=PITCH):
+    """Pixels of markings as ridges, as a flawless detector would find them."""
+    points, normals = [], []
+    for name in names:
+        pixels = true.project(pitch.marking_points(name, 0.02))
+        inside = ((pixels >= 0.0) & (pixels <= np.array(SIZE) - 1.0)).all(axis=1)
+        way = np.gradient(pixels, axis=0)
+        points.append(pixels[inside])
+        normals.append((np.arctan2(way[:, 1], way[:, 0]) + 0.5 * np.pi)[inside] % np.pi)
+    return Ridges(np.concatenate(points), np.concatenate(normals))
+
+
+def paint_of(true, names):
+    whole = np.ones(SIZE[::-1], np.bool_)
+    return straighten_paint(ridges(true, names), whole, guess_lens(0.0, SIZE), 1.0)
+
+
+def as_candidate(true, paint):
+    stretch = paint.focal / paint.lens.focal[0]
+    return Candidates(
+        np.asarray(true.cam_from_world.rotation)[None],
+        true.center[None],
+        np.array([true.focal[0] * stretch]),
+        np.array([true.distortion[0]]),
+    )
+
+
+def test_a_rendered_still_gives_its_camera_without_a_click():
+    found = calibrate_without_clicks(PITCH, still(), side="near")
+    off = misplaced(found.estimate.camera, camera())
+    assert len(off) > 20
+    assert np.median(off) < 0.05
+    assert found.report.decisions[0].startswith("markings proposed from the image")
+
+
+def test_half_a_turn_about_the_centre_spot_is_decided_by_the_side():
+    near = propose_camera(still(), PITCH, side="near").camera
+    far = propose_camera(still(), PITCH, side="far").camera
+    assert near.center[1] < 0.0 < far.center[1]
+    np.testing.assert_allclose(far.center, near.center * [-1.0, -1.0, 1.0])
+    there = near.project(feet())
+    np.testing.assert_allclose(far.project(feet() * [-1.0, -1.0, 1.0]), there, atol=1e-6)
+
+
+def test_drawn_pixels_lie_on_the_markings_that_they_name():
+    proposal = propose_camera(still(), PITCH, side="near")
+    assert len(proposal.drawn.drawn) >= 5
+    for marking in proposal.drawn.drawn:
+        true = camera().project(PITCH.marking_points(marking.name, 0.05))
+        true = true[np.isfinite(true).all(axis=1)]
+        away = np.linalg.norm(np.array(marking.xy)[:, None] - true, axis=-1).min(axis=1)
+        assert np.median(away) < 2.0, marking.name
+
+
+def test_too_little_paint_is_refused_with_what_to_click():
+    paint = paint_of(camera(), ["penalty_area_left_front"])
+    assert propose_from_paint([paint], PITCH, side="near") is None
+    grass = np.full((720, 1280, 3), (60, 120, 50), np.uint8)
+    with pytest.raises(InputError, match=r"image of cam3: expected at least three straight.*Click"):
+        calibrate_without_clicks(PITCH, grass, side="near", where="image of cam3")
+
+
+def test_lines_that_many_cameras_explain_are_not_clear():
+    # Two parallels and a line across them: every pair of parallels of the pitch explains them.
+    names = ["penalty_area_left_near", "penalty_area_left_far", "penalty_area_left_front"]
+    proposal = propose_from_paint([paint_of(camera(), names)], PITCH, side="near")
+    assert proposal is not None
+    assert not proposal.is_clear
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.zeros((720, 1280), np.uint8), "expected RGB bytes"),
+        (np.zeros((720, 1280, 3), np.uint8), "expected grass in the lower three quarters"),
+        (np.full((720, 1280, 3), 200, np.uint8), "expected grass in the lower three quarters"),
+    ],
+    ids=["grey", "black", "white"],
+)
+def test_an_image_without_a_green_pitch_is_refused(picture, message):
+    with pytest.raises(InputError, match=message):
+        propose_camera(picture, PITCH, side="near")
+
+
+def test_samples_are_projected_as_opencv_does():
+    true = camera()
+    paint = paint_of(true, [*PITCH.lines, *PITCH.arcs])
+    seen = project_markings(paint, SAMPLES, as_candidate(true, paint))
+    rotation, _ = cv2.Rodrigues(np.asarray(true.cam_from_world.rotation))
+    focal = paint.focal * true.focal[0] / paint.lens.focal[0]
+    matrix = np.array([[focal, 0.0, 0.0], [0.0, focal, 0.0], [0.0, 0.0, 1.0]])
+    expected, _ = cv2.projectPoints(
+        SAMPLES.points_world,
+        rotation,
+        np.asarray(true.cam_from_world.translation),
+        matrix,
+        np.array([true.distortion[0], 0.0, 0.0, 0.0]),
+    )
+    inside = seen.lengths[0] > 0.0
+    assert np.count_nonzero(inside) > 100
+    np.testing.assert_allclose(seen.pixels[0, inside], expected[inside, 0], atol=1e-6)
+    assert np.median(seen.distances[0, inside]) < 1.0
+
+
+def test_a_displaced_camera_returns_to_the_paint():
+    true = camera()
+    paint = paint_of(true, [*PITCH.lines, *PITCH.arcs])
+    start = as_candidate(true, paint)
+    turn, _ = cv2.Rodrigues(np.array([0.004, -0.006, 0.002]))
+    moved = Candidates(
+        turn @ start.rotations,
+        start.centers + [1.0, -1.5, 0.5],
+        start.focals * 1.02,
+        np.zeros(1),
+    )
+    back = refine_candidates(paint, SAMPLES, moved, (25.0, 12.0, 6.0, 5.0), (True, True))
+    before, after = (score_candidates(paint, SAMPLES, each, 2.0) for each in (moved, back))
+    assert after > before
+    assert np.linalg.norm(back.centers - start.centers) < 0.3
+    assert abs(np.log(back.focals / start.focals)) < 0.004
+
+
+@pytest.mark.parametrize("bend", [-0.09, -0.18])
+def test_a_bent_image_offers_lenses_that_make_it_straight(bend):
+    lens = guess_lens(bend, SIZE)
+    flat = still().astype(np.float32)
+    y, x = np.indices(SIZE[::-1], dtype=np.float64)
+    straight = lens.normalize(np.stack([x.ravel(), y.ravel()], axis=-1))
+    places = straight * 0.5 * SIZE[0] + 0.5 * (np.array(SIZE) - 1.0)
+    maps = [places[:, axis].reshape(SIZE[::-1]).astype(np.float32) for axis in (0, 1)]
+    bent = cv2.remap(flat, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    offered = list(find_paint(np.clip(bent, 0, 255).astype(np.uint8)))
+    assert len(offered) > 1
+    # The rim of a straight copy by the true lens lies where that of an offered one lies.
+    rim = np.array([[0.0, 0.5 * (SIZE[1] - 1)]])
+    reaches = [abs(each.lens.normalize(rim)[0, 0]) for each in offered]
+    assert min(abs(reach - abs(lens.normalize(rim)[0, 0])) for reach in reaches) < 0.06
+
+
+def test_nothing_is_drawn_where_nothing_is_found():
+    grass = np.full((720, 1280, 3), (60, 120, 50), np.uint8)
+    (paint,) = find_paint(grass)
+    assert paint.segments.shape == (0, 2, 2)
+    assert paint.area.all()
+    assert propose_from_paint([paint], PITCH, side="near") is None
+    assert ClickedMarkings() == ClickedMarkings(drawn=())
