@@ -16,12 +16,13 @@ from fastapi.responses import FileResponse, Response
 from data_contracts.release import EXPORT_FORMATS
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
-from flows.reports.scene_data import describe_frames, describe_scene
+from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import Origin, clips_of
 from flows.results.export import export
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from worldpose.errors import WorldposeError
+from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
 from worldpose.store import Run, open_run
 
 BINARY: Final = "application/octet-stream"
@@ -58,6 +59,25 @@ class _Files:
         return file
 
 
+class _Clips:
+    """The clip that was shown last, in memory: the browser asks for it range by range."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._key: tuple[str, str, str] | None = None
+        self._clip: ViewerClip | None = None
+
+    def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
+        key = (run.record.match_id, run.record.run_id, clip)
+        with self._lock:
+            if self._clip is None or self._key != key:
+                origin = Origin(run, match.registration)
+                video = describe_video(run, match, clip)
+                self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
+                self._key = key
+            return self._clip
+
+
 def _require_clip(run: Run, clip: str) -> None:
     if clip not in clips_of(run.record):
         raise HTTPException(404, "the run has no such clip")
@@ -66,7 +86,7 @@ def _require_clip(run: Run, clip: str) -> None:
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
-    files = _Files()
+    files, shown = _Files(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
@@ -89,7 +109,7 @@ def routes(context: PageContext) -> APIRouter:
     def scene(match_id: str, clip: str) -> Response:
         match, run = open_latest(match_id)
         _require_clip(run, clip)
-        return Response(describe_scene(run, match, clip), media_type=BINARY)
+        return Response(encode_scene(shown.get(run, match, clip)), media_type=BINARY)
 
     @router.get("/scenes/{clip}/frames")
     def frames(
@@ -100,7 +120,7 @@ def routes(context: PageContext) -> APIRouter:
     ) -> Response:
         match, run = open_latest(match_id)
         _require_clip(run, clip)
-        return Response(describe_frames(run, match, clip, first, count), media_type=BINARY)
+        return Response(encode_frames(shown.get(run, match, clip), first, count), media_type=BINARY)
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:
