@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -18,9 +19,11 @@ from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
 from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import Origin, clips_of
+from flows.results.comparison import compare_runs
 from flows.results.export import export
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.browser_words import describe_error
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
 from worldpose.store import Run, open_run
@@ -103,6 +106,32 @@ def routes(context: PageContext) -> APIRouter:
             "run": run.record.run_id,
             "formats": list(EXPORT_FORMATS),
             "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
+        }
+
+    @router.get("/metrics")
+    def metrics(match_id: str) -> dict[str, Any]:
+        _, run = open_latest(match_id)
+        record, parent = run.record, run.record.parent
+        changes, problem = [], ""
+        if parent is not None:
+            try:
+                before = context.store.run(match_id, parent)
+                changes = compare_runs(context.store, before, record)
+            except WorldposeError as error:  # its results may be garbage collected
+                problem = f"Run {parent} cannot be compared: {describe_error(error)}"
+        return {
+            "metrics": [
+                {
+                    "kind": each.kind,
+                    "name": each.name,
+                    "values": {one.figure: one.after for one in each.figures},
+                }
+                for each in compare_runs(context.store, record, record)
+            ],
+            "before": parent,
+            "problem": problem,
+            "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
+            "unchanged": sum(each.mark == "unchanged" for each in changes),
         }
 
     @router.get("/scenes/{clip}")

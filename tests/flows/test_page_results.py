@@ -19,7 +19,7 @@ from worldpose.formats.viewer_file import (
     encode_spread,
     read_viewer,
 )
-from worldpose.store import open_run
+from worldpose.store import Store, open_run
 
 
 def test_a_complete_run_gives_its_report_and_its_exports(ada):
@@ -102,6 +102,37 @@ def test_parts_that_there_are_none_of_are_refused(ada):
     assert (header["first"], header["count"]) == (3, 2)
     assert ada.get(f"{MATCH}/results/scenes/other").status_code == 404
     assert ada.get(f"{MATCH}/results/scenes/clip/frames?first=-1&count=2").status_code == 422
+
+
+def test_metrics_are_per_camera_and_player_and_compared_with_the_run_before(ada, project_copy):
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert (found["before"], found["changes"], found["problem"]) == (None, [], "")
+    kinds = {each["kind"] for each in found["metrics"]}
+    assert kinds == {"match", "clip", "camera", "player"}
+    (player, *_) = (each for each in found["metrics"] if each["kind"] == "player")
+    assert any(name.endswith(" residual_m") for name in player["values"])
+    store = Store.open(str(project_copy))
+    first = store.run(TINY)
+    unit = "static_calibration/cam00"
+    figures = {name: dict(values) for name, values in first.figures.items()}
+    figures[unit]["expected_ground_error_median_m"] *= 2.0
+    number = store.reserve_run(TINY)
+    second = {"run_id": number, "parent": first.run_id, "figures": figures}
+    store.finish_run(first.model_copy(update=second))
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert (found["before"], found["problem"]) == (first.run_id, "")
+    (changed,) = found["changes"]
+    assert (changed["kind"], changed["name"], changed["mark"]) == ("camera", "cam00", "worse")
+    assert found["unchanged"] == len(found["metrics"]) - 1
+
+
+def test_a_run_before_that_is_gone_is_said(ada, project_copy):
+    store = Store.open(str(project_copy))
+    number = store.reserve_run(TINY)
+    store.finish_run(store.run(TINY).model_copy(update={"run_id": number, "parent": "0099"}))
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert found["problem"].startswith("Run 0099 cannot be compared: ")
+    assert found["metrics"]
 
 
 def test_the_viewer_is_a_download(ada, tmp_path):
