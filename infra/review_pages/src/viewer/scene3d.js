@@ -407,16 +407,16 @@ export class Scene3D {
   }
 
   // What is written above a person; people on discs say that.
-  nameOf(number) {
-    const { id, name, kind } = this.scene.people[number];
-    return `${name || id}${kind === "plane" ? " (feet)" : ""}`;
+  #nameOf(number, isOnDisc) {
+    const { id, name } = this.scene.people[number];
+    return `${name || id}${isOnDisc ? " (feet)" : ""}`;
   }
 
   #write(people, M, width, height, ratio) {
     const { gl } = this;
     if (this.labels?.ratio !== ratio) {
       this.labels?.destroy();
-      const texts = this.scene.people.map((_, number) => this.nameOf(number));
+      const texts = this.scene.people.flatMap((_, number) => [this.#nameOf(number, false), this.#nameOf(number, true)]);
       this.labels = new Labels(gl, [...new Set([...texts, ...this.scene.cameras.map((each) => each.name), BROADCAST])], ratio);
       this.labels.ratio = ratio;
     }
@@ -426,7 +426,7 @@ export class Scene3D {
       const middle = this.#middle(person);
       const top = person.skeleton ? person.skeleton[HEAD] : middle;
       const high = person.feet ? this.#groundAt(middle[1]) + this.#stature(number) + 0.1 : Math.max(top[2] + 0.26, middle[2] + 0.5);
-      rows.push(...this.labels.row([top[0], top[1], high], this.nameOf(number), this.follow === number ? [1, 0.9, 0.4] : [1, 1, 1]));
+      rows.push(...this.labels.row([top[0], top[1], high], this.#nameOf(number, Boolean(person.feet)), this.follow === number ? [1, 0.9, 0.4] : [1, 1, 1]));
     });
     for (const name of [...this.scene.cameras.map((each) => each.name), ...(this.scene.broadcast ? [BROADCAST] : [])]) {
       const row = this.through === name ? null : this.cameraRow(name);
