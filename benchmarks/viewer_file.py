@@ -94,7 +94,7 @@ def main() -> None:
     clip = random_clip()
     assert clip.bodies is not None
     assert clip.model is not None
-    page = (files("flows.web") / "static" / "viewer.html").read_text(encoding="utf-8")
+    page = (files("flows.reports") / "viewer.html").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(sys.argv[1] if len(sys.argv) > 1 else f"{folder}/viewer.html").resolve()
         write_viewer(out, page, [clip], {})

@@ -42,7 +42,7 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         InputError: there is nobody to show.
     """
     pitch = read_match(Path(origin.registration.folder)).pitch
-    page = (files("flows.web") / "static" / "viewer.html").read_text(encoding="utf-8")
+    page = (files("flows.reports") / "viewer.html").read_text(encoding="utf-8")
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
     }

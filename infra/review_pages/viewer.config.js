@@ -25,7 +25,7 @@ const inline = {
 export default defineConfig({
   plugins: [svelte(), inline],
   build: {
-    outDir: "../../flows/web/static",
+    outDir: "../../flows/reports",
     emptyOutDir: false,
     modulePreload: false,
     rollupOptions: { input: "viewer.html" },

@@ -1,6 +1,7 @@
 """The review pages that ship are those that their sources make."""
 
 import hashlib
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "infra" / "review_pages"
 BUILT = ROOT / "flows" / "web" / "static"
+VIEWER = ROOT / "flows" / "reports" / "viewer.html"
 
 
 def source_digest():
@@ -37,6 +39,19 @@ def test_building_the_sources_gives_the_committed_bytes(tmp_path):
     for config in ("vite.config.js", "viewer.config.js"):
         command = [shutil.which("npx"), "vite", "build", "--config", config, "--outDir", str(out)]
         subprocess.run(command, cwd=SOURCES, check=True, capture_output=True, timeout=300)
+    assert (out / "viewer.html").read_bytes() == VIEWER.read_bytes()
+    (out / "viewer.html").unlink()
     made = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
     kept = {file.relative_to(BUILT): file.read_bytes() for file in BUILT.rglob("*.*")}
     assert made == kept
+
+
+def test_the_viewer_may_request_nothing():
+    page = VIEWER.read_text()
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    allowed = dict(each.strip().split(" ", 1) for each in policy.split(";"))
+    assert allowed.pop("default-src") == "'none'"
+    assert set(" ".join(allowed.values()).split()) == {"'unsafe-inline'", "data:", "blob:"}
+    assert re.findall(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=", page) == [
+        '<link rel="icon" href='
+    ]

@@ -31,7 +31,7 @@ def seen(clip, tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
     film = (np.full((90, 160, 3), 15 * k, np.uint8) for k in range(15))
     write_video(folder / "half.mp4", film, clip.fps / 2)
-    page = (files("flows.web") / "static" / "viewer.html").read_text()
+    page = (files("flows.reports") / "viewer.html").read_text()
     write_viewer(folder / "view.html", page, [clip], {"half": folder / "half.mp4"})
     task = {"file": str(folder / "view.html"), "frames": FRAMES, "video": True}
     task |= {"picture": str(folder / "plain.png"), "coloured": str(folder / "coloured.png")}

@@ -194,7 +194,7 @@ def test_reduced_surfaces_cover_the_body():
 
 def test_thirty_seconds_of_22_people_fit_into_15_mb(tmp_path):
     clip = bodies_clip(frames=1500, people=22)
-    page = (ROOT / "flows" / "web" / "static" / "viewer.html").read_text()
+    page = (ROOT / "flows" / "reports" / "viewer.html").read_text()
     write_viewer(tmp_path / "v.html", page, [clip], {})
     assert (tmp_path / "v.html").stat().st_size <= 15e6
     (parts,) = read_viewer(tmp_path / "v.html")
