@@ -36,6 +36,7 @@ EXPORT_FORMATS: Final = (
     "gltf",
     "csv",
     "parquet",
+    "viewer",
     "challenge",
     "challenge-2025",
     "tracks",

@@ -33,7 +33,10 @@ def export(
             "(docs/reference/formats.md); more than one may be given.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Output folder.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", help="Output folder; with --format viewer also FILE.html."),
+    ],
     run: RunOption = "latest",
     stage: StageOption = None,
     definition: Annotated[
@@ -62,6 +65,10 @@ def export(
             help="With gltf, also write the surface of a licensed body model (needs --licence).",
         ),
     ] = False,
+    video: Annotated[
+        bool,
+        typer.Option("--video", help="With viewer, also embed the clip's overlay video."),
+    ] = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -69,8 +76,8 @@ def export(
 
     Example: worldpose export tiny-1 --format joints --out exported
     """
-    from flows.registering import find_registration
-    from flows.results.best_results import Origin
+    from flows.registering import find_registration, open_match
+    from flows.results.best_results import Footage, Origin
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
@@ -82,15 +89,24 @@ def export(
             found="no licence" if licence is None else changed,
             todo="Give the text of the data licence, or export without --release.",
         )
+    if video and "viewer" not in forms:
+        raise UsageError(
+            "worldpose export --video",
+            expected="--format viewer, whose file holds the video",
+            found=f"--format {' --format '.join(forms)}",
+            todo="Add --format viewer, or leave out --video.",
+        )
     store = Store.open(project)
     registration = find_registration(store, match)
+    name = registration.spec.match_id
     origin = Origin(
-        open_run(project, registration.spec.match_id, run, complete=True),
+        open_run(project, name, run, complete=True),
         registration,
         stage,
         filled=filled,
         surface=surface,
         definition=definition,
+        footage=Footage(store, open_match(store, name)) if video else None,
         licence=None if licence is None else licence.read_text(encoding="utf-8").strip(),
     )
     if release is None or origin.licence is None:
@@ -99,10 +115,11 @@ def export(
         written = write_release(store, origin, forms, out, release, origin.licence)
     if as_json:
         files = [str(path) for path in written]
-        print_json({"match": registration.spec.match_id, "files": files})
+        print_json({"match": name, "files": files})
     else:
         for path in written:
-            line(f"wrote {path}")
+            size = f", {path.stat().st_size / 1e6:.1f} MB" if path.suffix == ".html" else ""
+            line(f"wrote {path}{size}")
 
 
 def report(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
+from flows.stage import Match
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.filtering import perceived_covariance, perceived_joints
@@ -20,7 +21,7 @@ from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store import Run
+from worldpose.store import Run, Store
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -168,6 +169,16 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 
 @dataclass(frozen=True)
+class Footage:
+    """Videos of a match."""
+
+    store: Store
+    """Its latest run maps match frames to video frames."""
+    match: Match
+    """Names the videos."""
+
+
+@dataclass(frozen=True)
 class Origin:
     """Run whose results an export writes, with the options of the export."""
 
@@ -183,6 +194,8 @@ class Origin:
     """Write also the surface of a body model that has terms of its own."""
     definition: JointDefinition = "body"
     """Definition of the joints of bodies."""
+    footage: Footage | None = None
+    """Videos to embed in viewer files; None = none."""
 
     @property
     def spec(self) -> MatchSpec:

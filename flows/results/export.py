@@ -238,6 +238,18 @@ def export_minimap(origin: Origin, out: Path) -> list[Path]:
     return written
 
 
+def export_viewer(origin: Origin, out: Path) -> list[Path]:
+    """Write `viewer/<clip>.html`, or one file with all clips where `out` ends with .html.
+
+    Raises:
+        UsageError: a video is asked for, and no camera of a clip has one.
+    """
+    # Imported here: it loads matplotlib, which takes 0.5 s.
+    from flows.reports.viewer import write_viewers
+
+    return write_viewers(origin, out)
+
+
 EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
@@ -245,6 +257,7 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "positions": export_positions,
     "minimap": export_minimap,
     **TOOL_EXPORTS,
+    "viewer": export_viewer,
     "challenge": export_challenge,
     "challenge-2025": export_challenge_2025,
     "tracks": export_tracks,
@@ -256,6 +269,8 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
+VIEWER_SUFFIX = ".html"
+"""An output that ends so is one viewer file, not a folder."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
@@ -267,10 +282,12 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     origins/<clip>.npz, which flags them.
 
     Raises:
-        UsageError: an unknown format, or two with the same file names.
+        UsageError: an unknown format, two with the same file names, or a file in place of a folder.
     """
+    if out.suffix == VIEWER_SUFFIX and set(forms) != {"viewer"}:
+        raise _file_for_folder(out, forms)
     written = _export(origin, forms, out)
-    for clip in origin.clips if origin.filled else ():
+    for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
         tracks = origin.tracks(clip)
         written.append(out / "origins" / f"{clip}.npz")
         write_origins(written[-1], tracks, origins_of(tracks))
@@ -278,6 +295,15 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
         return written
     rates = dict.fromkeys(origin.clips, origin.spec.fps)
     return [*written, write_frame_rates(out, rates)]
+
+
+def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
+    return UsageError(
+        f"--out {out}",
+        expected="a folder; a file only with --format viewer alone, and not for a release",
+        found=f"the name of a file, with --format {' --format '.join(forms)}",
+        todo="Give the name of a folder.",
+    )
 
 
 def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
@@ -333,6 +359,8 @@ def release(
         UsageError: the folder holds another release.
         InputError: another run of the match was released under this name.
     """
+    if out.suffix == VIEWER_SUFFIX:
+        raise _file_for_folder(out, forms)
     origin = replace(origin, licence=licence)
     record, spec = origin.run.record, origin.spec
     frozen = read_manifest(out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tempfile
@@ -65,6 +66,8 @@ Person = Annotated[str, Depends(_person)]
 
 
 _COMMAND = [sys.executable, "-c", "from flows.cli import main; main()", "run"]
+_STAGE_LINE = re.compile(r" *[\d.]+ s  (\w+): \d+ of \d+ to compute")
+_UNIT_LINE = re.compile(r" *[\d.]+ s    \S+ +[\d.]+ s .* (\d+) %((?: [\d.]+ \w+)?)$")
 LAST_LINES = 12
 """Lines of a run's output that a page shows."""
 FRESH_SECONDS = 2.0
@@ -175,6 +178,24 @@ class Continuing:
         return self._seen
 
 
+def read_progress(said: str) -> dict[str, Any]:
+    """Return percent of a run, and its stage with the time left, from what `worldpose run` prints.
+
+    A unit's line ends with percent and time left of its stage and then of the run
+    (`flows.cli.console`).
+    """
+    lines = said.splitlines()
+    stages = [found[1] for each in lines if (found := _STAGE_LINE.match(each)) is not None]
+    units = [found for each in lines if (found := _UNIT_LINE.match(each)) is not None]
+    doing = [stages[-1].replace("_", " ")] if stages else []
+    if not units:
+        return {"lines": doing, "percent": 0.0}
+    percent, left = float(units[-1][1]), units[-1][2].strip()
+    if doing and left:
+        doing = [f"{doing[0]}, {left} left"]
+    return {"lines": doing, "percent": percent}
+
+
 @dataclass(frozen=True)
 class _Seen:
     """Runs of the service at a time of the monotonic clock [s]."""
@@ -197,6 +218,7 @@ class LocalRuns:
     store: Store
     _waiting: list[tuple[str, str | None]] = field(default_factory=list)
     _at_work: str | None = None
+    _output: Path | None = None
     _ended: dict[str, tuple[int, Path]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -218,7 +240,9 @@ class LocalRuns:
         """Return the state of the match's last run that was started here; None without one."""
         with self._lock:
             if match_id == self._at_work:
-                return {"state": "running", "lines": []}
+                output = self._output
+                printed = "" if output is None else output.read_text(errors="replace")
+                return {"state": "running", **read_progress(printed)}
             if match_id in dict(self._waiting):
                 return {"state": "running", "lines": [f"waits for the run of {self._at_work}"]}
             ended = self._ended.get(match_id)
@@ -231,6 +255,9 @@ class LocalRuns:
     def _run_all(self, match_id: str, gates: str | None) -> None:
         while True:
             said = Path(tempfile.mkdtemp(prefix="worldpose-run-")) / "output.txt"
+            said.touch()
+            with self._lock:
+                self._output = said
             command = [*_COMMAND, match_id, "--project", self.store.url]
             if gates is not None:
                 command += ["--gates", gates]
@@ -243,7 +270,7 @@ class LocalRuns:
                     start_new_session=True,
                 ).wait()
             with self._lock:
-                self._ended[match_id] = (code, said)
+                self._ended[match_id], self._output = (code, said), None
                 if not self._waiting:
                     self._at_work = None
                     return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -16,12 +17,15 @@ from fastapi.responses import FileResponse, Response
 from data_contracts.release import EXPORT_FORMATS
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
-from flows.reports.scene_data import describe_frames, describe_scene
+from flows.reports.viewer import describe_video, viewer_clip
 from flows.results.best_results import Origin, clips_of
+from flows.results.comparison import compare_runs
 from flows.results.export import export
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.browser_words import describe_error
 from worldpose.errors import WorldposeError
+from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
 from worldpose.store import Run, open_run
 
 BINARY: Final = "application/octet-stream"
@@ -58,6 +62,25 @@ class _Files:
         return file
 
 
+class _Clips:
+    """The clip that was shown last, in memory: the browser asks for it range by range."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._key: tuple[str, str, str] | None = None
+        self._clip: ViewerClip | None = None
+
+    def get(self, run: Run, match: Match, clip: str) -> ViewerClip:
+        key = (run.record.match_id, run.record.run_id, clip)
+        with self._lock:
+            if self._clip is None or self._key != key:
+                origin = Origin(run, match.registration)
+                video = describe_video(run, match, clip)
+                self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
+                self._key = key
+            return self._clip
+
+
 def _require_clip(run: Run, clip: str) -> None:
     if clip not in clips_of(run.record):
         raise HTTPException(404, "the run has no such clip")
@@ -66,7 +89,7 @@ def _require_clip(run: Run, clip: str) -> None:
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
-    files = _Files()
+    files, shown = _Files(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
@@ -85,11 +108,37 @@ def routes(context: PageContext) -> APIRouter:
             "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
         }
 
+    @router.get("/metrics")
+    def metrics(match_id: str) -> dict[str, Any]:
+        _, run = open_latest(match_id)
+        record, parent = run.record, run.record.parent
+        changes, problem = [], ""
+        if parent is not None:
+            try:
+                before = context.store.run(match_id, parent)
+                changes = compare_runs(context.store, before, record)
+            except WorldposeError as error:  # its results may be garbage collected
+                problem = f"Run {parent} cannot be compared: {describe_error(error)}"
+        return {
+            "metrics": [
+                {
+                    "kind": each.kind,
+                    "name": each.name,
+                    "values": {one.figure: one.after for one in each.figures},
+                }
+                for each in compare_runs(context.store, record, record)
+            ],
+            "before": parent,
+            "problem": problem,
+            "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
+            "unchanged": sum(each.mark == "unchanged" for each in changes),
+        }
+
     @router.get("/scenes/{clip}")
     def scene(match_id: str, clip: str) -> Response:
         match, run = open_latest(match_id)
         _require_clip(run, clip)
-        return Response(describe_scene(run, match, clip), media_type=BINARY)
+        return Response(encode_scene(shown.get(run, match, clip)), media_type=BINARY)
 
     @router.get("/scenes/{clip}/frames")
     def frames(
@@ -100,7 +149,7 @@ def routes(context: PageContext) -> APIRouter:
     ) -> Response:
         match, run = open_latest(match_id)
         _require_clip(run, clip)
-        return Response(describe_frames(run, match, clip, first, count), media_type=BINARY)
+        return Response(encode_frames(shown.get(run, match, clip), first, count), media_type=BINARY)
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:

@@ -6,7 +6,7 @@ import { defineConfig } from "vite";
 
 // What the built files are made from; a test compares its digest with the one that is written beside them.
 function sourceDigest() {
-  const top = ["index.html", "package-lock.json", "vite.config.js"];
+  const top = ["index.html", "package-lock.json", "viewer.config.js", "viewer.html", "vite.config.js"];
   const inside = readdirSync("src", { recursive: true, withFileTypes: true })
     .filter((each) => each.isFile())
     .map((each) => join(each.parentPath, each.name).replaceAll("\\", "/"));

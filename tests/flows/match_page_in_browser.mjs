@@ -42,5 +42,24 @@ for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
   await shoot(page, `undone_${width}`);
 }
+
+// A run at work says how far it is, and a viewer is told who decides.
+const change = (path, how) =>
+  page.route(path, async (route) => {
+    const answer = await route.fetch();
+    await route.fulfill({ response: answer, json: { ...(await answer.json()), ...how } });
+  });
+await change(`**/api/matches/${encodeURIComponent(task.match)}`, { at_work: { state: "running", percent: 41.6, lines: ["tracking, 18 s left"] } });
+await page.setViewportSize({ width: 1280, height: 720 });
+await page.waitForSelector(".progress progress");
+seen.progress = (await page.locator(".progress").innerText()).replace(/\s+/g, " ").trim();
+await shoot(page, "at_work");
+await page.unrouteAll({ behavior: "wait" });
+await change("**/api/session", { role: "viewer" });
+await page.reload();
+await page.waitForSelector("text=Approvers decide and start runs");
+seen.who = await page.locator(".who").innerText();
+seen.run_buttons = await page.locator("button:has-text('run'), button:has-text('Run')").count();
+await shoot(page, "viewer");
 seen.errors = seen.errors.filter((text) => !text.includes("422"));
 await tell(seen);

@@ -31,4 +31,18 @@ await shoot(page, "through_cam00");
 await page.click(".people button >> nth=0");
 await page.waitForTimeout(500);
 await shoot(page, "follow");
+await page.click("text=Metrics per camera");
+await page.waitForSelector('[data-metrics="player"] td');
+seen.cameras = await page.locator('[data-metrics="camera"] tbody tr').count();
+await page.locator('[data-metrics="player"]').scrollIntoViewIfNeeded();
+await shoot(page, "metrics");
+if (await page.locator("[data-watch]").count()) {
+  await page.click("[data-watch]");
+  await page.waitForFunction(() => document.querySelector("video")?.readyState >= 2);
+  await page.locator("[data-scrub]").fill("20");
+  await page.waitForTimeout(800);
+  seen.video_s = await page.evaluate(() => document.querySelector("video").currentTime);
+  await canvas.scrollIntoViewIfNeeded();
+  await shoot(page, "video");
+}
 await tell(seen);

@@ -1,25 +1,25 @@
 """The page of a match shows and downloads the results of a complete run."""
 
 import io
-import json
-import shutil
-import subprocess
 import zipfile
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import TINY
 from page_client import MATCH
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
-from flows.reports import scene_data
-from flows.results.best_results import body_tracks
-from worldpose.store import open_run
-
-SCRIPT = Path(__file__).with_name("scene_data.mjs")
-PAGES = Path(__file__).parents[2] / "infra" / "review_pages"
+from flows.cli.app import app
+from flows.results.best_results import fitted_bodies
+from worldpose.formats.viewer_file import (
+    decode_bodies,
+    decode_part,
+    encode_spread,
+    read_viewer,
+)
+from worldpose.store import Store, open_run
 
 
 def test_a_complete_run_gives_its_report_and_its_exports(ada):
@@ -55,51 +55,107 @@ def test_an_export_that_lacks_a_result_says_what_to_do(ada):
     assert "expected" in answer.json()["error"]
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
-def test_the_3d_view_poses_people_as_the_body_model_does(ada, project_copy, tmp_path):
+def parts(ada):
+    """The scene, and all ranges of frames as the page asks for them."""
     scene = ada.get(f"{MATCH}/results/scenes/clip").content
-    frames = ada.get(f"{MATCH}/results/scenes/clip/frames?first=0&count=10000").content
-    (tmp_path / "scene").write_bytes(scene)
-    (tmp_path / "frames").write_bytes(frames)
-    module = PAGES / "src" / "scene3d.js"
-    command = ["node", SCRIPT, module, tmp_path / "scene", tmp_path / "frames"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    seen = json.loads(done.stdout)
-    run = open_run(str(project_copy), TINY, complete=True)
-    bodies = body_tracks(run, "clip")
-    joints, surfaces = bodies.model.joints(bodies.poses), bodies.model.vertices(bodies.poses)
-    shown = range(0, len(bodies.frames), seen["every"])
-    assert [len(person) for person in seen["people"]] == [len(shown)] * len(bodies.person_ids)
-    count = 0
-    for column, person in enumerate(seen["people"]):
-        for frame, posed in zip(shown, person, strict=True):
-            if posed is None:
-                assert np.isnan(joints[frame, column]).any()
-                continue
-            np.testing.assert_allclose(posed["joints"], joints[frame, column], atol=2e-3)
-            # Four joints move a vertex of the view, and its shape does not follow the pose.
-            far = np.linalg.norm(posed["placed"] - surfaces[frame, column, ::500], axis=-1)
-            assert far.max() < 0.06
-            count += 1
-    assert count > 10
+    header, _ = decode_part(scene)
+    step = header["range_frames"]
+    asked = (f"first={first}&count={step}" for first in range(0, header["frames"], step))
+    return scene, [ada.get(f"{MATCH}/results/scenes/clip/frames?{each}").content for each in asked]
 
 
-def test_thirty_seconds_of_a_full_pitch_are_small(ada):
-    scene = ada.get(f"{MATCH}/results/scenes/clip").content
-    frames = ada.get(f"{MATCH}/results/scenes/clip/frames?first=0&count=10000").content
-    header = json.loads(scene[4 : 4 + int.from_bytes(scene[:4], "little")])
-    people = len(header["people"])
-    assert header["range_frames"] == 750
-    each = len(frames) / header["frames"] / people
-    assert 22 * 750 * each + len(scene) / people * 22 < 15e6
+def test_the_page_gets_the_bodies_of_the_store(ada, project_copy):
+    scene, ranges = parts(ada)
+    model, poses, persons = fitted_bodies(open_run(str(project_copy), TINY, complete=True), "clip")
+    header, _ = decode_part(scene)
+    assert [person["id"] for person in header["people"]] == persons.tolist()
+    assert {person["kind"] for person in header["people"]} == {"triangulated"}
+    assert header["notes"]["units"] == "metres, seconds"
+    found = [decode_bodies(scene, each) for each in ranges]
+    rotations, placed = (np.concatenate(each) for each in zip(*found, strict=True))
+    joints = model.joints(poses).swapaxes(0, 1)
+    known = np.isfinite(joints).all(axis=(-1, -2))
+    assert np.array_equal(known, np.isfinite(placed).all(axis=(-1, -2)))
+    assert known.sum() > 10
+    assert np.linalg.norm(placed - joints, axis=-1)[known].max() < 1e-4
+    truth = model.articulate(poses).rotations.swapaxes(0, 1)[known].reshape(-1, 3, 3)
+    turned = Rotation.from_matrix(rotations[known].reshape(-1, 3, 3))
+    apart = turned * Rotation.from_matrix(truth).inv()
+    assert np.degrees(apart.magnitude()).max() < 0.01
+
+
+def test_the_page_gets_how_well_joints_are_known(ada, project_copy):
+    _, (frames, *_) = parts(ada)
+    fits = open_run(str(project_copy), TINY, complete=True).bodies("clip")
+    variance = np.trace(fits["covariance"].values, axis1=-2, axis2=-1) / 3.0
+    _, arrays = decode_part(frames)
+    known = np.isfinite(variance)
+    codes = encode_spread(np.sqrt(variance))
+    assert np.array_equal(arrays["spread"][known], codes[: len(arrays["spread"])][known])
+    assert (arrays["spread"][known] > 1).mean() > 0.5
+    assert arrays["views"].max() <= len(decode_part(parts(ada)[0])[0]["cameras"])
+
+
+def test_parts_that_there_are_none_of_are_refused(ada):
     part = ada.get(f"{MATCH}/results/scenes/clip/frames?first=3&count=2").content
-    assert json.loads(part[4 : 4 + int.from_bytes(part[:4], "little")])["count"] == 2
+    header, _ = decode_part(part)
+    assert (header["first"], header["count"]) == (3, 2)
     assert ada.get(f"{MATCH}/results/scenes/other").status_code == 404
     assert ada.get(f"{MATCH}/results/scenes/clip/frames?first=-1&count=2").status_code == 422
 
 
-def test_the_surface_of_a_licensed_body_stays_on_the_machine(project_copy):
-    bodies = body_tracks(open_run(str(project_copy), TINY, complete=True), "clip")
-    licensed = replace(bodies, model=replace(bodies.model, name="smpl-neutral/1"))
-    assert {"surface", "faces"} <= set(scene_data._body_arrays(bodies))
-    assert set(scene_data._body_arrays(licensed)) == {"rest_joints", "parents"}
+def test_metrics_are_per_camera_and_player_and_compared_with_the_run_before(ada, project_copy):
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert (found["before"], found["changes"], found["problem"]) == (None, [], "")
+    kinds = {each["kind"] for each in found["metrics"]}
+    assert kinds == {"match", "clip", "camera", "player"}
+    (player, *_) = (each for each in found["metrics"] if each["kind"] == "player")
+    assert any(name.endswith(" residual_m") for name in player["values"])
+    store = Store.open(str(project_copy))
+    first = store.run(TINY)
+    unit = "static_calibration/cam00"
+    figures = {name: dict(values) for name, values in first.figures.items()}
+    figures[unit]["expected_ground_error_median_m"] *= 2.0
+    number = store.reserve_run(TINY)
+    second = {"run_id": number, "parent": first.run_id, "figures": figures}
+    store.finish_run(first.model_copy(update=second))
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert (found["before"], found["problem"]) == (first.run_id, "")
+    (changed,) = found["changes"]
+    assert (changed["kind"], changed["name"], changed["mark"]) == ("camera", "cam00", "worse")
+    assert found["unchanged"] == len(found["metrics"]) - 1
+
+
+def test_a_run_before_that_is_gone_is_said(ada, project_copy):
+    store = Store.open(str(project_copy))
+    number = store.reserve_run(TINY)
+    store.finish_run(store.run(TINY).model_copy(update={"run_id": number, "parent": "0099"}))
+    found = ada.get(f"{MATCH}/results/metrics").json()
+    assert found["problem"].startswith("Run 0099 cannot be compared: ")
+    assert found["metrics"]
+
+
+def test_the_viewer_is_a_download(ada, tmp_path):
+    answer = ada.get(f"{MATCH}/results/exports/viewer")
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        (tmp_path / "clip.html").write_bytes(archive.read("viewer/clip.html"))
+    (clip,) = read_viewer(tmp_path / "clip.html")
+    scene, ranges = parts(ada)
+    assert clip["scene"] == scene
+    assert [clip[str(number)] for number in range(len(ranges))] == ranges
+
+
+def test_a_command_writes_one_file(project_copy, tmp_path):
+    out = tmp_path / "view.html"
+    command = ["export", TINY, "--format", "viewer", "--project", str(project_copy), "--out"]
+    done = CliRunner().invoke(app, [*command, str(out)])
+    assert done.exit_code == 0, done.output
+    assert f"{out.stat().st_size / 1e6:.1f} MB" in done.output.replace("\n", "")
+    assert len(read_viewer(out)) == 1
+    refused = CliRunner().invoke(app, [*command, str(out), "--video"])
+    assert "--video: expected a camera with a video" in str(refused.exception)
+    refused = CliRunner().invoke(app, [*command, str(out), "--format", "joints"])
+    assert "expected a folder" in str(refused.exception)
+    other = ["export", TINY, "--format", "joints", "--video", "--project", str(project_copy)]
+    refused = CliRunner().invoke(app, [*other, "--out", str(tmp_path)])
+    assert "--video: expected --format viewer" in str(refused.exception)

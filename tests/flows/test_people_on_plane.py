@@ -6,6 +6,7 @@ import numpy as np
 from command_line import succeed, worldpose
 
 import worldpose as library
+from worldpose.formats.viewer_file import decode_part, read_viewer
 
 
 def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, tmp_path):
@@ -22,6 +23,18 @@ def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, 
     with (tmp_path / "out/positions/clip.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["kind"] for row in rows} == {"plane"}
+    view = tmp_path / "view.html"
+    succeed("export", match, *project, "--format", "viewer", "--out", view)
+    (parts,) = read_viewer(view)
+    scene, _ = decode_part(parts["scene"])
+    header, arrays = decode_part(parts["0"])
+    assert {person["kind"] for person in scene["people"]} == {"plane"}
+    shown = [scene["people"][column]["id"] for column in header["plane"]]
+    for row in rows:
+        at = int(row["frame"]) - scene["first"], shown.index(int(row["person"]))
+        assert (
+            np.abs(arrays["ground"][at][:2] - [float(row["x_m"]), float(row["y_m"])]).max() < 1e-3
+        )
     page = tmp_path / "report.html"
     succeed("report", match, "--out", page, "--no-videos", *project)
     assert page.read_text().count("<td>plane</td>") == len({row["person"] for row in rows})

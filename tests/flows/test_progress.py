@@ -20,6 +20,7 @@ from flows.progress import MOST_TOLD, Reporter, in_time
 from flows.registering import open_match
 from flows.run_plan import plan_run
 from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
+from flows.web.app_context import read_progress
 from worldpose.store import Store
 from worldpose.store.documents import seal
 
@@ -186,3 +187,24 @@ def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(serve
     assert len(found) >= kept >= 1
     assert "working" not in last and "Traceback" not in text and "leaked" not in text
     succeed("run", tiny, "--project", tmp_path / "project", "--until", "tracking")
+
+
+def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
+    printed = io.StringIO()
+    monkeypatch.setattr(console, "errors", Console(file=printed, width=80))
+    reporter = console.ConsoleReporter()
+    reporter.run_planned({"static_calibration": 10.0, "tracking": 30.0})
+    assert read_progress(printed.getvalue()) == {"lines": [], "percent": 0.0}
+    reporter.stage_started("static_calibration", "find cameras", units=2, missing=2)
+    assert read_progress(printed.getvalue())["lines"] == ["static calibration"]
+    for unit in "ab":
+        clock[0] += 5.0
+        reporter.unit_done(f"static_calibration/cam0{unit}", 5.0, {})
+    reporter.stage_started("tracking", "who is who", units=2, missing=2)
+    clock[0] += 15.0
+    reporter.unit_done("tracking/clip", 15.0, {})
+    reporter.unit_waits("tracking/clip", ["50 % of 3.0 s are beyond the limit 5 %"])
+    progress = {"lines": ["tracking, 15 s left"], "percent": 62.0}
+    assert read_progress(printed.getvalue()) == progress
+    reporter.unit_done("tracking/other", 15.0, {})
+    assert read_progress(printed.getvalue()) == {"lines": ["tracking"], "percent": 100.0}

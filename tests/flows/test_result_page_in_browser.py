@@ -24,3 +24,4 @@ def test_people_are_seen_in_3d_and_played(project_copy, tmp_path):
     is_person = (blue > 1.2 * green) & (green > 1.5 * red) & (blue > 60)
     assert is_person.sum() > 30
     assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
+    assert seen["cameras"] == 6

@@ -23,7 +23,7 @@ from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.pitch.surface import Surface
+from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import (
     Explanation,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from data_contracts.arrays import Floats, Integers
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.pitch.surface import Surface
+from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, weight_residuals
 from worldpose.static_calibration.paint_noise import FIRST_KNOT

@@ -1,0 +1,190 @@
+"""What the 3D viewer shows of a run's clip, for the file and for the page of results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from data_contracts.arrays import Floats
+from data_contracts.pitch import PitchSpec
+from data_contracts.run import BODY_STAGES
+from flows.reports.clip_video import clip_view, video_frames, write_clip_video
+from flows.results.best_results import (
+    Origin,
+    bodies_unit,
+    camera_in_frames,
+    clip_positions,
+    fitted_bodies,
+    person_kinds,
+    static_cameras,
+)
+from flows.results.tool_exports import describe_clip
+from flows.stage import Match
+from worldpose.body import BodyModel, BodyParameters
+from worldpose.errors import UsageError
+from worldpose.formats import JointTracks
+from worldpose.formats.tables import Positions
+from worldpose.formats.viewer_file import ViewerClip, ViewerPerson, write_viewer
+from worldpose.ingest import read_match
+from worldpose.store import Run
+
+
+def write_viewers(origin: Origin, out: Path) -> list[Path]:
+    """Write `viewer/<clip>.html`; or the file `out` with all clips, if its name ends with .html.
+
+    Raises:
+        UsageError: a video is asked for, and no camera of a clip has one.
+        InputError: there is nobody to show.
+    """
+    pitch = read_match(Path(origin.registration.folder)).pitch
+    page = (files("flows.reports") / "viewer.html").read_text(encoding="utf-8")
+    written: dict[Path, tuple[str, ...]] = {
+        out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
+    }
+    if out.suffix == ".html":
+        written = {out: origin.clips}
+    for path, names in written.items():
+        with TemporaryDirectory(prefix="worldpose-viewer-") as draft:
+            videos = {} if origin.footage is None else _draw_videos(origin, names, Path(draft))
+            clips = [
+                viewer_clip(origin, name, pitch, _video_of(origin, name, videos)) for name in names
+            ]
+            write_viewer(path, page, clips, videos)
+    return list(written)
+
+
+def _video_of(origin: Origin, clip: str, videos: Mapping[str, Path]) -> dict[str, Any] | None:
+    footage = origin.footage
+    if footage is None or clip not in videos:
+        return None
+    return describe_video(origin.run, footage.match, clip)
+
+
+def _draw_videos(origin: Origin, clips: tuple[str, ...], folder: Path) -> dict[str, Path]:
+    """Draw the overlay video of every clip; return the files by clip."""
+    footage = origin.footage
+    assert footage is not None  # the caller asks
+    videos = {}
+    for clip in clips:
+        if clip_view(origin.run, footage.match, clip) is None:
+            raise UsageError(
+                "--video",
+                expected=f"a camera with a video that films clip {clip}",
+                found="no video of any camera",
+                todo="Export without --video, or add the videos to the match's folder videos/.",
+            )
+        videos[clip] = folder / f"{clip}.mp4"
+        write_clip_video(footage.store, origin.run, footage.match, clip, videos[clip])
+    return videos
+
+
+def describe_video(run: Run, match: Match, clip: str) -> dict[str, Any] | None:
+    """Return camera, first match frame, number of frames and step of a clip's overlay video."""
+    owner = clip_view(run, match, clip)
+    if owner is None:
+        return None
+    frames = video_frames(run, match, clip, owner)
+    step = int(frames[1] - frames[0]) if len(frames) > 1 else 1
+    return {"camera": owner, "first": int(frames[0]), "frames": len(frames), "step": step}
+
+
+def viewer_clip(
+    origin: Origin, clip: str, pitch: PitchSpec | None, video: Mapping[str, Any] | None
+) -> ViewerClip:
+    """Return a clip of a run as the viewer shows it.
+
+    Args:
+        origin: the run; a `stage` before body fitting shows joints in place of bodies.
+        clip: id of the clip.
+        pitch: pitch of the match.
+        video: the clip's video as `describe_video` returns it.
+    """
+    # Imported here: it loads matplotlib's colours, which takes 0.5 s.
+    from worldpose.reports.drawing import markings, person_color
+
+    tracks, positions = origin.tracks(clip), clip_positions(origin.run, clip)
+    kinds = person_kinds(origin.run, clip)
+    roster = {player.id: player for player in origin.spec.roster}
+    people = []
+    for person, name in zip(positions.person.tolist(), positions.names, strict=True):
+        player = roster.get(name)
+        people.append(
+            ViewerPerson(
+                person=person,
+                name=name if player is None else player.name or name,
+                kind=kinds[person],
+                team="" if player is None else player.team,
+                color=person_color(person),
+            )
+        )
+    column = np.searchsorted(positions.person, tracks.person_ids)
+    shape = (len(tracks.frames), len(people), 17)
+    joints, spread = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
+    views = np.full(shape, -1, dtype=np.int64)
+    joints[:, column] = tracks.joints
+    if tracks.covariance is not None:
+        variance = np.trace(tracks.covariance, axis1=-2, axis2=-1) / 3.0
+        spread[:, column] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    if tracks.views is not None:
+        views[:, column] = tracks.views
+    model, bodies = _bodies(origin, clip, tracks, positions)
+    moving = None
+    if f"broadcast_calibration/{clip}" in origin.run:
+        moving = camera_in_frames(origin.run, clip, tracks.frames)
+    still = static_cameras(origin.run, origin.spec, origin.stage)
+    return ViewerClip(
+        clip=clip,
+        fps=origin.spec.fps,
+        frames=tracks.frames,
+        people=tuple(people),
+        joints=joints,
+        spread=spread,
+        views=views,
+        ground=_ground(positions),
+        height=positions.height,
+        bodies=bodies,
+        model=model,
+        cameras=still,
+        broadcast=moving,
+        markings=[] if pitch is None else markings(pitch),
+        notes=describe_clip(origin, clip) | {"units": "metres, seconds"},
+        video=video,
+    )
+
+
+def _bodies(
+    origin: Origin, clip: str, tracks: JointTracks, positions: Positions
+) -> tuple[BodyModel | None, BodyParameters | None]:
+    """Return body model and bodies (frames, people) in the frames of the joints."""
+    unit = bodies_unit(origin.run, clip)
+    if unit not in origin.run or origin.stage not in (None, *BODY_STAGES):
+        return None, None
+    model, poses, persons = fitted_bodies(origin.run, clip)
+    own = origin.run[unit]["frame"].values
+    _, rows, here = np.intersect1d(own, tracks.frames, return_indices=True)
+    column = np.searchsorted(positions.person, persons)
+
+    def place(values: Floats) -> Floats:
+        placed = np.full((len(tracks.frames), len(positions.person), values.shape[-1]), np.nan)
+        placed[here[:, None], column] = values[:, rows].swapaxes(0, 1)
+        return placed
+
+    return model, BodyParameters(
+        betas=place(poses.betas),
+        global_orient=place(poses.global_orient),
+        body_pose=place(poses.body_pose),
+        transl=place(poses.transl),
+    )
+
+
+def _ground(positions: Positions) -> Floats:
+    """Return x, y and standard deviation (frames, people, 3) [m] of people placed by their feet."""
+    variance = np.trace(positions.covariance, axis1=-2, axis2=-1) / 2.0
+    spread = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    ground = np.concatenate([positions.xy, spread[..., None]], axis=-1)
+    return np.where(positions.on_plane[..., None], ground, np.nan)

@@ -1,0 +1,88 @@
+"""A viewer file opened from disk in a real browser without a network."""
+
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from chromium import IN_BROWSER, drive
+from scipy.spatial.transform import Rotation
+from viewer_clips import mixed_clip
+
+from worldpose.formats.viewer_file import write_viewer
+from worldpose.video import write_video
+
+pytestmark = [*IN_BROWSER, pytest.mark.timeout(1800)]
+SCRIPT = Path(__file__).with_name("viewer_file_in_browser.mjs")
+FRAMES = [0, 1, 31]
+
+
+@pytest.fixture(scope="module")
+def clip():
+    """Half of the clip, from its 10th frame on, is in a video of every second frame."""
+    video = {"camera": "north", "first": 110, "frames": 15, "step": 2}
+    return replace(mixed_clip(), video=video)
+
+
+@pytest.fixture(scope="module")
+def seen(clip, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer")
+    film = (np.full((90, 160, 3), 15 * k, np.uint8) for k in range(15))
+    write_video(folder / "half.mp4", film, clip.fps / 2)
+    page = (files("flows.reports") / "viewer.html").read_text()
+    write_viewer(folder / "view.html", page, [clip], {"half": folder / "half.mp4"})
+    task = {"file": str(folder / "view.html"), "frames": FRAMES, "video": True}
+    task |= {"picture": str(folder / "plain.png"), "coloured": str(folder / "coloured.png")}
+    return task | drive(SCRIPT, task, folder, 600)
+
+
+def test_the_file_opens_offline_and_paints_at_once(seen):
+    assert seen["title"] == "m & n: half"
+    assert seen["first_paint_ms"] is not None
+
+
+def test_the_browser_decodes_bodies_joints_and_feet(seen, clip):
+    joints = clip.model.joints(clip.bodies[:, 0])
+    rotations = clip.model.articulate(clip.bodies[:, 0]).rotations
+    for frame, (body, loose, feet) in zip(FRAMES, seen["people"], strict=True):
+        assert [each["kind"] for each in (body, loose, feet)] == ["body", "joints", "feet"]
+        assert [each["id"] for each in (body, loose, feet)] == [7, 8, 9]
+        assert np.linalg.norm(body["joints"] - joints[frame], axis=-1).max() < 1e-4
+        turned = Rotation.from_matrix(np.reshape(body["rotations"], (-1, 3, 3)))
+        apart = turned * Rotation.from_matrix(rotations[frame]).inv()
+        assert np.degrees(apart.magnitude()).max() < 0.01
+        far = np.array(loose["joints"][9]) - clip.joints[frame, 1, 9]
+        assert np.linalg.norm(far) < 1e-4
+        np.testing.assert_allclose(feet["joints"][0], clip.ground[frame, 2, :2], atol=1e-5)
+
+
+def test_pages_fit_their_screens(seen):
+    assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
+
+
+def test_keys_move_through_time_colours_and_cameras(seen):
+    assert (seen["last"], seen["stepped"]) == (59, 1)
+    assert seen["colours"] == "spread"
+    assert seen["through"] == "broadcast"
+    assert seen["played"] > 20
+
+
+def test_the_video_shows_the_frame_of_the_view(seen):
+    # Frame 20 of the clip is the 6th of the video, shown from 0.20 to 0.24 s.
+    assert 0.2 < seen["video"] < 0.24
+
+
+def test_people_are_blue_by_person_and_not_all_blue_by_uncertainty(seen):
+    def blue(path):
+        b, g, r = cv2.imread(path).astype(int).transpose(2, 0, 1)
+        return ((b > 1.2 * g) & (g > 1.5 * r) & (b > 60)).sum()
+
+    def warm(path):
+        b, g, r = cv2.imread(path).astype(int).transpose(2, 0, 1)
+        return ((r > 1.3 * b) & (r > 90) & (r >= g)).sum()
+
+    assert blue(seen["picture"]) > 100
+    assert warm(seen["picture"]) < 30
+    assert warm(seen["coloured"]) > 100

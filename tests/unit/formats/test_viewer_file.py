@@ -1,0 +1,235 @@
+"""A viewer file holds what the store has, and its script poses people as the body model does."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from viewer_clips import CENTER, bodies_clip, mixed_clip
+
+from worldpose.errors import InputError
+from worldpose.formats import viewer_file
+from worldpose.formats.viewer_file import (
+    ViewerClip,
+    decode_bodies,
+    decode_part,
+    encode_frames,
+    encode_scene,
+    read_viewer,
+    write_viewer,
+)
+
+ROOT = Path(__file__).parents[3]
+SCRIPT = Path(__file__).with_name("viewer_in_node.mjs")
+MODULE = ROOT / "infra" / "review_pages" / "src" / "viewer" / "payload.js"
+PAGE = "<title>worldpose viewer</title><body><!--worldpose-data--><script>1</script></body>"
+IN_NODE = pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+MAX_JOINT_M, MAX_ROTATION_DEG = 1e-4, 0.01
+
+
+def pose_in_node(clip, folder):
+    """What the script of the page makes of all parts of a clip."""
+    parts = [folder / "scene"]
+    parts[0].write_bytes(encode_scene(clip))
+    for first in range(0, len(clip.frames), clip.range_frames):
+        parts.append(folder / f"range-{first}")
+        parts[-1].write_bytes(encode_frames(clip, first, clip.range_frames))
+    command = ["node", SCRIPT, MODULE, *parts]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def rotation_errors_deg(found, truth):
+    found, truth = (np.reshape(each, (-1, 3, 3)) for each in (found, truth))
+    return np.degrees((Rotation.from_matrix(found) * Rotation.from_matrix(truth).inv()).magnitude())
+
+
+def test_joints_and_rotations_come_back_from_the_parts():
+    clip = bodies_clip(frames=600, people=3)
+    scene = encode_scene(clip)
+    truth = clip.model.articulate(clip.bodies).rotations
+    joints = clip.model.joints(clip.bodies)
+    assert clip.range_frames == 500
+    for first in (0, 500):
+        turned, placed = decode_bodies(scene, encode_frames(clip, first, 500))
+        here = slice(first, first + 500)
+        there = np.isfinite(joints[here])
+        assert np.array_equal(np.isfinite(placed), there)
+        far = np.linalg.norm(placed - joints[here], axis=-1)
+        assert np.nanmax(far) < MAX_JOINT_M
+        known = there.all(axis=(-1, -2))
+        assert known.sum() >= 300
+        assert rotation_errors_deg(turned[known], truth[here][known]).max() < MAX_ROTATION_DEG
+
+
+def test_a_body_upside_down_and_turned_by_half_a_turn_comes_back():
+    clip = bodies_clip(frames=3, people=1)
+    orient = np.array([[np.pi, 0.0, 0.0], [0.0, -np.pi, 0.0], [2.2, 0.0, -2.2]])[:, None]
+    bodies = replace(clip.bodies, global_orient=orient)
+    clip = replace(clip, bodies=bodies)
+    turned, placed = decode_bodies(encode_scene(clip), encode_frames(clip, 0, 3))
+    truth = clip.model.articulate(bodies).rotations
+    assert rotation_errors_deg(turned, truth).max() < MAX_ROTATION_DEG
+    assert np.linalg.norm(placed - clip.model.joints(bodies), axis=-1).max() < MAX_JOINT_M
+
+
+@IN_NODE
+def test_the_page_poses_bodies_as_the_model_does(tmp_path):
+    clip = bodies_clip(frames=40)
+    seen = pose_in_node(clip, tmp_path)["frames"]
+    joints, surfaces = clip.model.joints(clip.bodies), clip.model.vertices(clip.bodies)
+    rotations = clip.model.articulate(clip.bodies).rotations
+    for frame, people in enumerate(seen):
+        for column, posed in enumerate(people):
+            if posed is None:
+                assert np.isnan(joints[frame, column]).any()
+                continue
+            assert posed["kind"] == "body"
+            far = np.linalg.norm(posed["joints"] - joints[frame, column], axis=-1)
+            assert far.max() < MAX_JOINT_M
+            wrong = rotation_errors_deg(posed["rotations"], rotations[frame, column])
+            assert wrong.max() < MAX_ROTATION_DEG
+            # Four joints move a vertex of the view, and its shape does not follow the pose.
+            away = np.linalg.norm(posed["placed"] - surfaces[frame, column, ::500], axis=-1)
+            assert away.max() < 0.08
+    assert [frame for frame, people in enumerate(seen) if people[0] is None] == [5, 6, 7, 8]
+
+
+@IN_NODE
+def test_the_page_shows_joints_feet_and_evidence_of_people_without_a_body(tmp_path):
+    clip = mixed_clip(frames=10)
+    shown = pose_in_node(clip, tmp_path)
+    people = shown["frames"][9]
+    assert [person["kind"] for person in people] == ["body", "joints", "feet"]
+    assert [person["kind"] for person in shown["people"]] == ["triangulated"] * 2 + ["plane"]
+    assert people[1]["joints"][3] is None
+    known = [0, 1, 2, *range(4, 17)]
+    found = np.array([people[1]["joints"][joint] for joint in known])
+    assert np.linalg.norm(found - clip.joints[9, 1, known], axis=-1).max() < MAX_JOINT_M
+    np.testing.assert_allclose(people[2]["feet"], [1.0, -6.0])
+    assert people[2]["feetSpread"] == 0.25
+    assert shown["frames"][2][2] is None
+    # A step of the logarithmic scale of uncertainty is 2.8 %.
+    np.testing.assert_allclose(people[0]["spread"], clip.spread[9, 0], rtol=0.014)
+    assert people[0]["views"] == clip.views[9, 0].tolist()
+
+
+def test_a_joint_far_from_the_others_widens_the_unit_of_its_range():
+    clip = mixed_clip(frames=4)
+    joints = clip.joints.copy()
+    joints[2, 1, 9] += [40.0, 0.0, 0.0]
+    header, arrays = decode_part(encode_frames(replace(clip, joints=joints), 0, 4))
+    column = header["loose"].index(1)
+    anchor, whole = arrays["anchor"][2, column], arrays["joints"][2, column]
+    np.testing.assert_allclose(
+        anchor + header["joint_unit"] * whole[9], joints[2, 1, 9], atol=header["joint_unit"]
+    )
+    assert header["joint_unit"] < 2e-3
+
+
+def test_unknown_evidence_is_told_from_zero():
+    clip = bodies_clip(frames=2, people=1)
+    spread, views = clip.spread.copy(), clip.views.copy()
+    spread[0, 0, 3], views[0, 0, 3], views[0, 0, 4] = np.nan, -1, 0
+    _, arrays = decode_part(encode_frames(replace(clip, spread=spread, views=views), 0, 2))
+    assert arrays["spread"][0, 0, 3] == 0
+    assert (arrays["spread"][0, 0, :3] > 0).all()
+    assert arrays["views"][0, 0, 3:5].tolist() == [255, 0]
+
+
+def test_cameras_and_the_pitch_are_those_of_the_clip():
+    clip = bodies_clip(frames=3)
+    header, _ = decode_part(encode_scene(clip))
+    row = np.array(header["cameras"][0]["row"])
+    rotation = row[:9].reshape(3, 3)
+    np.testing.assert_allclose(-rotation.T @ row[9:12], CENTER, atol=1e-5)
+    np.testing.assert_allclose(row[12:], [2000.0, 2000.0, 959.5, 539.5, 1920, 1080])
+    # The point in the middle of a straight line says nothing.
+    assert header["markings"] == [[[-52.5, -34.0, 0.0], [52.5, -34.0, 0.0], [52.5, 34.0, 0.0]]]
+    _, arrays = decode_part(encode_frames(clip, 0, 3))
+    np.testing.assert_allclose(arrays["broadcast"], np.tile(row, (3, 1)), atol=1e-4)
+
+
+def test_a_curved_line_keeps_its_shape():
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    circle = 9.15 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    clip = replace(bodies_clip(frames=1), markings=[circle])
+    (line,) = decode_part(encode_scene(clip))[0]["markings"]
+    line = np.array(line)
+    assert len(line) < 100
+    middles = (line[1:] + line[:-1]) / 2.0
+    assert np.abs(np.linalg.norm(middles, axis=1) - 9.15).max() < 0.02
+
+
+def test_the_surface_of_a_licensed_body_stays_on_the_machine():
+    clip = bodies_clip(frames=2)
+    licensed = replace(clip, model=replace(clip.model, name="smpl-neutral/1"))
+    assert {"surface", "faces"} <= set(decode_part(encode_scene(clip))[1])
+    assert set(decode_part(encode_scene(licensed))[1]) == {"rest_joints", "parents"}
+
+
+def test_reduced_surfaces_cover_the_body():
+    clip = bodies_clip(frames=1)
+    _, arrays = decode_part(encode_scene(clip))
+    template = clip.model.template
+    counts = []
+    for name, cell in (("coarse_faces", 0.08), ("rough_faces", 0.16)):
+        faces = arrays[name].astype(int)
+        counts.append(len(faces))
+        used = template[np.unique(faces)]
+        np.testing.assert_allclose(np.ptp(used, axis=0), np.ptp(template, axis=0), atol=cell)
+        # Outside stays outside: the signed volume is near that of the whole body.
+        volumes = [
+            np.einsum("fi,fi->", a, np.cross(b, c)) / 6.0
+            for a, b, c in (template[f].swapaxes(0, 1) for f in (faces, clip.model.faces))
+        ]
+        assert 0.6 < volumes[0] / volumes[1] < 1.2
+    assert len(clip.model.faces) / 8 > counts[0] > 2 * counts[1]
+
+
+def test_thirty_seconds_of_22_people_fit_into_15_mb(tmp_path):
+    clip = bodies_clip(frames=1500, people=22)
+    page = (ROOT / "flows" / "reports" / "viewer.html").read_text()
+    write_viewer(tmp_path / "v.html", page, [clip], {})
+    assert (tmp_path / "v.html").stat().st_size <= 15e6
+    (parts,) = read_viewer(tmp_path / "v.html")
+    assert list(parts) == ["scene", "0", "1", "2"]
+    _, placed = decode_bodies(parts["scene"], parts["2"])
+    far = np.linalg.norm(placed - clip.model.joints(clip.bodies[1000:]), axis=-1)
+    assert far.max() < MAX_JOINT_M
+
+
+def test_a_file_holds_several_clips_and_videos_and_its_notes(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"\0film")
+    clips = [bodies_clip(frames=3), replace(mixed_clip(frames=3), clip="other")]
+    write_viewer(tmp_path / "v.html", PAGE, clips, {"other": tmp_path / "film.mp4"})
+    first, second = read_viewer(tmp_path / "v.html")
+    assert "video" not in first
+    assert second["video"] == b"\0film"
+    assert decode_part(second["scene"])[0]["notes"]["licence"] == "For tests alone."
+    text = (tmp_path / "v.html").read_text()
+    assert "<title>m &amp; n: half, other</title>" in text
+    assert text.index("data-clip") < text.index("<script>1")
+
+
+def empty(clip) -> ViewerClip:
+    gone = np.full_like(clip.bodies.transl, np.nan)
+    return replace(clip, bodies=replace(clip.bodies, transl=gone))
+
+
+def test_a_file_without_anyone_is_refused(tmp_path):
+    with pytest.raises(InputError, match="a person with joints, a body or a place on the pitch"):
+        write_viewer(tmp_path / "v.html", PAGE, [empty(bodies_clip(frames=3))], {})
+    assert not (tmp_path / "v.html").exists()
+
+
+def test_a_file_that_browsers_refuse_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer_file, "MAX_FILE_BYTES", 100_000)
+    with pytest.raises(InputError, match=r"expected at most 0\.1 MB"):
+        write_viewer(tmp_path / "v.html", PAGE, [bodies_clip(frames=300)], {})
+    assert list(tmp_path.iterdir()) == []
