@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,14 @@ from worldpose.broadcast_calibration import (
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
+    propose_key_frames,
 )
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
 from worldpose.video import open_video
+
+PROPOSED_FRAMES: Final = 8
+"""Frames of a clip without clicks to propose key frames in, evenly spaced [1]."""
 
 
 @unit_task
@@ -44,15 +48,27 @@ def broadcast_calibration(work: Work) -> str:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
     people, boxes = _people(store, work)
+    pitch = _open_pitch(store, work)
+    key_frames = [
+        KeyFrame(frame=int(frame), markings=clicked_markings(markings))
+        for frame, markings in clicked.items()
+        if start <= int(frame) < start + count
+    ]
+    side = sources.get("side")
+    if side is not None:
+        numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
+
+        def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+            with open_video(path) as video:
+                for number in np.unique(numbers).tolist():
+                    yield from video.frames(number, number + 1)
+
+        key_frames = propose_key_frames(spread_out(), pitch, side=side, where=str(path))
     with store.publish(work) as result:
         calibration = calibrate_broadcast(
-            _open_pitch(store, work),
+            pitch,
             BroadcastClip(
-                [
-                    KeyFrame(frame=int(frame), markings=clicked_markings(markings))
-                    for frame, markings in clicked.items()
-                    if start <= int(frame) < start + count
-                ],
+                key_frames,
                 pictures,
                 float(sources["fps"]),
                 people=people,

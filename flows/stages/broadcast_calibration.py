@@ -1,4 +1,4 @@
-"""Stage `broadcast_calibration`: one unit per clip with clicked key frames (M1-M6)."""
+"""Stage `broadcast_calibration`: one unit per clip with key frames, clicked or proposed (M1-M6)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from worldpose.ingest.annotations import key_frames_file
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Return the clips with a broadcast video and clicked key frames."""
-    folder = match.folder
-    clips = (clip.id for clip in folder.spec.clips if clip.broadcast is not None)
-    return tuple(clip for clip in clips if clip in folder.key_frames and clip in folder.videos)
+    """Return the clips with a broadcast video and key frames that are clicked or proposed."""
+    return match.folder.calibrated_clips
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
@@ -47,12 +45,14 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
                 marking.name: [[x, y] for x, y in marking.xy] for marking in key.markings.drawn
             },
         }
-        for key in folder.key_frames[unit].key_frames
+        for key in (folder.key_frames[unit].key_frames if unit in folder.key_frames else ())
     }
+    proposed = {"side": folder.broadcast_side(unit)} if unit in folder.proposed_clips else {}
     return {
         "video": path,
         "video_sha256": match.registration.digest_of(path),
         "key_frames": {key_frames_file(unit): clicked},
+        **proposed,
         "first_frame": frames.first,
         "frame_count": frames.count,
         "offset_frames": frames.offset,

@@ -22,7 +22,7 @@ class IngestSettings(Record):
 
 @once_a_match
 def units(match: Match) -> tuple[str, ...]:
-    """Return static cameras in order, then broadcast clips with 2D poses, or with video and clicks.
+    """Return static cameras in order, then clips with 2D poses, or with video and key frames.
 
     A clip without key frames does not use the detections of its broadcast camera.
     """
@@ -32,8 +32,7 @@ def units(match: Match) -> tuple[str, ...]:
         *(
             clip.id
             for clip in folder.spec.clips
-            if clip.id in folder.detections
-            or (clip.id in folder.key_frames and clip.id in folder.videos)
+            if clip.id in folder.detections or clip.id in folder.calibrated_clips
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Broadcast calibration: a clip's moving camera from clicks in a few key frames (M1-M6).
+"""Broadcast calibration: a clip's moving camera from a few key frames, clicked or proposed (M1-M6).
 
 Input: clicks in key frames, the clip's frames, people of the static cameras. Output: a camera per
 frame with one center, its covariance, and a report.
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         moving_arrays,
         moving_from_arrays,
     )
+    from worldpose.broadcast_calibration.key_frames import propose_key_frames
     from worldpose.broadcast_calibration.moving_camera import MovingCamera
     from worldpose.broadcast_calibration.players import FeedOffset, People, estimate_feed_offset
     from worldpose.broadcast_calibration.report import BroadcastReport
@@ -52,6 +53,7 @@ __all__ = [
     "moving_arrays",
     "moving_from_arrays",
     "pool_centers",
+    "propose_key_frames",
     "static_covariance",
 ]
 
@@ -68,6 +70,7 @@ __getattr__ = import_on_use(
             "moving_arrays",
             "moving_from_arrays",
         ),
+        "worldpose.broadcast_calibration.key_frames": ("propose_key_frames",),
         "worldpose.broadcast_calibration.moving_camera": ("MovingCamera",),
         "worldpose.broadcast_calibration.players": (
             "FeedOffset",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
+from data_contracts.match import Side
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
@@ -25,11 +27,65 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.errors import DegenerateError, InputError
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate_camera
+from worldpose.static_calibration import (
+    CameraEstimate,
+    StaticCalibration,
+    calibrate_camera,
+    propose_camera,
+)
 from worldpose.static_calibration.residuals import nearest_on_markings
 
 _ROUNDS = 3
 """Iterations that match drawn markings and painted lines again [1]."""
+
+
+_SAME_CENTER = 0.1
+"""Largest distance of a proposal's center from the median one, of its distance to the centre spot
+[1]: from one frame alone the distance trades with the focal length."""
+_MIN_PROPOSALS = 2
+"""Minimum proposals with one center [1]."""
+
+
+def propose_key_frames(
+    pictures: Iterable[tuple[int, Image]], pitch: PitchTemplate, *, side: Side, where: str
+) -> list[KeyFrame]:
+    """Return key frames proposed from images of a clip, without a click.
+
+    Only clear proposals count, and only those that agree on the center with most of the others.
+
+    Args:
+        pictures: numbers of frames, and their images (height, width, 3) RGB.
+        pitch: the stadium's template.
+        side: where the camera stands.
+        where: clip or file, for messages.
+
+    Raises:
+        InputError: fewer than two frames have a clear proposal with one center.
+    """
+    clear, seen = [], 0
+    for number, picture in pictures:
+        seen += 1
+        with suppress(InputError):  # a frame without a pitch, or with too little paint
+            proposal = propose_camera(picture, pitch, side=side, where=f"{where}: frame {number}")
+            if proposal.is_clear:
+                clear.append((number, proposal))
+    centers = np.array([each.camera.center for _, each in clear]).reshape(-1, 3)
+    middle = np.median(centers, axis=0) if len(clear) else np.zeros(3)
+    reach = _SAME_CENTER * float(np.linalg.norm(middle))
+    agreed = np.linalg.norm(centers - middle, axis=1) <= reach
+    if np.count_nonzero(agreed) < max(_MIN_PROPOSALS, len(clear) // 2 + 1):
+        raise InputError(
+            where,
+            expected=f"{_MIN_PROPOSALS} frames or more whose markings show one camera position",
+            found=f"{len(clear)} clear frames of {seen}, {np.count_nonzero(agreed)} with one "
+            "position",
+            todo="Click four or more named points in three frames of the clip.",
+        )
+    return [
+        KeyFrame(frame=number, markings=proposal.drawn)
+        for (number, proposal), kept in zip(clear, agreed, strict=True)
+        if kept
+    ]
 
 
 @dataclass(frozen=True, eq=False)

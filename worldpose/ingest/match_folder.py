@@ -10,7 +10,7 @@ from typing import Final
 
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from data_contracts.match import MatchSpec
+from data_contracts.match import MatchSpec, Side
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
@@ -72,6 +72,33 @@ class MatchFolder:
             seen = {*self.stills, *self.videos}
             known |= {each.id for each in self.spec.cameras if each.side and each.id in seen}
         return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
+
+    @property
+    def proposed_clips(self) -> tuple[str, ...]:
+        """Broadcast clips without key frames whose key frames are proposed from their video.
+
+        A proposal needs the camera's side, the clip's video and the pitch.
+        """
+        if self.pitch is None:
+            return ()
+        clips = (each.id for each in self.spec.clips if each.broadcast is not None)
+        filmed = (each for each in clips if each in self.videos and each not in self.key_frames)
+        return tuple(each for each in filmed if self.broadcast_side(each) is not None)
+
+    @property
+    def calibrated_clips(self) -> tuple[str, ...]:
+        """Broadcast clips with a video whose key frames are clicked or proposed."""
+        known = {*self.key_frames, *self.proposed_clips}
+        return tuple(each.id for each in self.spec.clips if each.id in known & self.videos.keys())
+
+    def broadcast_side(self, clip_id: str) -> Side | None:
+        """The side on which a clip's broadcast camera stands, if it is stated.
+
+        Raises:
+            KeyError: no such clip.
+        """
+        broadcast = self.spec.clip(clip_id).broadcast
+        return None if broadcast is None else self.spec.camera(broadcast).side
 
 
 def read_match(folder: str | os.PathLike[str]) -> MatchFolder:
@@ -170,14 +197,13 @@ def unclicked_clips(match: MatchFolder) -> tuple[str, ...]:
     """Return the broadcast clips that need key frames; none if static cameras film the match."""
     clips = (clip.id for clip in match.spec.clips if clip.broadcast is not None)
     filmed = (clip for clip in clips if clip in match.videos and match.pitch is not None)
-    unclicked = tuple(clip for clip in filmed if clip not in match.key_frames)
+    unclicked = tuple(clip for clip in filmed if clip not in match.calibrated_clips)
     return () if match.spec.static_cameras else unclicked
 
 
 def _require_key_frames(match: MatchFolder) -> None:
     """Raise InputError if no broadcast clip of a match without static cameras can be calibrated."""
-    usable = match.key_frames.keys() & match.videos.keys()
-    if match.pitch is not None and usable:
+    if match.pitch is not None and match.calibrated_clips:
         return
     clip = next(each.id for each in match.spec.clips if each.broadcast is not None)
     found, todo = "no clip with a video", f"Add broadcast/{clip}.mp4."
@@ -187,7 +213,9 @@ def _require_key_frames(match: MatchFolder) -> None:
         found = "no clicked key frame"
         todo = (
             f"Click {CLICKS_NEEDED} in a frame into {match.folder / key_frames_file(clip)}, or "
-            f"click on the pages: worldpose ingest {match.folder}, then worldpose review serve."
+            f"click on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
+            "give the broadcast camera a side (near, far, left, right) in match.yaml, so that key "
+            "frames are proposed from its video."
         )
     raise InputError(
         str(match.folder),

@@ -169,7 +169,7 @@ def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                     beside = sign * first[0] - up * triples.offsets[kept, 0]
                     ahead = other[0] - up * triples.offset[kept]
                     place = (ahead, beside) if axis == 0 else (-beside, ahead)
-                    fits = np.hypot(*place) < _FARTHEST
+                    fits = np.hypot(place[0], place[1]) < _FARTHEST
                     fits &= (np.abs(place[0]) > half[0]) | (np.abs(place[1]) > half[1])
                     for index, line in enumerate((first, second)):
                         ends = triples.reach[kept, index] * up[:, None] + ahead[:, None]

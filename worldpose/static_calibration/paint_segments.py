@@ -127,7 +127,7 @@ def find_paint(
             found=f"{picture.dtype} of shape {picture.shape}",
             todo="Give a color image: the pitch is found by its color.",
         )
-    width = int(np.clip(picture.shape[1], *_WIDTHS))
+    width = int(np.clip(picture.shape[1], _WIDTHS[0], _WIDTHS[1]))
     scale = width / picture.shape[1]
     size = (width, max(1, round(picture.shape[0] * scale)))
     small = np.asarray(
@@ -136,7 +136,8 @@ def find_paint(
     )
     grass = _find_grass(small, where)
     area = _fill_area(grass)
-    ridges = thin_ridges(*_find_ridges(small, grass, area))
+    strength, normal = _find_ridges(small, grass, area)
+    ridges = thin_ridges(strength, normal)
     original = (picture.shape[1], picture.shape[0])
     for each in (lens,) if lens is not None else _find_lenses(ridges, original, scale):
         yield straighten_paint(ridges, area, each, scale)
@@ -187,7 +188,7 @@ def guess_lens(bend: float, image_size: tuple[int, int]) -> Camera:
         distortion".
     """
     half = 0.5 * image_size[0]
-    radius = np.linspace(0.05, 1.1 * np.hypot(*image_size) / image_size[0], 40)
+    radius = np.linspace(0.05, 1.1 * np.hypot(image_size[0], image_size[1]) / image_size[0], 40)
     straight = radius / (1.0 + bend * radius**2)
     powers = straight[:, None] ** np.array([2.0, 4.0, 6.0])
     k1, k2, k3 = np.linalg.lstsq(powers, radius / straight - 1.0, rcond=None)[0]
@@ -271,7 +272,7 @@ def _find_lenses(ridges: Ridges, image_size: tuple[int, int], scale: float) -> t
     straight = []
     for bend in _BENDS:
         flat = _flatten(ridges, guess_lens(bend, image_size), scale, size)[0]
-        segments = _find_segments(flat, float(np.hypot(*size)), _COMPARED)
+        segments = _find_segments(flat, float(np.hypot(size[0], size[1])), _COMPARED)
         straight.append(sum(count for count, _ in segments))
     if straight[0] >= _BEND_GAIN * max(straight):
         return (guess_lens(0.0, image_size),)

@@ -52,7 +52,7 @@ MIN_MARGIN: Final = 25.0
 """Minimum margin of a proposal to be used without a click [1]."""
 MIN_FOUND: Final = 0.6
 """Minimum share of its markings on paint [1]."""
-MIN_EXPLAINED: Final = 0.4
+MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
 _AGREES: Final = 0.01
@@ -195,9 +195,9 @@ def propose_from_paint(
         drawn,
         markings,
         float(scores[0]),
-        float(scores[0] - max(0.0, *scores[1:2])),
+        float(scores[0]) - _second(scores),
         float(on_paint),
-        _explained(paint, seen),
+        _explained_share(paint, seen),
     )
 
 
@@ -285,9 +285,14 @@ def _rank_under_lenses(
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        if best is not None and best[2][0] - max(0.0, *best[2][1:2]) > _CLEAR:
+        if best is not None and best[2][0] - _second(best[2]) > _CLEAR:
             break
     return best
+
+
+def _second(scores: Floats) -> float:
+    """Return the score of the best other camera, or that of none [1]."""
+    return max(0.0, float(scores[1])) if len(scores) > 1 else 0.0
 
 
 def rank_cameras(
@@ -302,7 +307,7 @@ def rank_cameras(
         focals: focal lengths to try, in image widths [1]; a single one is kept.
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
-    if len(scores) and scores[0] - max(0.0, *scores[1:2]) > _CLEAR:
+    if len(scores) and scores[0] - _second(scores) > _CLEAR:
         return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
     return _order(
@@ -437,7 +442,7 @@ def _support(
     return tuple(support), ClickedMarkings(drawn=tuple(drawn))
 
 
-def _explained(paint: PaintMap, seen: SeenMarkings) -> float:
+def _explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
     """Return the share of the segments' length that lies on a projected marking [1]."""
     width, height = paint.size
     canvas = np.ones((height, width), np.uint8)
