@@ -20,6 +20,7 @@ from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     clip_positions,
+    estimated_pitch,
     joint_tracks,
     static_cameras,
 )
@@ -70,7 +71,8 @@ def describe_scene(run: Run, match: Match, clip: str) -> bytes:
     names = dict(zip(positions.person.tolist(), positions.names, strict=True))
     fitted = [] if bodies is None else bodies.person_ids.tolist()
     arrays: Arrays = {} if bodies is None else _body_arrays(bodies)
-    lines = [] if match.folder.pitch is None else markings(match.folder.pitch)
+    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec, clip)
+    lines = [] if pitch is None else markings(pitch)
     header = {
         "clip": clip,
         "run": run.record.run_id,
