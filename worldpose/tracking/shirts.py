@@ -96,7 +96,7 @@ def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floa
     known = np.asarray(confidence[list(TORSO)]) >= MIN_CONFIDENCE
     if known.all() and np.isfinite(torso).all():
         top, bottom = torso[:2].mean(axis=0), torso[2:].mean(axis=0)
-        length = np.linalg.norm(bottom - top)
+        length = float(np.linalg.norm(bottom - top))
         spans = np.linalg.norm(torso[[0, 2]] - torso[[1, 3]], axis=1)
         wide = max(float(spans.max()), WIDTH * length)
     else:
@@ -104,8 +104,9 @@ def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floa
         middle, tall = 0.5 * (left + right), lower - upper
         top = np.array([middle, upper + BOX_TORSO[0] * tall])
         bottom = np.array([middle, upper + BOX_TORSO[1] * tall])
-        length, wide = np.linalg.norm(bottom - top), BOX_TORSO[2] * (right - left)
-    ahead = (bottom - top) / max(float(length), 1e-6)
+        length = float(np.linalg.norm(bottom - top))
+        wide = BOX_TORSO[2] * (right - left)
+    ahead = (bottom - top) / max(length, 1e-6)
     across = np.array([-ahead[1], ahead[0]])
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, GRID[0]), np.linspace(*ALONG, GRID[1]))
     middle_line = top + v.reshape(-1, 1) * (bottom - top)
@@ -153,7 +154,7 @@ class ShirtModel:
             shirts: (frames, detections, 3) [CIELAB]; NaN where not known.
             xy: (frames, detections, 2) places [m]; NaN where not known.
         """
-        known = np.isfinite(shirts).all(axis=-1) & np.isfinite(xy).all(axis=-1)
+        known = np.asarray(np.isfinite(shirts).all(axis=-1) & np.isfinite(xy).all(axis=-1))
         changes = [np.empty((0, 3))]
         for frame in range(len(shirts) - 1):
             a, b = (np.flatnonzero(known[at]) for at in (frame, frame + 1))
