@@ -108,7 +108,7 @@ def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floa
         wide = BOX_TORSO[2] * (right - left)
     ahead = (bottom - top) / max(length, 1e-6)
     across = np.array([-ahead[1], ahead[0]])
-    u, v = np.meshgrid(np.linspace(-0.5, 0.5, GRID[0]), np.linspace(*ALONG, GRID[1]))
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, GRID[0]), np.linspace(ALONG[0], ALONG[1], GRID[1]))
     middle_line = top + v.reshape(-1, 1) * (bottom - top)
     return np.asarray(middle_line + INNER * wide * u.reshape(-1, 1) * across)
 
