@@ -32,6 +32,8 @@ INNER: Final = 0.7
 BOX_TORSO: Final = (0.18, 0.48, 0.35)
 """Shoulders, hips and width of the trunk in a box: from its top, relative to its height, and
 relative to its width [1]."""
+BORDER: Final = 2.0
+"""A box so near to a side of the image is cut off by it [px]."""
 MIN_SAMPLES: Final = 32
 """Least number of samples for a colour: half of the grid, the others are hidden."""
 LEAST_STD: Final = np.array([4.0, 2.0, 2.0])
@@ -62,7 +64,8 @@ def measure_shirts(
 ) -> Floats:
     """Return the colours of people's upper bodies (people, 3) [CIELAB]; NaN where hidden.
 
-    Samples within the box of a person who stands nearer to the camera do not count.
+    Samples within the box of a person who stands nearer to the camera do not count. A person whom a
+    side of the image cuts off has no colour: the trunk is not where the keypoints put it.
 
     Args:
         image: (height, width, 3) RGB.
@@ -75,7 +78,8 @@ def measure_shirts(
     colours = np.full((len(boxes), 3), np.nan)
     there = np.flatnonzero(np.isfinite(boxes).all(axis=1))
     size = np.array([image.shape[1], image.shape[0]])
-    for person in there:
+    whole = there[(boxes[there, 0] > BORDER) & (boxes[there, 2] < size[0] - 1.0 - BORDER)]
+    for person in whole:
         places = _sample(keypoints[person], confidence[person], boxes[person])
         cells = np.rint(places).astype(np.int64)
         kept = ((cells >= 0) & (cells < size)).all(axis=1)
