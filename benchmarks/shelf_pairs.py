@@ -79,8 +79,10 @@ def main() -> None:
             views = np.array(pair)
             for frame in range(0, len(truth), options.every):
                 both = (index[frame, views] >= 0).all(axis=0)
-                arrays = seen[frame : frame + 1].arrays()
-                one = KeypointDetections(**{name: each[:, views] for name, each in arrays.items()})
+                now = seen[frame : frame + 1]
+                one = KeypointDetections.from_keypoints(
+                    now.keypoints[:, views], now.confidence[:, views]
+                )
                 joints, _ = find_people(cameras[views], one, settings)
                 rows, _, distance = pair_people(truth[frame], joints[0])
                 asked += int(both.sum())
