@@ -9,7 +9,8 @@ points alone, the second the same turned onto the painted lines, the third all t
 of painted lines, and of people by the mean over their keypoints, before and after the third step.
 Rough: root mean square second differences of log focal length, k1 and k2. Regions: the share of
 centers, of frames' cameras with the center, and of players' places in the image that are inside
-their stated regions.
+their stated regions. The last lines have, over all clips, the median and the range of found and
+stated errors: of the centre, and of players' places in the image (medians of each clip).
 """
 
 from __future__ import annotations
@@ -121,6 +122,33 @@ def distances(
     }
 
 
+def stated_errors(
+    found: MovingCamera, known: Uncertainty, true: MovingCamera, joints: Floats
+) -> dict[str, tuple[float, float]]:
+    """Return found and stated errors of the centre [m] and of players' places [px].
+
+    Stated is the root of the mean squared distance for the centre, and for places the median
+    distance of a normal distribution in the plane with their median variance.
+    """
+    feet, inside = feet_in_picture(true, joints)
+    off = np.linalg.norm(found.camera.project(feet) - true.camera.project(feet), axis=-1)
+    pixel, rows, spread = np.empty(2), np.empty((2, 12)), []
+    for t in range(0, len(found), 5):
+        for place in feet[t, inside[t]]:
+            point_row(found.rotation[t], found.center, found.lens(t), place, pixel, rows)
+            spread.append(np.trace(rows @ known.frame[t] @ rows.T))
+    return {
+        "centre [m]": (
+            float(np.linalg.norm(found.center - true.center)),
+            float(np.sqrt(np.trace(known.clip[:3, :3]))),
+        ),
+        "ground [px]": (
+            float(np.median(off[inside])),
+            float(np.sqrt(np.log(2.0) * np.median(spread))),
+        ),
+    }
+
+
 def main() -> None:
     """Print two lines per clip, and the regions of all together."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -135,6 +163,7 @@ def main() -> None:
     if options.without_m6:
         settings = settings.model_copy(update={"smooth": False, "flow_weight": 0.0})
     told: dict[str, list[Floats]] = {}
+    both: dict[str, list[tuple[float, float]]] = {}
     for folder in options.matches:
         match = read_match(folder)
         for clip in (each.id for each in match.spec.clips if each.id in match.key_frames):
@@ -178,10 +207,18 @@ def main() -> None:
             for name, shares in distances(found.camera, found.uncertainty, true, joints).items():
                 told.setdefault(name, []).append(shares)
                 print(f"  {name}: inside the region of {np.median(shares):.3f} in the median")
+            stated = stated_errors(found.camera, found.uncertainty, true, joints)
+            for name, pair in stated.items():
+                both.setdefault(name, []).append(pair)
+                print("  {}: found {:.3f}, stated {:.3f}".format(name, *pair), flush=True)
     for name, parts in told.items():
         held = [100.0 * np.mean([(part < share).mean() for part in parts]) for share in SHARES]
         wanted = " / ".join(f"{100.0 * share:g}" for share in SHARES)
         print(f"{name} in regions of {wanted} %: " + " / ".join(f"{each:.1f}" for each in held))
+    for name, pairs in both.items():
+        for kind, values in zip(("found", "stated"), np.transpose(pairs), strict=True):
+            middle, low, high = np.median(values), values.min(), values.max()
+            print(f"{name} {kind} in {len(values)} clips: {middle:.3f} ({low:.3f} to {high:.3f})")
 
 
 if __name__ == "__main__":

@@ -36,12 +36,12 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.line_samples import (
+    EXACT_PAINT,
     LineSamples,
     project_lines,
     sample_markings,
     thin_samples,
 )
-from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 NOISE = 0.15
 """Noise of a line's sample [px]."""

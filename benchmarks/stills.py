@@ -11,8 +11,8 @@ people at the pitch, and twelve joints of some, drawn on enlargements without he
 and AP50: on the pitch alone, where boxes with feet outside of the pitch do not count, as a
 calibrated camera rejects them, and in the whole image, where every spectator counts as false. Then
 follow PCK (a fifth of the torso) of joints in the labelled boxes, and how confidence agrees with
-the share of right boxes and joints. Detectors that take views of a fixed size see tiles, as in the
-stage.
+the share of right joints, and of right boxes as the stage stores them. Detectors that take views of
+a fixed size see tiles, as in the stage.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats
 from worldpose.detection import DetectionSettings, People
-from worldpose.detection.models import load_detectors, load_pose
+from worldpose.detection.models import load_detectors, load_pose, load_score_map
 from worldpose.detection.suppression import fuse
 from worldpose.detection.views import TiledDetector
-from worldpose.geometry.boxes import box_iou
 from worldpose.training.labels import LabelledPicture, PictureCache, read_labels
 from worldpose.training.metrics import (
-    MIN_TRUE_IOU,
     average_precision,
     calibration_error,
     correct_keypoints,
+    judge_boxes,
+    stored_people,
 )
 
 LABELS = Path(__file__).parents[1] / "tests" / "real" / "stills" / "labels.json"
@@ -168,24 +168,6 @@ def keep_pitch(
     return people, labelled
 
 
-def judge_boxes(people: People, still: LabelledPicture) -> tuple[Floats, Flags, Flags]:
-    """Return scores and verdicts of boxes that count, best first, and which people were found."""
-    order = np.argsort(-people.scores, kind="stable")
-    overlap = box_iou(people.boxes[order], still.boxes)
-    free = ~still.ignored
-    scores, right = [], []
-    for row, score in zip(overlap, people.scores[order], strict=True):
-        best = int(np.where(free, row, -1.0).argmax()) if len(row) else 0
-        hit = bool(len(row)) and bool(free[best]) and row[best] >= MIN_TRUE_IOU
-        if hit:
-            free[best] = False
-        elif np.any(row[still.ignored] >= MIN_TRUE_IOU):
-            continue
-        scores.append(score)
-        right.append(hit)
-    return np.array(scores), np.array(right, dtype=np.bool_), ~still.ignored & ~free
-
-
 def score_boxes(
     found: Sequence[People], stills: Sequence[LabelledPicture], threshold: float
 ) -> dict[str, float]:
@@ -223,6 +205,21 @@ def agreement(confidence: Floats, right: Flags) -> Reliability:
     return Reliability(said, share, calibration_error(confidence, right, BINS))
 
 
+def store(
+    found: Sequence[People], stills: Sequence[LabelledPicture], settings: DetectionSettings
+) -> list[People]:
+    """Return the people as the stage stores them, with the pose net's boxes and probabilities."""
+    estimator, cache = load_pose(settings), PictureCache(1 << 28)
+    score_map = load_score_map(settings)
+    stored = [
+        stored_people(people, cache[still.path], estimator, settings)
+        for people, still in zip(found, stills, strict=True)
+    ]
+    if score_map is None:
+        return stored
+    return [People(each.boxes, score_map.probability(each.scores)) for each in stored]
+
+
 def judge_joints(
     stills: Sequence[LabelledPicture], settings: DetectionSettings
 ) -> tuple[Floats, Floats]:
@@ -245,7 +242,7 @@ def plot_agreement(boxes: Reliability, joints: Reliability, file: Path) -> None:
     """Draw confidence against the share of right ones."""
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     axes.plot([0, 1], [0, 1], color="0.7")
-    for found, name in ((boxes, "boxes on the pitch"), (joints, "joints")):
+    for found, name in ((boxes, "stored boxes on the pitch"), (joints, "joints")):
         axes.plot(found.confidence, found.share, "o-", label=f"{name}, mean gap {found.gap:.2f}")
     axes.set(xlabel="confidence", ylabel="share that is right", xlim=(0, 1), ylim=(0, 1))
     axes.legend()
@@ -258,7 +255,8 @@ def score(data: Path, settings: DetectionSettings, plot: Path | None) -> None:
     folder = data / "stills"
     stills = read_labels(folder / "labels.json")
     found = detect(stills, settings)
-    on_pitch, labelled = keep_pitch(found, stills, pitch_outlines(folder / "labels.json"))
+    outlines = pitch_outlines(folder / "labels.json")
+    on_pitch, labelled = keep_pitch(found, stills, outlines)
     threshold = settings.high_score_threshold
     print(f"{'boxes':<22}{'people':>8}{'recall':>8}{'precision':>11}{'AP50':>7}")
     rows = [
@@ -275,7 +273,8 @@ def score(data: Path, settings: DetectionSettings, plot: Path | None) -> None:
             f"{name:<22}{asked:>8}{values['recall']:>8.3f}{values['precision']:>11.3f}"
             f"{values['ap50']:>7.3f}"
         )
-    judged = [judge_boxes(*each)[:2] for each in zip(on_pitch, labelled, strict=True)]
+    stored, _ = keep_pitch(store(found, stills, settings), stills, outlines)
+    judged = [judge_boxes(*each)[:2] for each in zip(stored, labelled, strict=True)]
     boxes = agreement(
         np.concatenate([scores for scores, _ in judged]),
         np.concatenate([right for _, right in judged]),
@@ -283,7 +282,7 @@ def score(data: Path, settings: DetectionSettings, plot: Path | None) -> None:
     confidence, right = judge_joints(stills, settings)
     joints = agreement(confidence, right > 0)
     print(f"\njoints: PCK {right.mean():.3f} of {len(right)} visible ones")
-    for name, each in (("boxes", boxes), ("joints", joints)):
+    for name, each in (("stored boxes", boxes), ("joints", joints)):
         print(f"\n{name}: mean gap {each.gap:.3f}\nconfidence  right")
         for said, share in zip(each.confidence, each.share, strict=True):
             print(f"{said:>10.2f}{share:>7.2f}")

@@ -1,24 +1,28 @@
-"""Task of stage `broadcast_tracking`: people of a moving camera on the pitch, by their feet."""
+"""Task of stage `broadcast_tracking`: a moving camera's people on the pitch, by feet and shirts."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from data_contracts.broadcast_tracking import BROADCAST_TRACKING
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import Track
 from data_contracts.work import Work
-from tasks.unit import open_input, unit_task
+from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
-from worldpose.tracking import GroundPositions, locate_feet, track_on_plane
+from worldpose.tracking import GroundPositions, locate_feet, measure_shirts, track_on_plane
+from worldpose.video import open_video
 
 SURFACE: Final = ("length", "width", "crown")
 """Entries of pitch.json that give the surface under the feet."""
@@ -32,7 +36,12 @@ def broadcast_tracking(work: Work) -> str:
     first, count = sources["first_frame"], sources["frame_count"]
     filmed = open_broadcast(store, work)
     detections, pitch = filmed.detections, filmed.pitch
-    positions = _locate_people(detections, filmed.camera, pitch)
+    path = Path(work.folder) / sources["video"]
+    with open_video(path) as video:
+        start = first + sources["offset_frames"]
+        images = (image for _, image in video.frames(start, start + count))
+        positions = _locate_people(detections, filmed.camera, pitch, images)
+    require_registered(path, sources["video_sha256"])
     size = (pitch.length, pitch.width)
     tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
     index = tracks.detection_index[:, 0]
@@ -109,22 +118,25 @@ def open_broadcast(store: Store, work: Work) -> BroadcastInputs:
 
 
 def _locate_people(
-    detections: xr.Dataset, camera: xr.Dataset, pitch: PitchTemplate
+    detections: xr.Dataset, camera: xr.Dataset, pitch: PitchTemplate, images: Iterator[Image]
 ) -> GroundPositions:
-    """Return the places of a moving camera's detections, as those of one camera."""
+    """Return places and shirts of a moving camera's detections, as those of one camera."""
     moving, uncertainty = moving_from_arrays(
         {str(name): array.values for name, array in camera.data_vars.items()}
     )
     covariance, cameras = static_covariance(moving, uncertainty), moving.camera
     seen = KeypointDetections.from_arrays(detections)
     parts = []
-    for frame in range(len(moving)):
+    for frame, image in zip(range(len(moving)), images, strict=True):
         now = slice(frame, frame + 1)
         people = KeypointDetections.stack([seen[now]])
-        parts.append(locate_feet(cameras[now], people, pitch, camera_covariance=covariance[now]))
-    names = ("xy", "noise", "calibration", "height")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return GroundPositions(**joined)
+        found = locate_feet(cameras[now], people, pitch, camera_covariance=covariance[now])
+        shirts = measure_shirts(
+            image, seen.keypoints[frame], seen.confidence[frame], seen.boxes[frame]
+        )
+        # Parts start tracks, too: in a duel one player is often a part of the other's box.
+        parts.append(replace(found, is_whole=None, boxes=None, shirts=shirts[None, None]))
+    return GroundPositions.concatenate(parts)
 
 
 def _track(person: int, index: NDArray[np.int16], first: int) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from worldpose.detection import (
     Place,
     load_detectors,
     load_pose,
+    load_score_map,
     weights_of,
 )
 from worldpose.errors import InputError
@@ -94,7 +95,9 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     """Run the detection nets."""
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
-    finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
+    finder = PeopleFinder(
+        load_detectors(settings), load_pose(settings), settings, load_score_map(settings)
+    )
     require_weights(settings, sources["weights"])
     most = 0
     for chunk in finder.find(_read_frames(store, work), _open_place(store, work)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ from tasks.clip_inputs import ADJUSTED
 from tasks.detection import footage_index, require_weights
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.detection import DetectionSettings, Place, load_pose
+from worldpose.detection import DetectionSettings, Place, load_pose, load_score_map
 from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering import (
     BodyViews,
@@ -218,7 +218,8 @@ def _search(store: Store, work: Work, case: _Case, sought: MissingPeople) -> Key
         case.detected.boxes,
     )
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
-    return found
+    score_map = load_score_map(settings)
+    return found if score_map is None else replace(found, score=score_map.probability(found.score))
 
 
 def _pictures(

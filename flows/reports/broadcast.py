@@ -17,6 +17,7 @@ from flows.results.best_results import (
     broadcast_cameras,
     broadcast_unit,
     clip_title,
+    estimated_pitch,
     joint_tracks,
 )
 from flows.stage import Match
@@ -89,7 +90,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
                         tracks,
                         int(np.searchsorted(tracks.frames, number)),
                         still=still,
-                        pitch=match.folder.pitch,
+                        pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
                     ),
                 )
             )
@@ -132,7 +133,7 @@ def _before_and_after(
                 person,
                 still=still,
                 seen=run[detected].sel(frame=number)["keypoints"].values,
-                pitch=match.folder.pitch,
+                pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
             ),
         )
     ]
@@ -174,7 +175,7 @@ def write_broadcast_videos(
                 camera[chosen],
                 joint_tracks(run, clip),
                 frames,
-                match.folder.pitch,
+                estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
                 body_tracks(run, clip),
             )
             write_video(draft, drawn, fps / every, quality=23)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
 from flows.reports.match_pictures import background_image
+from flows.results.best_results import estimated_pitch
 from flows.stage import Match
 from worldpose.geometry import Camera
 from worldpose.reports import CameraSummary, CaptionedImage
@@ -102,7 +103,9 @@ def paint_pictures(
     still = background_image(store, match, name)
     if still is None:  # no image of the video's clips can be read
         return []
-    png, share = plot_paint(cameras[name], still, match.folder.pitch)
+    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    assert pitch is not None  # of the match folder
+    png, share = plot_paint(cameras[name], still, pitch)
     return [
         CaptionedImage(
             f"Camera {name}: paint in its image, and the distance of every pixel from it, with the "
@@ -116,13 +119,14 @@ def paint_pictures(
 
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
     """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
-    assert match.folder.pitch is not None, "nothing is clicked without a pitch"
+    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    assert pitch is not None, "nothing is clicked without a pitch"
     result = run[f"static_calibration/{name}"]
     inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
     return plot_calibration(
         camera,
         f"camera {name}",
-        match.folder.pitch,
+        pitch,
         clicks=[
             Click(point, place, inlier[point])
             for point, place in _clicked_places(store, run, name).items()

@@ -14,6 +14,7 @@ from flows.reports.match_pictures import frame_pictures
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
+    estimated_pitch,
     joint_tracks,
     placed_joints,
     static_cameras,
@@ -85,7 +86,8 @@ def write_clip_video(
             yield dark if picture is None else picture
 
     bodies = body_tracks(run, clip)
-    drawn = overlay_frames(pictures(), cameras, tracks, frames, match.folder.pitch, bodies)
+    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    drawn = overlay_frames(pictures(), cameras, tracks, frames, pitch, bodies)
     write_video(file, drawn, fps / every, quality=23)
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.pitch import PitchSpec
 from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     clip_title,
+    estimated_pitch,
     joint_tracks,
     placed_joints,
     static_cameras,
@@ -37,7 +39,7 @@ def clip_pictures(
     """Draw the stadium from a camera and from above, the bodies, and all trajectories."""
     cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
-    pitch = match.folder.pitch
+    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
     seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
     pictures = []
     if len(tracks.frames):
@@ -61,7 +63,7 @@ def clip_pictures(
         ]
         bodies = body_tracks(run, clip)
         if bodies is not None:
-            pictures.append(_bodies(store, bodies, match, clip, widest, cameras[widest]))
+            pictures.append(_bodies(store, bodies, match, clip, (widest, cameras[widest]), pitch))
     above = plot_paths(tracks, truth=truth, cameras=cameras, pitch=pitch)
     pictures.append(CaptionedImage(f"{clip_title(clip)}: the paths of all people.", above))
     return pictures
@@ -76,9 +78,15 @@ def _image_with_people(
 
 
 def _bodies(
-    store: Store, bodies: BodyTracks, match: Match, clip: str, camera_id: str, camera: Camera
+    store: Store,
+    bodies: BodyTracks,
+    match: Match,
+    clip: str,
+    view: tuple[str, Camera],
+    pitch: PitchSpec | None,
 ) -> CaptionedImage:
-    """Draw the bodies of a clip's first frame on a camera's image."""
+    """Draw the bodies of a clip's first frame on the image of a camera, given with its id."""
+    camera_id, camera = view
     frame = int(bodies.frames[0])
     image = _image_with_people(store, match, camera_id, frame)
     png = plot_bodies(
@@ -88,7 +96,7 @@ def _bodies(
         bodies.model.faces,
         bodies.person_ids,
         still=image,
-        pitch=match.folder.pitch,
+        pitch=pitch,
     )
     return CaptionedImage(
         f"{clip_title(clip)}, frame {frame}: fitted bodies ({bodies.model.name}) where camera "
@@ -124,7 +132,7 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
             placed["inliers"].values[frame, index].any(-1),
         ),
         still=image,
-        pitch=match.folder.pitch,
+        pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec),
     )
     return [
         CaptionedImage(
@@ -153,5 +161,5 @@ def clip_scene(run: Run, match: Match, clip: str) -> Scene:
         match.folder.spec.fps,
         static_cameras(run, match.folder.spec),
         broadcast,
-        match.folder.pitch,
+        estimated_pitch(run, match.folder.pitch, match.folder.spec),
     )

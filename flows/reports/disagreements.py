@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from flows.reports.match_pictures import background_image, frame_picture
-from flows.results.best_results import clip_title, joint_tracks, static_cameras
+from flows.results.best_results import clip_title, estimated_pitch, joint_tracks, static_cameras
 from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
@@ -79,7 +79,7 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
             ),
             ReconstructedPeople(tracks.joints[row], tracks.person_ids, index >= 0),
             still=still,
-            pitch=match.folder.pitch,
+            pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec),
             part=(pixels.mean(axis=0) - 0.5 * side, side),
         )
         pictures.append(

@@ -19,6 +19,7 @@ from flows.results.best_results import (
     bodies_unit,
     camera_in_frames,
     clip_positions,
+    estimated_pitch,
     fitted_bodies,
     person_kinds,
     static_cameras,
@@ -101,12 +102,13 @@ def viewer_clip(
     Args:
         origin: the run; a `stage` before body fitting shows joints in place of bodies.
         clip: id of the clip.
-        pitch: pitch of the match.
+        pitch: pitch of the match folder; the viewer draws the surface that the run estimated.
         video: the clip's video as `describe_video` returns it.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings, person_color
 
+    shown = estimated_pitch(origin.run, pitch, origin.spec, clip)
     tracks, positions = origin.tracks(clip), clip_positions(origin.run, clip)
     kinds = person_kinds(origin.run, clip)
     roster = {player.id: player for player in origin.spec.roster}
@@ -151,7 +153,7 @@ def viewer_clip(
         model=model,
         cameras=still,
         broadcast=moving,
-        markings=[] if pitch is None else markings(pitch),
+        markings=[] if shown is None else markings(shown),
         notes=describe_clip(origin, clip) | {"units": "metres, seconds"},
         video=video,
     )

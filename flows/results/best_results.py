@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec, Registration
+from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from flows.stage import Match
@@ -306,6 +307,41 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
         return {}
     cameras = join_cameras(list(found.values())).cameras
     return {camera_id: cameras[index] for index, camera_id in enumerate(found)}
+
+
+def estimated_pitch(
+    run: Run, pitch: PitchSpec | None, spec: MatchSpec, clip: str | None = None
+) -> PitchSpec | None:
+    """Return the pitch with the surface that a run estimated, for drawing; None without a pitch.
+
+    Args:
+        run: the run.
+        pitch: pitch of the match folder.
+        spec: the match.
+        clip: size, crown and markings are those that this clip's broadcast camera shows, if it
+            estimated them; None, or no such estimate: crown and end fall are those that the static
+            cameras show together.
+    """
+    if pitch is None:
+        return None
+    seen = f"broadcast_calibration/{clip}"
+    found = run[seen].attrs["pitch"] if clip is not None and seen in run else None
+    if found is not None:
+        sizes = {name: found[name] for name in ("length", "width", "crown", "points")}
+        given = pitch.model_dump(mode="json") | sizes
+        return PitchSpec.model_validate(given | {"any_size": True})
+    if ADJUSTED in run:
+        surface = run[ADJUSTED].attrs["surface"]
+    else:
+        used = [camera.id for camera in spec.static_cameras if camera.id not in run.record.left_out]
+        units = [f"static_calibration/{camera_id}" for camera_id in used]
+        known = [run[unit].data_vars for unit in units if unit in run]
+        venue = join_cameras(known).surface if known else None
+        surface = None if venue is None else venue.shape.tolist()
+    if surface is None:
+        return pitch
+    # Not validated: an estimated crown may be slightly negative.
+    return pitch.model_copy(update={"crown": surface[0], "end_fall": surface[1]})
 
 
 def broadcast_cameras(run: Run) -> dict[str, Camera]:

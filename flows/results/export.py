@@ -20,6 +20,7 @@ from flows.results.best_results import (
     broadcast_camera,
     camera_in_frames,
     clip_positions,
+    estimated_pitch,
     fitted_bodies,
     person_kinds,
     placed_joints,
@@ -198,7 +199,12 @@ def export_recording(origin: Origin, out: Path) -> list[Path]:
             origin.spec.fps,
             cameras=static_cameras(origin.run, origin.spec, origin.stage),
             broadcast=moving,
-            pitch=read_match(Path(origin.registration.folder)).pitch,
+            pitch=estimated_pitch(
+                origin.run,
+                read_match(Path(origin.registration.folder)).pitch,
+                origin.spec,
+                clip,
+            ),
         )
     return written
 

@@ -16,6 +16,7 @@ from flows.results.best_results import (
     bodies_unit,
     broadcast_camera,
     clip_positions,
+    estimated_pitch,
     fitted_bodies,
     person_kinds,
     static_cameras,
@@ -164,7 +165,8 @@ def export_gltf(origin: Origin, out: Path) -> list[Path]:
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings
 
-    pitch = read_match(Path(origin.registration.folder)).pitch
+    given = read_match(Path(origin.registration.folder)).pitch
+    pitch = estimated_pitch(origin.run, given, origin.spec)
     written = []
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)

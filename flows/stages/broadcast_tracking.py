@@ -7,10 +7,11 @@ from pydantic import JsonValue
 from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import broadcast_calibration, broadcast_pooling, detection
+from worldpose.ingest import unit_frames
 
 
 class BroadcastTrackingSettings(Record):
-    """No settings: covariances of feet and camera decide which detections are one person."""
+    """No settings: covariances of feet and camera, and shirts, decide who is one person."""
 
 
 @once_a_match
@@ -30,12 +31,16 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the clip, its clock, the pitch, and whether there are monocular poses."""
+    """Return the clip, its video and clock, the pitch, and whether there are monocular poses."""
     spec, pitch = match.folder.spec, match.folder.pitch
-    clip = spec.clip(unit)
+    frames, video = unit_frames(spec, unit), match.folder.videos[unit]
+    path = video.relative_to(match.folder.folder).as_posix()
     return {
-        "first_frame": clip.first_frame,
-        "frame_count": clip.frame_count,
+        "video": path,
+        "video_sha256": match.registration.digest_of(path),
+        "first_frame": frames.first,
+        "frame_count": frames.count,
+        "offset_frames": frames.offset,
         "fps": spec.fps,
         "has_estimates": unit in match.folder.estimates,
         "pitch": None if pitch is None else pitch.model_dump(mode="json"),

@@ -27,8 +27,8 @@ def measured():
     return measure(*load_moments(MVOR), TrackingSettings())
 
 
-# Published errors of mv3dreg are 9.9 and 18.3 cm; seen here 308 of 308 at 9.4, 322 of 415 at 12.8.
-@pytest.mark.parametrize(("views", "share", "limit_cm"), [(3, 0.95, 9.9), (2, 0.70, 18.3)])
+# Published errors of mv3dreg are 9.9 and 18.3 cm; seen here 308 of 308 at 9.4, 342 of 415 at 12.8.
+@pytest.mark.parametrize(("views", "share", "limit_cm"), [(3, 0.95, 9.9), (2, 0.80, 18.3)])
 def test_people_of_an_operating_room_are_found(measured, views, share, limit_cm):
     errors = np.array(measured["errors"][views])
     assert len(errors) >= share * measured["people"][views] > 0

@@ -24,6 +24,7 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
+    EXACT_PAINT,
     LineSamples,
     WhiteStructures,
     clear,
@@ -32,7 +33,6 @@ from worldpose.static_calibration.line_samples import (
     thin_samples,
     white_structures,
 )
-from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 _SPACING: Final = 0.25
 """Spacing of samples in the world [m]."""

@@ -10,7 +10,7 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.detection.interfaces import Detector, People, PoseEstimator
-    from worldpose.detection.models import load_detectors, load_pose, weights_of
+    from worldpose.detection.models import load_detectors, load_pose, load_score_map, weights_of
     from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place, detect_people
     from worldpose.detection.settings import DetectionSettings
 
@@ -25,6 +25,7 @@ __all__ = [
     "detect_people",
     "load_detectors",
     "load_pose",
+    "load_score_map",
     "weights_of",
 ]
 
@@ -39,6 +40,7 @@ __getattr__ = import_on_use(
         "worldpose.detection.models": (
             "load_detectors",
             "load_pose",
+            "load_score_map",
             "weights_of",
         ),
         "worldpose.detection.pipeline": (

@@ -8,11 +8,13 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import AnyFloats, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 
 MIN_SCORE: Final = 0.05
 """A detector reports every box from this score on; the stage applies its own thresholds."""
+MIN_PROBABILITY: Final = 1e-12
+"""Least stored score: a score of 0 would mean that there is no person."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,29 @@ class People:
         return cls(
             np.asarray(detections.boxes, np.float64), np.asarray(detections.score, np.float64)
         )
+
+
+@dataclass(frozen=True)
+class ScoreMap:
+    """Map of a net's scores to the probability that a box is a person's.
+
+    The logit of the probability is a linear function of the logit of the score (Platt scaling of
+    log odds), so that the order of boxes stays.
+
+    Attributes:
+        slope: factor on the logit, more than 0 [1].
+        offset: added to it [1].
+    """
+
+    slope: float
+    offset: float
+
+    def probability(self, scores: AnyFloats) -> Floats:
+        """Return the probability of each score [1], within (0, 1]; NaN stays NaN."""
+        score = np.clip(np.asarray(scores, dtype=np.float64), MIN_PROBABILITY, 1.0)
+        with np.errstate(divide="ignore"):
+            against = self.slope * (np.log1p(-score) - np.log(score)) - self.offset
+        return np.asarray(np.maximum(1.0 / (1.0 + np.exp(against)), MIN_PROBABILITY))
 
 
 class Detector(Protocol):

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Final
 
 from data_contracts.checkpoint import Checkpoint
-from worldpose.detection.interfaces import Detector, PoseEstimator
+from worldpose.detection.interfaces import Detector, PoseEstimator, ScoreMap
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
@@ -30,6 +30,9 @@ BUNDLED_WEIGHTS: Final = (
     Path(__file__).with_name("embedded_keypoints.safetensors"),
 )
 """Shipped weights of the bundled detector and of the bundled pose estimator."""
+
+SHIPPED_SCORE_MAP: Final = ScoreMap(slope=4.0, offset=-0.42)
+"""Map of stored scores of the shipped pair of nets (infra/embedded_detector/score_map.py)."""
 
 
 PULLED_RECORD: Final = "model.json"
@@ -72,6 +75,15 @@ def load_pose(settings: DetectionSettings) -> PoseEstimator:
     """Return the pose estimator that the settings name; raises as `load_detectors`."""
     estimator = _pose(settings)
     return FlipTest(estimator) if settings.flip_test else estimator
+
+
+def load_score_map(settings: DetectionSettings) -> ScoreMap | None:
+    """Return the map of stored scores to probabilities; None for nets whose map is not known.
+
+    It is known for the shipped detector alone with the shipped pose estimator.
+    """
+    shipped = settings.detector == ("embedded",) and settings.pose == "embedded"
+    return SHIPPED_SCORE_MAP if shipped else None
 
 
 def _pose(settings: DetectionSettings) -> PoseEstimator:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -12,8 +12,14 @@ from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.enlargement import Part, SeesParts, expect_parts
-from worldpose.detection.interfaces import Detector, FindsOccludedPeople, People, PoseEstimator
-from worldpose.detection.models import load_detectors, load_pose
+from worldpose.detection.interfaces import (
+    Detector,
+    FindsOccludedPeople,
+    People,
+    PoseEstimator,
+    ScoreMap,
+)
+from worldpose.detection.models import load_detectors, load_pose, load_score_map
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.views import TiledDetector
@@ -150,14 +156,20 @@ class PeopleFinder:
     """
 
     def __init__(
-        self, detectors: Sequence[Detector], estimator: PoseEstimator, settings: DetectionSettings
+        self,
+        detectors: Sequence[Detector],
+        estimator: PoseEstimator,
+        settings: DetectionSettings,
+        score_map: ScoreMap | None = None,
     ) -> None:
         """Combine detectors, an estimator and settings.
 
         Args:
             detectors: one, or an ensemble.
             estimator: finds keypoints in boxes.
-            settings: settings of the stage.
+            settings: settings of the stage. Its thresholds apply to the nets' own scores.
+            score_map: makes probabilities of the scores of the people found, at the very end;
+                None = not known, scores stay.
         """
         self._detectors = [
             detector
@@ -165,7 +177,7 @@ class PeopleFinder:
             else TiledDetector(detector, settings.zooms, settings.view_overlap, settings.nms_iou)
             for detector in detectors
         ]
-        self._estimator, self._settings = estimator, settings
+        self._estimator, self._settings, self._score_map = estimator, settings, score_map
         self._parts: list[Part] | None = None
         self.report = DetectionReport()
 
@@ -255,7 +267,10 @@ class PeopleFinder:
         distinct = suppress_poses(found, settings.min_keypoint_confidence, settings.oks_nms)
         self.report.unsure += len(found.score) - len(distinct.score)
         best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
-        return distinct.select(best)
+        kept = distinct.select(best)
+        if self._score_map is None:
+            return kept
+        return replace(kept, score=self._score_map.probability(kept.score))
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
         """Return the detections of frames in one record, padded to `max_people` with NaN."""
@@ -297,7 +312,9 @@ def detect_people(
     Raises:
         InputError: a net or its file is missing or invalid.
     """
-    finder = PeopleFinder(load_detectors(settings), load_pose(settings), settings)
+    finder = PeopleFinder(
+        load_detectors(settings), load_pose(settings), settings, load_score_map(settings)
+    )
     place = None if camera is None or pitch is None else Place(camera, pitch)
     chunks = list(finder.find(enumerate(images), place))
     if not chunks:

@@ -21,12 +21,14 @@ from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
     LineSamples,
+    PaintNoise,
+    PaintUnknowns,
     ProjectedLines,
     clear,
     project_lines,
+    stated_noise,
     white_structures,
 )
-from worldpose.static_calibration.paint_noise import PaintNoise, PaintUnknowns, stated_noise
 from worldpose.static_calibration.parameters import (
     CameraOnPitch,
     by_step,

@@ -22,7 +22,7 @@ from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, weight_residuals
-from worldpose.static_calibration.paint_noise import FIRST_KNOT
+from worldpose.static_calibration.line_samples import FIRST_KNOT
 from worldpose.static_calibration.parameters import CameraOnPitch, step_camera
 from worldpose.static_calibration.residuals import SIZE
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from worldpose.tracking.joins import describe_doubts
     from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
     from worldpose.tracking.settings import TrackingSettings
+    from worldpose.tracking.shirts import measure_shirts
     from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "estimate_plane_clocks",
     "locate_feet",
     "locate_tracks",
+    "measure_shirts",
     "track_on_plane",
     "track_people",
     "triangulated_places",
@@ -68,6 +70,7 @@ __getattr__ = import_on_use(
             "estimate_plane_clocks",
         ),
         "worldpose.tracking.settings": ("TrackingSettings",),
+        "worldpose.tracking.shirts": ("measure_shirts",),
         "worldpose.tracking.tracker": (
             "Tracking",
             "TrackingReport",

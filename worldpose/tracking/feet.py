@@ -67,6 +67,8 @@ class GroundPositions:
         is_whole: (frames, cameras, detections), False for a part of a person: cut by the image
             border, or overlapping a surer detection. None = all are whole.
         boxes: (frames, cameras, detections, 4) [px]; None = not known.
+        shirts: (frames, cameras, detections, 3) colours of upper bodies [CIELAB]; NaN where hidden,
+            None = not known.
     """
 
     xy: Floats
@@ -75,6 +77,7 @@ class GroundPositions:
     height: Floats
     is_whole: Flags | None = None
     boxes: Floats | None = None
+    shirts: Floats | None = None
 
     @classmethod
     def concatenate(cls, parts: Sequence[GroundPositions]) -> GroundPositions:
@@ -82,6 +85,8 @@ class GroundPositions:
         names = ["xy", "noise", "calibration", "height"]
         if all(part.boxes is not None for part in parts):
             names += ["is_whole", "boxes"]
+        if all(part.shirts is not None for part in parts):
+            names.append("shirts")
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 

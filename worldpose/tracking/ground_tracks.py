@@ -25,6 +25,7 @@ from worldpose.tracking.plane_paths import (
     merge_paths,
     track_height,
 )
+from worldpose.tracking.shirts import ShirtMemory, ShirtModel
 
 HIPS: Final = [11, 12]
 """The hips in COCO-17."""
@@ -100,11 +101,11 @@ class _Sight:
 
     @classmethod
     def of(
-        cls, positions: GroundPositions, frame: int, camera: int, detection: int, colour: float
+        cls, positions: GroundPositions, frame: int, camera: int, detection: int, inflation: float
     ) -> _Sight:
         """Return a detection, with the inflation of correlated errors."""
         where = (frame, camera, detection)
-        return cls(positions.xy[where], colour * positions.noise[where])
+        return cls(positions.xy[where], inflation * positions.noise[where])
 
     @classmethod
     def at_place(cls, place: Floats) -> _Sight:
@@ -129,6 +130,8 @@ class _Track:
     """By frame: predicted state and covariance, updated state and covariance."""
     index: dict[int, dict[int, int]] = field(default_factory=dict)
     """Frame to camera to detection."""
+    shirts: dict[int, ShirtMemory] = field(default_factory=dict)
+    """Colour of the shirt by camera."""
 
     @classmethod
     def start(cls, sight: _Sight, frame: int) -> _Track:
@@ -183,9 +186,9 @@ def track_on_plane(
     """Return the tracks of people by their feet (T1, without triangulation).
 
     A Kalman filter at constant velocity predicts each person. In every frame, each camera in turn
-    gives its detections to the predicted people by the Hungarian method; the remaining detections
-    start people. A backward pass smooths each track. Tracks of two cameras that stay together are
-    one person.
+    gives its detections to the predicted people by the Hungarian method, by place and, where known,
+    by the colour of the shirt; the remaining detections start people. A backward pass smooths each
+    track. Tracks of two cameras that stay together are one person.
 
     A triangulated person is a track as well, which takes the detections near it and continues where
     triangulation ends. A track by feet that meets a person who begins to be triangulated becomes
@@ -205,7 +208,8 @@ def track_on_plane(
     frames, cameras = positions.xy.shape[:2]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
     dt = 1.0 / fps
-    move, drift, colour = _motion(fps)
+    move, drift, inflation = _motion(fps)
+    shirts = _learn_shirts(positions)
     running: list[_Track] = []
     ended: list[_Track] = []
     for frame in range(frames):
@@ -214,7 +218,7 @@ def track_on_plane(
         if triangulated is not None:
             _follow_triangulated(running, triangulated.xy[frame], frame)
         for c in range(cameras):
-            _update(running, positions, frame, c, float(clocks[c]), colour)
+            _update(running, positions, (frame, c), float(clocks[c]), inflation, shirts[c])
         lost = [track for track in running if _is_lost(track, frame, dt)]
         ended += lost
         running = [track for track in running if track not in lost]
@@ -296,7 +300,7 @@ def locate_tracks(
     """
     cameras, persons = detection_index.shape[1:]
     clocks = np.zeros(cameras) if clock_s is None else np.asarray(clock_s, dtype=np.float64)
-    move, drift, colour = _motion(fps)
+    move, drift, inflation = _motion(fps)
     paths = []
     for person in range(persons):
         index = detection_index[:, :, person]
@@ -319,7 +323,7 @@ def locate_tracks(
                 detection = int(index[frame, camera])
                 if not np.isfinite(positions.xy[frame, camera, detection, 0]):
                     continue
-                sight = _Sight.of(positions, frame, camera, detection, colour)
+                sight = _Sight.of(positions, frame, camera, detection, inflation)
                 if track is None:
                     track = _Track.start(sight, frame)
                 else:
@@ -346,27 +350,53 @@ def _is_lost(track: _Track, frame: int, dt: float) -> bool:
     return (frame - track.last_seen) * dt > MAX_LOST_S
 
 
+def _learn_shirts(positions: GroundPositions) -> list[ShirtModel | None]:
+    """Return the statistics of colours in each camera; None where they are not known."""
+    if positions.shirts is None:
+        return [None] * positions.xy.shape[1]
+    return [
+        ShirtModel.learn(positions.shirts[:, c], positions.xy[:, c])
+        for c in range(positions.xy.shape[1])
+    ]
+
+
 def _update(
     tracks: list[_Track],
     positions: GroundPositions,
-    frame: int,
-    camera: int,
+    image: tuple[int, int],
     clock: float,
-    colour: float,
+    inflation: float,
+    shirts: ShirtModel | None,
 ) -> None:
-    """Match the detections of one camera with people; the others start people.
+    """Match the detections of one image with people; the others start people.
 
     Detections of parts of people come last and start no track: most are a second box of the same
     person.
+
+    Args:
+        tracks: people before the image; those who appear are added.
+        positions: the clip's foot positions.
+        image: frame and camera.
+        clock: time of the image minus time of the frame [s].
+        inflation: factor on the noise of a place, for correlated errors [1].
+        shirts: statistics of colours in this camera; None = not known.
     """
+    frame, camera = image
     seen = np.isfinite(positions.xy[frame, camera, :, 0])
     whole = seen if positions.is_whole is None else seen & positions.is_whole[frame, camera]
+    colours = None
+    if shirts is not None and positions.shirts is not None:
+        colours = positions.shirts[frame, camera]
     unseen = tracks
     for is_whole, chosen in ((True, whole), (False, seen & ~whole)):
         here = np.flatnonzero(chosen)
-        sights = [_Sight.of(positions, frame, camera, int(d), colour) for d in here]
+        sights = [_Sight.of(positions, frame, camera, int(d), inflation) for d in here]
         lasting = positions.calibration[frame, camera, here]
-        pairs = {column: row for row, column in _match(unseen, sights, lasting, clock)}
+        odds = None
+        if shirts is not None and colours is not None and unseen:
+            known = [track.shirts.get(camera) for track in unseen]
+            odds = np.stack([shirts.same_person(each, colours[here]) for each in known])
+        pairs = {column: row for row, column in _match(unseen, sights, lasting, clock, odds)}
         taken = set()
         for column, sight in enumerate(sights):
             if column in pairs:
@@ -378,12 +408,18 @@ def _update(
             else:
                 continue
             track.note(frame, camera, int(here[column]), is_whole=is_whole)
+            if colours is not None:
+                track.shirts.setdefault(camera, ShirtMemory()).see(colours[here[column]])
             taken.add(id(track))
         unseen = [track for track in unseen if id(track) not in taken]
 
 
 def _match(
-    tracks: list[_Track], sights: list[_Sight], lasting: Floats, clock: float
+    tracks: list[_Track],
+    sights: list[_Sight],
+    lasting: Floats,
+    clock: float,
+    shirts: Floats | None = None,
 ) -> list[tuple[int, int]]:
     """Return pairs of track and sight by the Hungarian method, within the gate.
 
@@ -392,6 +428,8 @@ def _match(
         sights: detections of one camera.
         lasting: (sights, 2, 2) [m^2], error that does not change from frame to frame.
         clock: time of the image minus time of the frame [s].
+        shirts: (tracks, sights), log odds that the shirts of a pair are one person's; None = not
+            known.
     """
     if not tracks or not sights:
         return []
@@ -404,9 +442,12 @@ def _match(
     off = places[None] - (states @ look.T)[:, None]
     squared = np.einsum("tdi,tdij,tdj->td", off, np.linalg.inv(total), off)
     size = np.log(np.linalg.det(total))
-    cost = np.where(squared < GATE, squared + size, GATE + size.max() + 1.0)
+    other = np.zeros_like(squared) if shirts is None else -2.0 * shirts
+    # Shirts that differ count towards the gate; shirts that agree do not widen it.
+    near = squared + np.maximum(other, 0.0) < GATE
+    cost = np.where(near, squared + size + other, GATE + size.max() + 1.0)
     pairs = zip(*linear_sum_assignment(cost), strict=True)
-    return [(int(row), int(column)) for row, column in pairs if squared[row, column] < GATE]
+    return [(int(row), int(column)) for row, column in pairs if near[row, column]]
 
 
 def _follow_triangulated(tracks: list[_Track], places: Floats, frame: int) -> None:

@@ -36,10 +36,12 @@ class TrackingSettings(Record):
     birth_views: int = Field(default=3, ge=2, le=1000)
     """Cameras that must agree on a new person [1]; `pair_odds` decides about two. Two rays alone
     also intersect where no person is."""
-    pair_odds: float = Field(default=10.0, ge=1, le=1000)
+    pair_odds: float = Field(default=3.0, ge=1, le=1000)
     """Odds from which two views of a new person count as much as three [1]: that the rays of one
     person pass at that distance, with limbs of that size and undetected by the cameras that should
-    see it, against no partner and against every other pair that has one of the two detections."""
+    see it, against no partner and against every other pair that has one of the two detections. In
+    single frames of pairs of Shelf's cameras 3 finds 98 % of people and 10 finds 89 %, with as few
+    false ones; lower odds find hardly more."""
     pair_evidence: float = Field(default=0.2, ge=0, le=1)
     """Weight towards `min_track_s` of a frame with two views at lower odds [1], unless other pairs
     explain its detections better. Mean IDF1 of simulated clips with few cameras or occluded people:

@@ -79,7 +79,10 @@ def stored_people(
     estimator: PoseEstimator,
     settings: DetectionSettings | None = None,
 ) -> People:
-    """Return the people in an image as the stage stores them, the crowd included."""
+    """Return the people in an image as the stage stores them, the crowd included.
+
+    Scores are those before `ScoreMap`.
+    """
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
     people = People(people.boxes[kept], people.scores[kept])
@@ -181,6 +184,32 @@ def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
         elif np.any(row[~wanted] >= MIN_TRUE_IOU):
             verdict[index] = -1
     return verdict
+
+
+def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags, Flags]:
+    """Return scores and verdicts of boxes that count, best first, and which people were found.
+
+    A box is right if it overlaps a person by `MIN_TRUE_IOU` whom no better box has. Boxes on
+    ignored people do not count.
+
+    Args:
+        people: detections in an image.
+        picture: the truth of the image.
+    """
+    order = np.argsort(-people.scores, kind="stable")
+    overlap = box_iou(people.boxes[order], picture.boxes)
+    free = ~picture.ignored
+    scores, right = [], []
+    for row, score in zip(overlap, people.scores[order], strict=True):
+        best = int(np.where(free, row, -1.0).argmax()) if len(row) else 0
+        hit = bool(len(row)) and bool(free[best]) and row[best] >= MIN_TRUE_IOU
+        if hit:
+            free[best] = False
+        elif np.any(row[picture.ignored] >= MIN_TRUE_IOU):
+            continue
+        scores.append(score)
+        right.append(hit)
+    return np.array(scores), np.array(right, dtype=np.bool_), ~picture.ignored & ~free
 
 
 def torso_sizes(keypoints: Floats) -> Floats:

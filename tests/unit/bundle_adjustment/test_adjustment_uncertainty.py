@@ -8,9 +8,13 @@ import pytest
 from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import step_camera
-from worldpose.static_calibration.line_samples import project_lines, sample_markings, thin_samples
+from worldpose.static_calibration.line_samples import (
+    EXACT_PAINT,
+    project_lines,
+    sample_markings,
+    thin_samples,
+)
 from worldpose.static_calibration.line_search import adjust
-from worldpose.static_calibration.paint_noise import EXACT_PAINT
 
 SURVEY_ERROR = 0.006
 

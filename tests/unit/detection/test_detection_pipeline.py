@@ -7,6 +7,8 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
+from worldpose.detection.interfaces import ScoreMap
+from worldpose.detection.models import SHIPPED_SCORE_MAP, load_score_map
 from worldpose.detection.pipeline import on_pitch
 from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
 from worldpose.formats.calibration_files import build_camera
@@ -147,6 +149,47 @@ def test_boxes_are_those_of_who_looked_closer():
     wanted = [[8.0, 10.0, 32.0, 60.0], [100.0, 10.0, 120.0, 60.0]]
     np.testing.assert_allclose(stretch.boxes[1, :2], wanted)
     np.testing.assert_allclose(stretch.score[1, :2], np.cbrt(0.9 * 0.4 * 0.8), rtol=1e-6)
+
+
+def test_a_score_map_changes_logits_linearly():
+    score = np.array([0.2, 0.5, 0.9, np.nan])
+    found = ScoreMap(slope=2.0, offset=1.0).probability(score)
+    # Odds of 1/4, 1 and 9, squared and times e.
+    odds = np.e * np.array([1.0 / 16.0, 1.0, 81.0])
+    np.testing.assert_allclose(found[:3], odds / (1.0 + odds))
+    assert np.isnan(found[3])
+    edge = ScoreMap(slope=4.0, offset=-1.0).probability(np.array([0.0, 1e-9, 1.0]))
+    assert (edge > 0.0).all() and edge[2] == 1.0
+
+
+def test_a_score_map_changes_scores_alone_and_not_who_is_kept():
+    boxes = np.array(
+        [[10.0, 10.0, 30.0, 60.0], [100.0, 10.0, 120.0, 60.0], [50.0, 10.0, 70.0, 60.0]]
+    )
+    truth = LookingCloser([boxes] * 3, np.array([[0.9, 0.45, 0.3]] * 3))
+    blank = np.zeros((80, 160, 3), dtype=np.uint8)
+
+    def find(score_map):
+        finder = PeopleFinder([truth], truth, DetectionSettings(max_people=8), score_map)
+        return next(finder.find((n, blank) for n in range(3)))
+
+    plain, mapped = find(None), find(SHIPPED_SCORE_MAP)
+    assert np.isfinite(plain.score[1]).sum() == 2  # 0.3 begins no track
+    for name in ("keypoints", "confidence", "boxes"):
+        np.testing.assert_array_equal(getattr(mapped, name), getattr(plain, name))
+    wanted = SHIPPED_SCORE_MAP.probability(plain.score.astype(np.float64))
+    np.testing.assert_allclose(mapped.score, wanted, rtol=1e-4)
+    assert mapped.score[1, 0] > plain.score[1, 0] > 0.5 > mapped.score[1, 1]
+
+
+def test_only_the_shipped_pair_of_nets_has_a_known_score_map():
+    assert load_score_map(DetectionSettings()) == SHIPPED_SCORE_MAP
+    for other in (
+        {"detector": "embedded:other.safetensors"},
+        {"detector": ("embedded", "onnx:other.onnx")},
+        {"pose": "onnx:other.onnx"},
+    ):
+        assert load_score_map(DetectionSettings(**other)) is None
 
 
 def test_two_poses_of_one_person_are_alike_and_those_of_two_are_not():

@@ -19,9 +19,8 @@ from worldpose.static_calibration.curvature_correction import (
     free_on_pitch,
 )
 from worldpose.static_calibration.evidence import gather_evidence
-from worldpose.static_calibration.line_samples import project_lines, sample_markings
+from worldpose.static_calibration.line_samples import PaintNoise, project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
-from worldpose.static_calibration.paint_noise import PaintNoise
 from worldpose.static_calibration.parameters import step_camera
 
 SETTINGS = StaticCalibrationSettings()

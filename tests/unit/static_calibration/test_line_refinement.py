@@ -16,13 +16,14 @@ from worldpose.simulation.settings import RenderingSettings
 from worldpose.static_calibration.line_detection import brightness
 from worldpose.static_calibration.line_refinement import refine_on_lines
 from worldpose.static_calibration.line_samples import (
+    EXACT_PAINT,
+    PaintNoise,
     clear,
     project_lines,
     sample_markings,
     white_structures,
 )
 from worldpose.static_calibration.line_search import LineSearch, adjust
-from worldpose.static_calibration.paint_noise import EXACT_PAINT, PaintNoise
 from worldpose.static_calibration.parameters import (
     CameraEstimate,
     CameraOnPitch,

@@ -103,18 +103,28 @@ def test_causal_mode_knows_nothing_of_later_frames(ring, people, seen):
 def test_person_whom_two_cameras_see_is_found_but_slowly(ring, people, seen):
     keypoints, confidence = seen(ring(5), still(people, 60))
     keypoints[:, 2:, 2] = np.nan
+    # The odds of this pair are between three and ten.
+    settings = SETTINGS.model_copy(update={"pair_odds": 10.0})
     result = track_people(
-        ring(5), detections(keypoints, confidence), FPS, SETTINGS, pitch_size=(105.0, 68.0)
+        ring(5), detections(keypoints, confidence), FPS, settings, pitch_size=(105.0, 68.0)
     )
     assert sorted(owners(result)) == [0, 1, 2, 3]
     short = track_people(
         ring(5),
         detections(keypoints[:40], confidence[:40]),
         FPS,
-        SETTINGS,
+        settings,
         pitch_size=(105.0, 68.0),
     )
     assert sorted(owners(short)) == [0, 1, 3]
+    sooner = track_people(
+        ring(5),
+        detections(keypoints[:40], confidence[:40]),
+        FPS,
+        SETTINGS.model_copy(update={"pair_odds": 3.0}),
+        pitch_size=(105.0, 68.0),
+    )
+    assert sorted(owners(sooner)) == [0, 1, 2, 3]
 
 
 def test_cameras_that_drop_out_lose_nobody(ring, people, seen):

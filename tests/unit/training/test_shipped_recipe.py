@@ -96,3 +96,19 @@ def test_joints_are_labelled_where_three_views_agree(real_frames):
     np.testing.assert_allclose(keypoints[0, 1], [60.0, 50.0])
     assert np.isnan(keypoints[0, 0]).all()
     assert not visible[1].any()  # 39 px: too small
+
+
+def test_the_fit_of_a_score_map_finds_the_true_one_and_sources_weigh_alike(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE)
+    fit_score_map = importlib.import_module("score_map").fit_score_map
+    rng = np.random.default_rng(4)
+
+    def draw(count, slope, offset):
+        score = rng.uniform(0.05, 0.95, count)
+        odds = (score / (1.0 - score)) ** slope * np.exp(offset)
+        return score, rng.uniform(size=count) < odds / (1.0 + odds)
+
+    one = fit_score_map([draw(20_000, 3.0, -0.5)])
+    assert abs(one.slope - 3.0) < 0.15 and abs(one.offset + 0.5) < 0.1
+    both = fit_score_map([draw(20_000, 3.0, 1.0), draw(2_000, 3.0, -1.0)])
+    assert abs(both.offset) < 0.25

@@ -1,0 +1,203 @@
+"""Colours of shirts, which tell people apart where places on the pitch do not.
+
+A colour is the median over the upper body in CIELAB. How much one person's colour varies, and how
+much colours differ between people, is learned from the clip: where all wear the same, or colours
+are not known, they have no influence. A person in front may hide the shirt, so that no colour rules
+a match out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from data_contracts.arrays import AnyFloats, Floats, Image
+
+TORSO: Final = (5, 6, 11, 12)
+"""Shoulders and hips in COCO-17."""
+MIN_CONFIDENCE: Final = 0.3
+"""Least confidence of each of them; with less the box tells where the upper body is [1]."""
+GRID: Final = (7, 9)
+"""Samples across and along the upper body."""
+ALONG: Final = (0.1, 0.75)
+"""Part from the shoulders to the hips that is sampled [1]: neither collar nor shorts."""
+WIDTH: Final = 0.3
+"""Width of a trunk seen from the side, relative to its length [1]."""
+INNER: Final = 0.7
+"""Share of the trunk's width that is sampled [1]."""
+BOX_TORSO: Final = (0.18, 0.48, 0.35)
+"""Shoulders, hips and width of the trunk in a box: from its top, relative to its height, and
+relative to its width [1]."""
+BORDER: Final = 2.0
+"""A box so near to a side of the image is cut off by it [px]."""
+MIN_SAMPLES: Final = 32
+"""Least number of samples for a colour: half of the grid, the others are hidden."""
+LEAST_STD: Final = np.array([4.0, 2.0, 2.0])
+"""Least standard deviation of one person's colour [1, CIELAB]: noise of a small image."""
+LASTING: Final = 2.0
+"""Standard deviation of one person's colour over the clip, relative to that between two frames [1]:
+front, back and light differ by more than two neighbouring frames do."""
+NEXT_M: Final = 0.5
+"""Farther mutual nearest neighbours of two frames are not taken as one person [m]."""
+MIN_PAIRS: Final = 30
+"""Least number of such pairs, and of colours, from which a clip's statistics are learned."""
+USUAL: Final = 7.8
+"""Squared distance of one person's colours, 95 % of three dimensions [1]."""
+MAX_SQUARED: Final = 100.0
+"""Largest squared distance that counts: two shirts that differ so are of two people [1]."""
+DOUBT: Final = 0.05
+"""Share of colours that tell nothing [1]: of the person in front, or of another's limb."""
+MAX_SAMPLE: Final = 300
+"""Largest sample of a clip's colours, evenly over its frames."""
+MEMORY_FRAMES: Final = 25
+"""A person's colour is the median over so many sightings."""
+MIN_SIGHTINGS: Final = 3
+"""Sightings from which on a person's colour is known: one may show the background."""
+
+
+def measure_shirts(
+    image: Image, keypoints: AnyFloats, confidence: AnyFloats, boxes: AnyFloats
+) -> Floats:
+    """Return the colours of people's upper bodies (people, 3) [CIELAB]; NaN where hidden.
+
+    Samples within the box of a person who stands nearer to the camera do not count. A person whom a
+    side of the image cuts off has no colour: the trunk is not where the keypoints put it.
+
+    Args:
+        image: (height, width, 3) RGB.
+        keypoints: (people, 17, 2) [px].
+        confidence: (people, 17).
+        boxes: (people, 4) x0, y0, x1, y1 [px]; NaN rows are no people.
+    """
+    import cv2  # late: it takes 0.2 s, and planning a run does not need it
+
+    colours = np.full((len(boxes), 3), np.nan)
+    there = np.flatnonzero(np.isfinite(boxes).all(axis=1))
+    size = np.array([image.shape[1], image.shape[0]])
+    whole = there[(boxes[there, 0] > BORDER) & (boxes[there, 2] < size[0] - 1.0 - BORDER)]
+    for person in whole:
+        places = _sample(keypoints[person], confidence[person], boxes[person])
+        cells = np.rint(places).astype(np.int64)
+        kept = ((cells >= 0) & (cells < size)).all(axis=1)
+        for other in there:
+            if boxes[other, 3] > boxes[person, 3]:
+                inside = (places >= boxes[other, :2]) & (places <= boxes[other, 2:])
+                kept &= ~inside.all(axis=1)
+        if np.count_nonzero(kept) < MIN_SAMPLES:
+            continue
+        seen = image[cells[kept, 1], cells[kept, 0]].astype(np.float32) / 255.0
+        colours[person] = np.median(cv2.cvtColor(seen[None], cv2.COLOR_RGB2LAB)[0], axis=0)
+    return colours
+
+
+def _sample(keypoints: AnyFloats, confidence: AnyFloats, box: AnyFloats) -> Floats:
+    """Return places on a person's upper body (samples, 2) [px]."""
+    torso = np.asarray(keypoints[list(TORSO)], dtype=np.float64)
+    known = np.asarray(confidence[list(TORSO)]) >= MIN_CONFIDENCE
+    if known.all() and np.isfinite(torso).all():
+        top, bottom = torso[:2].mean(axis=0), torso[2:].mean(axis=0)
+        length = float(np.linalg.norm(bottom - top))
+        spans = np.linalg.norm(torso[[0, 2]] - torso[[1, 3]], axis=1)
+        wide = max(float(spans.max()), WIDTH * length)
+    else:
+        left, upper, right, lower = (float(side) for side in box)
+        middle, tall = 0.5 * (left + right), lower - upper
+        top = np.array([middle, upper + BOX_TORSO[0] * tall])
+        bottom = np.array([middle, upper + BOX_TORSO[1] * tall])
+        length = float(np.linalg.norm(bottom - top))
+        wide = BOX_TORSO[2] * (right - left)
+    ahead = (bottom - top) / max(length, 1e-6)
+    across = np.array([-ahead[1], ahead[0]])
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, GRID[0]), np.linspace(ALONG[0], ALONG[1], GRID[1]))
+    middle_line = top + v.reshape(-1, 1) * (bottom - top)
+    return np.asarray(middle_line + INNER * wide * u.reshape(-1, 1) * across)
+
+
+class ShirtMemory:
+    """Colour of one person in one camera: the median of the last sightings."""
+
+    def __init__(self) -> None:
+        self._seen: deque[Floats] = deque(maxlen=MEMORY_FRAMES)
+
+    def see(self, shirt: Floats) -> None:
+        """Add a colour (3,) [CIELAB]; NaN changes nothing."""
+        if np.isfinite(shirt).all():
+            self._seen.append(shirt)
+
+    @property
+    def colour(self) -> Floats | None:
+        """Return the colour (3,) [CIELAB]; None before `MIN_SIGHTINGS`."""
+        if len(self._seen) < MIN_SIGHTINGS:
+            return None
+        return np.asarray(np.median(self._seen, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class ShirtModel:
+    """Statistics of the colours in a clip.
+
+    Attributes:
+        within: (3,) standard deviation of one person's colour [CIELAB].
+        anyone: (colours, 3) a sample of the colours of all people: two teams are two clusters.
+    """
+
+    within: Floats
+    anyone: Floats
+
+    @classmethod
+    def learn(cls, shirts: Floats, xy: Floats) -> ShirtModel | None:
+        """Return the statistics of one camera's clip; None with too few colours.
+
+        One person's variation is that between mutual nearest neighbours of two frames in sequence.
+
+        Args:
+            shirts: (frames, detections, 3) [CIELAB]; NaN where not known.
+            xy: (frames, detections, 2) places [m]; NaN where not known.
+        """
+        known = np.asarray(np.isfinite(shirts).all(axis=-1) & np.isfinite(xy).all(axis=-1))
+        changes = [np.empty((0, 3))]
+        for frame in range(len(shirts) - 1):
+            a, b = (np.flatnonzero(known[at]) for at in (frame, frame + 1))
+            if not len(a) or not len(b):
+                continue
+            one, two = xy[frame, a], xy[frame + 1, b]
+            distance, nearest = KDTree(two).query(one)
+            _, back = KDTree(one).query(two)
+            mutual = (back[nearest] == np.arange(len(a))) & (distance <= NEXT_M)
+            changes.append(shirts[frame + 1, b[nearest[mutual]]] - shirts[frame, a[mutual]])
+        change, everyone = np.concatenate(changes), shirts[known]
+        if min(len(change), len(everyone)) < MIN_PAIRS:
+            return None
+        # The difference of two colours has twice the variance of one.
+        spread = 1.4826 * np.median(np.abs(change), axis=0) / np.sqrt(2.0)
+        chosen = np.linspace(0, len(everyone) - 1, min(len(everyone), MAX_SAMPLE)).astype(np.int64)
+        return cls(LASTING * np.maximum(spread, LEAST_STD), everyone[chosen])
+
+    def same_person(self, memory: ShirtMemory | None, shirts: Floats) -> Floats:
+        """Return log odds (n,) that colours (n, 3) are those of a person and not of anyone.
+
+        Zero where the person's colour or the other one is not known.
+        """
+        result = np.zeros(len(shirts))
+        known = np.isfinite(shirts).all(axis=-1)
+        colour = None if memory is None else memory.colour
+        if colour is None or not known.any():
+            return result
+        own = self._likeness(shirts[known], colour[None])[:, 0]
+        others = self._likeness(shirts[known], self.anyone)
+        odds = own - np.log(np.exp(others).mean(axis=1))
+        result[known] = np.logaddexp(np.log(1.0 - DOUBT) + odds, np.log(DOUBT))
+        return result
+
+    def _likeness(self, first: Floats, second: Floats) -> Floats:
+        """Return log likelihoods (n, m) of colours (n, 3) and (m, 3) to be one person's.
+
+        They are equal for all pairs that differ as one person's colours do: two players of one
+        team must not be told apart by their shading.
+        """
+        squared = np.square((first[:, None] - second) / self.within).sum(axis=-1)
+        return np.asarray(-0.5 * np.clip(squared - USUAL, 0.0, MAX_SQUARED))
