@@ -1,0 +1,62 @@
+"""Cameras found without a click in real images and lines; skipped where the data is absent.
+
+WORLDPOSE_TEST_DATA names a folder with `static_pair`, `wc14` and `sn22_lines`.
+"""
+
+import argparse
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import static_pair
+
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import calibrate_without_clicks
+from worldpose.video import median_picture, open_video
+
+DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    sys.path.insert(0, str(BENCHMARKS))
+    spec = importlib.util.spec_from_file_location("proposals", BENCHMARKS / "proposals.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["proposals"] = module
+    spec.loader.exec_module(module)
+    yield module
+    sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.mark.skipif(
+    not (DATA / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair"
+)
+def test_a_wide_static_camera_is_found_without_a_click_and_without_its_lens():
+    with open_video(DATA / "static_pair" / "right_camera.mp4") as video:
+        pictures = (
+            picture
+            for number in range(0, 150, 15)
+            for _, picture in video.frames(number, number + 1)
+        )
+        still = median_picture(pictures, 10)
+    found = calibrate_without_clicks(PitchTemplate.standard(), still, side="near")
+    # 26 clicks by hand place it at (-1.0, -49.4, 7.6) m.
+    assert np.linalg.norm(found.estimate.camera.center - [-1.0, -49.4, 7.6]) < 0.5
+    assert not found.report.weak
+    assert still.shape == (static_pair.SIZE[1], static_pair.SIZE[0], 3)
+
+
+@pytest.mark.skipif(
+    not ((DATA / "wc14").is_dir() and (DATA / "sn22_lines").is_dir()),
+    reason="WORLDPOSE_TEST_DATA has no drawn lines",
+)
+def test_drawn_lines_without_names_give_their_cameras_and_no_wrong_one(bench):
+    options = argparse.Namespace(first=0, count=10, drop=0.2, clutter=4)
+    outcomes = list(bench.drawn_lines(DATA, options))
+    accepted = [each for each in outcomes if each.accepted]
+    assert len(accepted) >= 6
+    assert max(each.error for each in accepted) < bench.RIGHT_PX
