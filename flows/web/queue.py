@@ -186,7 +186,6 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
         )
     folder = match.folder
     corrections, first_clicks = count_corrections(match)
-    clicked = {**folder.calibrations, **folder.clicked}
     return {
         "match": match.match_id,
         "problem": None,
@@ -201,7 +200,7 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
             "failed": len(latest.failed),
         },
         "waiting": waiting,
-        "to_click": [each.id for each in folder.spec.static_cameras if each.id not in clicked],
+        "to_click": list(folder.to_click),
         "corrections": corrections,
         "first_clicks": first_clicks,
         "stale": len(match.stale),

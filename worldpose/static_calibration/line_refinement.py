@@ -355,6 +355,10 @@ def _judge(
     # Pixels drawn along a detected line measure the same paint less accurately.
     read = {each.name for each in lines.markings if each.found}
     other = np.array([name not in read for name in problem.evidence.markings], dtype=bool)
+    if not len(inliers):
+        # Without points the drawn pixels hold the camera while the lines are searched again.
+        other[:] = True
+        wider = scale_noise(problem, _WIDER[-1], settings)[0]
     rest = wider.select(inliers, fit.markings & other)
     scale = fit.noise_scale
     known = linearize_at(rest, row, scale, prior)
