@@ -61,6 +61,8 @@ seen.message = await page.locator("label.wrong .said").innerText();
 await shoot(page, "wrong");
 await page.fill('[data-field="match_id"]', "cup_final");
 await page.waitForSelector("text=Nothing is missing");
+await page.locator("select[data-side]").first().selectOption("far");
+await page.waitForSelector("text=Nothing is missing");
 for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   await page.setViewportSize({ width, height });
   seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
