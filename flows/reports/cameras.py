@@ -152,9 +152,12 @@ def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:
 
 
 def _clicked_places(store: Store, run: Run, camera_id: str) -> dict[str, NDArray[np.float64]]:
-    """Return the clicks that the run used: those of the folder may have changed since."""
+    """Return the clicks that the run used: those of the folder may have changed since.
+
+    A camera without clicks was proposed from its image.
+    """
     record = run.record
     key = record.results[f"static_calibration/{camera_id}"]
     recipe = store.manifest(record.match_id, "static_calibration", camera_id, key).recipe
-    (clicked,) = cast("dict[str, Any]", recipe.sources["clicked"]).values()
-    return {name: np.array(place) for name, place in clicked["points"].items()}
+    files = cast("dict[str, Any]", recipe.sources["clicked"]).values()
+    return {name: np.array(place) for file in files for name, place in file["points"].items()}

@@ -351,9 +351,10 @@ def _rank_rolled(
 def _order(
     paint: PaintMap, samples: LineSamples, found: Candidates, scores: Floats
 ) -> tuple[Candidates, Floats]:
-    """Return different cameras, the best first, and their scores (k,)."""
+    """Return different cameras on the near side, the best first, and their scores (k,)."""
     order = np.argsort(-scores, kind="stable")
-    found, scores = found[order], scores[order]
+    # Behind a goal refinement moves cameras across the long axis: half a turn makes them equal.
+    found, scores = _stand_on(found[order], "near"), scores[order]
     different = _different(paint, samples, found)
     return found[different], scores[different]
 

@@ -108,6 +108,16 @@ def test_half_a_turn_about_the_centre_spot_is_decided_by_the_side():
     np.testing.assert_allclose(far.project(feet() * [-1.0, -1.0, 1.0]), there, atol=1e-6)
 
 
+def test_a_camera_behind_a_goal_is_not_its_own_rival_after_half_a_turn():
+    behind = camera((-62.0, -2.5, 14.7), (-28.0, 6.0, 0.0), 900.0)
+    proposal = propose_from_paint(
+        [paint_of(behind, [*PITCH.lines, *PITCH.arcs])], PITCH, side="left"
+    )
+    assert proposal is not None
+    assert proposal.is_clear
+    assert np.linalg.norm(proposal.camera.center - behind.center) < 1.0
+
+
 def test_drawn_pixels_lie_on_the_markings_that_they_name():
     proposal = propose_camera(still(), PITCH, side="near")
     assert len(proposal.drawn.drawn) >= 5
