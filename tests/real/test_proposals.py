@@ -44,7 +44,7 @@ def test_a_wide_static_camera_is_found_without_a_click_and_without_its_lens():
         )
         still = median_picture(pictures, 10)
     found = calibrate_without_clicks(PitchTemplate.standard(), still, side="near")
-    # 26 clicks by hand place it at (-1.0, -49.4, 7.6) m.
+    # 39 clicks by hand place it at (-1.0, -49.4, 7.6) m.
     assert np.linalg.norm(found.estimate.camera.center - [-1.0, -49.4, 7.6]) < 0.5
     assert not found.report.weak
     assert still.shape == (static_pair.SIZE[1], static_pair.SIZE[0], 3)
