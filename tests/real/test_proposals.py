@@ -46,7 +46,7 @@ def test_a_wide_static_camera_is_found_without_a_click_and_without_its_lens():
     found = calibrate_without_clicks(PitchTemplate.standard(), still, side="near")
     # 39 clicks by hand place it at (-1.0, -49.4, 7.6) m.
     assert np.linalg.norm(found.estimate.camera.center - [-1.0, -49.4, 7.6]) < 0.5
-    assert not found.report.weak
+    assert found.report.ground_error.median < 0.4  # seen: 0.26 m stated, 0.13 m from the clicked
     assert still.shape == (static_pair.SIZE[1], static_pair.SIZE[0], 3)
 
 
