@@ -21,6 +21,7 @@ from worldpose.reports.static_cameras import (
     plot_calibration,
     plot_paint,
 )
+from worldpose.static_calibration.proposal import PROPOSED
 from worldpose.store import Run, Store
 
 SHOWN = 2
@@ -44,7 +45,7 @@ def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
         summaries.append(
             CameraSummary(
                 camera.id,
-                _ORIGINS[attributes["origin"]],
+                _origin(attributes),
                 figures.get("expected_ground_error_median_m"),
                 figures.get("expected_ground_error_p95_m"),
                 figures.get("reprojection_rms_px"),
@@ -54,6 +55,14 @@ def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
             )
         )
     return summaries
+
+
+def _origin(attributes: Mapping[Any, Any]) -> str:
+    """Return what a camera was calibrated from, given the attributes of its result."""
+    said = _ORIGINS[attributes["origin"]]
+    decisions = attributes["decisions"] or [""]
+    is_proposed = str(decisions[0]).startswith(PROPOSED)
+    return said.replace("clicks", "proposed markings") if is_proposed else said
 
 
 def _reasons(run: Run, camera_id: str) -> tuple[str, ...]:

@@ -46,10 +46,11 @@ _FOCALS: Final = np.geomspace(0.45, 5.0, 13)
 _ROLLS: Final = ((0.0,), (-0.14, -0.07, 0.07, 0.14))
 """Rolls to try, and those to try as well while the proposal is not clear [rad]: cameras on masts
 hang 4 to 8 degrees off the level."""
-_CLEAR: Final = 25.0
-"""Minimum margin of a clear proposal [1]."""
+PROPOSED: Final = "markings proposed from the image"
+"""How the first decision of a camera without clicks begins."""
 MIN_MARGIN: Final = 25.0
-"""Minimum margin of a proposal to be used without a click [1]."""
+"""Minimum margin of a proposal to be used without a click [1]; below, more rolls and lenses are
+tried."""
 MIN_FOUND: Final = 0.6
 """Minimum share of its markings on paint [1]."""
 MIN_EXPLAINED: Final = 0.25
@@ -255,7 +256,7 @@ def calibrate_without_clicks(
             todo=_TO_CLICK,
         )
     decision = (
-        f"markings proposed from the image: {proposal.found:.0%} of their length on paint, "
+        f"{PROPOSED}: {proposal.found:.0%} of their length on paint, "
         f"{proposal.margin:.0f} above other cameras"
     )
     report = calibration.report
@@ -285,7 +286,7 @@ def _rank_under_lenses(
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        if best is not None and best[2][0] - _second(best[2]) > _CLEAR:
+        if best is not None and best[2][0] - _second(best[2]) >= MIN_MARGIN:
             break
     return best
 
@@ -307,7 +308,7 @@ def rank_cameras(
         focals: focal lengths to try, in image widths [1]; a single one is kept.
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
-    if len(scores) and scores[0] - _second(scores) > _CLEAR:
+    if len(scores) and scores[0] - _second(scores) >= MIN_MARGIN:
         return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
     return _order(

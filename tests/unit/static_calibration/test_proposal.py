@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -219,4 +218,3 @@ def test_nothing_is_drawn_where_nothing_is_found():
     assert paint.segments.shape == (0, 2, 2)
     assert paint.area.all()
     assert propose_from_paint([paint], PITCH, side="near") is None
-    assert ClickedMarkings() == ClickedMarkings(drawn=())
