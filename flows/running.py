@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -177,7 +176,7 @@ def _machines(
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
     server = prefect_server(store.url, is_local=request.dask is None)
-    with _ending_at_once(), server as wait_until_ready, ExitStack() as stack:
+    with ending_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more
         if request.dask is None:
@@ -206,7 +205,7 @@ def _no_more(workers: int) -> None:
 
 
 @contextmanager
-def _ending_at_once() -> Iterator[None]:
+def ending_at_once() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the run at once.
 
     A killed run keeps its finished results, and its workers and server end with it. An orderly
@@ -218,9 +217,10 @@ def _ending_at_once() -> Iterator[None]:
 
     def end(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C does not tear the last line
-        reporter().report_interruption()
-        sys.stderr.flush()
-        os._exit(128 + number)
+        try:
+            reporter().report_interruption()
+        finally:
+            os._exit(128 + number)
 
     _start_quiet_tracker()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}

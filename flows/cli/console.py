@@ -43,6 +43,8 @@ StageOption = Annotated[
 ]
 
 DEFAULT_PROJECT = "worldpose-data"
+ERASE_SPINNER = "\r\x1b[2K\x1b[?25h"
+"""Control codes of a terminal: erase the current line and show the cursor."""
 NO_WIDTH = 100_000
 """Line width without a terminal [characters]."""
 
@@ -145,13 +147,18 @@ class ConsoleReporter(Reporter):
         line(f"{'':13}{unit} failed: {message}", to=errors)
 
     def report_interruption(self) -> None:
-        """Print what is kept, and how to continue, as the last line of the process."""
-        if self.spinner is not None:
-            self.spinner.stop()
+        """Print what is kept, and how to continue, as the last line of the process.
+
+        A signal handler calls this. The interrupted thread may hold a lock of the console for
+        which the thread that draws the spinner waits, so nothing here may wait for that thread.
+        """
         results = "result is" if self.computed == 1 else "results are"
         said = f"\ninterrupted: {self.computed} new {results} kept; the same command continues\n"
-        # A signal may arrive while the console prints: it would keep this line in its buffer.
-        os.write(sys.stderr.fileno(), said.encode())
+        number = sys.stderr.fileno()
+        terminal = os.dup(number)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # other threads print nothing more
+        erase = ERASE_SPINNER if self.spinner is not None else ""
+        os.write(terminal, f"{erase}{said}".encode())
 
 
 def shorten_name(name: str, width: int) -> str:
