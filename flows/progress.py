@@ -14,6 +14,9 @@ from typing import Final, Self
 
 logger = logging.getLogger("worldpose.run")
 
+EXPECTATION_SECONDS: Final = 60.0
+"""Measured computation time that counts as much as the expected one for the time left [s]: a first
+unit that takes a hundred times its expected time says little about other stages."""
 MOST_TOLD: Final = 200
 """Units of a stage that are reported one by one; of more, only every n-th."""
 
@@ -95,7 +98,12 @@ class Reporter:
             return self.stage_progress
         done = sum(self._work.get(stage, 0.0) for stage in self._reached[:-1])
         done += self._work.get(self._reached[-1], 0.0) * self.stage_progress.share
-        return Progress.after(min(done / total, 1.0), self._began)
+        share = min(done / total, 1.0)
+        if not done:
+            return Progress(share, None)
+        elapsed = time.monotonic() - self._began
+        slowness = (elapsed + EXPECTATION_SECONDS) / (done + EXPECTATION_SECONDS)
+        return Progress(share, (total - done) * slowness)
 
     def say(self, text: str) -> None:
         """Report any other slow operation."""

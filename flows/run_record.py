@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -27,6 +26,7 @@ from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_tracking, tracking, triangulation
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.errors import InputError
+from worldpose.ingest import MatchFolder
 from worldpose.store import Store, libraries
 
 ComputeUnits = Callable[
@@ -90,8 +90,6 @@ UNIT_SECONDS: Final[Mapping[str, float]] = MappingProxyType(
     {
         "ingest": 0.1,
         "static_calibration": 0.1,
-        "detection": 60.0,
-        "redetection": 60.0,
         "tracking": 2.8,
         "triangulation": 10.9,
         "retriangulation": 10.9,
@@ -99,34 +97,67 @@ UNIT_SECONDS: Final[Mapping[str, float]] = MappingProxyType(
         "body_fitting": 34.1,
         "refitting": 34.1,
         "filtering": 4.9,
+        "broadcast_calibration": 40.0,
+        "broadcast_tracking": 10.0,
     }
 )
 """Stage to the time of a unit in a match's first run, for the progress [s]: of a 20 s clip in 16
-cameras. A detector's time depends on its net and device; its value here is a guess."""
+cameras; other clips in proportion. A detector's time depends on its net and device."""
+DETECTION_SECONDS: Final = 0.6
+"""Time of one frame of 1920 x 1080 pixels; others in proportion [s]."""
+PAINT_SECONDS: Final = 15.0
+"""Time to calibrate a static camera with an image, whose painted lines are used [s]."""
+_FULL_HD: Final = 1920 * 1080
 
 
 def expected_work(
-    store: Store, missing: Iterable[PlannedUnit], latest: RunRecord | None
+    store: Store, match: Match, missing: Iterable[PlannedUnit], latest: RunRecord | None
 ) -> dict[str, float]:
     """Return the expected computation time of missing units by stage, from the latest run's [s].
 
     Args:
         store: the project.
+        match: the match, whose sizes tell how long a first run takes.
         missing: planned units without results.
         latest: the match's latest run, whose units tell how long one takes.
     """
     known = {} if latest is None else {name.partition("/")[0]: name for name in latest.results}
-    counts = Counter(unit.name.partition("/")[0] for unit in missing)
-    work = {}
-    for stage, count in counts.items():
-        seconds = UNIT_SECONDS.get(stage, 1.0)
+    work: dict[str, float] = {}
+    for stage, unit in (planned.name.split("/", 1) for planned in missing):
+        seconds = None
         if latest is not None and stage in known:
-            unit = known[stage].partition("/")[2]
+            before = known[stage].partition("/")[2]
             key = latest.results[known[stage]]
-            if store.has(latest.match_id, stage, unit, key):
-                seconds = store.manifest(latest.match_id, stage, unit, key).seconds
-        work[stage] = count * max(seconds, 1e-3)
+            if store.has(latest.match_id, stage, before, key):
+                seconds = store.manifest(latest.match_id, stage, before, key).seconds
+        if seconds is None:
+            seconds = first_seconds(match.folder, stage, unit)
+        work[stage] = work.get(stage, 0.0) + max(seconds, 1e-3)
     return work
+
+
+def first_seconds(folder: MatchFolder, stage: str, unit: str) -> float:
+    """Return the expected computation time of a unit that has never been computed [s].
+
+    Args:
+        folder: the match, with its sizes and files.
+        stage: the stage.
+        unit: a camera, a clip, or both as `camera.clip`.
+    """
+    spec, parts = folder.spec, unit.split(".")
+    camera = next((each for each in spec.cameras if each.id in parts), None)
+    clip = next((each for each in spec.clips if each.id in parts), None)
+    if stage in ("detection", "redetection") and camera is not None and clip is not None:
+        pixels = camera.width * camera.height / _FULL_HD
+        return DETECTION_SECONDS * pixels * clip.frame_count * (camera.fps or spec.fps) / spec.fps
+    if stage == "static_calibration" and (unit in folder.stills or unit in folder.videos):
+        return PAINT_SECONDS
+    seconds = UNIT_SECONDS.get(stage, 1.0)
+    if clip is None or stage == "ingest":
+        return seconds
+    cameras = sum(each.kind == "static" for each in spec.cameras)
+    share = 1.0 if stage.startswith("broadcast") else max(cameras, 1) / 16.0
+    return seconds * share * clip.frame_count / spec.fps / 20.0
 
 
 @dataclass

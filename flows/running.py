@@ -85,7 +85,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
         policy = latest.gates
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
-    reporter().run_planned(expected_work(store, plan.missing, latest))
+    reporter().run_planned(expected_work(store, match, plan.missing, latest))
     if plan.missing:
         return _with_prefect(store, match, replace(request, gates=policy), plan.missing)
     if latest is not None and plan.is_recorded_by(latest):

@@ -123,7 +123,7 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
             if latest.state == "complete":
                 return latest
         with shown_at_prefect(store, match_id):
-            reporter().run_planned(expected_work(store, plan.missing, latest))
+            reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)
         if record.failed or not waiting_for_verdicts(record.waiting):

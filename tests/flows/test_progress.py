@@ -1,5 +1,6 @@
 """Progress reports of a running run."""
 
+import functools
 import io
 import os
 import pty
@@ -14,13 +15,23 @@ import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 from rich.console import Console
 
+from data_contracts.match import MatchSpec
 from flows import progress
 from flows.cli import console
 from flows.progress import MOST_TOLD, Reporter, in_time
 from flows.registering import open_match
 from flows.run_plan import plan_run
-from flows.run_record import UNIT_SECONDS, expected_work, latest_run, require_no_other_run
+from flows.run_record import (
+    DETECTION_SECONDS,
+    PAINT_SECONDS,
+    UNIT_SECONDS,
+    expected_work,
+    first_seconds,
+    latest_run,
+    require_no_other_run,
+)
 from flows.web.app_context import read_progress
+from worldpose.ingest import MatchFolder
 from worldpose.store import Store
 from worldpose.store.documents import seal
 
@@ -73,7 +84,8 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     heard.unit_done("ingest/a", 5.0, {})
     assert (heard.stage_progress.share, heard.stage_progress.seconds_left) == (0.25, 15.0)
     assert heard.run_progress.share == pytest.approx(2.5 / 40.0)
-    assert heard.run_progress.seconds_left == pytest.approx(75.0)
+    # 2.5 s of expected work took 5 s: 60 s of the same would count as much as the expectation.
+    assert heard.run_progress.seconds_left == pytest.approx(37.5 * 65.0 / 62.5)
     for unit in "bcd":
         heard.unit_done(f"ingest/{unit}", 5.0, {})
     heard.stage_started("static_calibration", "all there", units=3, missing=0)
@@ -82,8 +94,8 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     heard.stage_started("tracking", "who is who", units=2, missing=2)
     heard.unit_failed("tracking/a", "why")
     assert heard.run_progress.share == pytest.approx(25.0 / 40.0)
-    assert heard.run_progress.seconds_left == pytest.approx(20.0 * 15.0 / 25.0)
-    assert str(heard.run_progress) == "62 % 12 s"
+    assert heard.run_progress.seconds_left == pytest.approx(15.0 * 80.0 / 85.0)
+    assert str(heard.run_progress) == "62 % 14 s"
     heard.unit_done("tracking/b", 5.0, {})
     assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
 
@@ -116,7 +128,7 @@ def test_a_unit_is_one_line_of_80_columns_with_metrics_only_if_asked_for(verbose
     lines = terminal.export_text().splitlines()
     assert len(lines) == 3 + verbose
     assert all(len(each) <= 80 for each in lines), lines
-    row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 2042 d$"
+    row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 772 d$"
     assert re.search(row, lines[2]), lines
     assert ("clicks_wrong 1" in lines[-1]) == verbose
 
@@ -131,8 +143,26 @@ def test_expected_work_comes_from_the_latest_run(project_copy):
     ]
     key = latest.results["tracking/clip"]
     seconds = store.manifest(TINY, "tracking", "clip", key).seconds
-    assert expected_work(store, units, latest) == {"tracking": pytest.approx(seconds)}
-    assert expected_work(store, units * 3, None) == {"tracking": 3.0 * UNIT_SECONDS["tracking"]}
+    assert expected_work(store, match, units, latest) == {"tracking": pytest.approx(seconds)}
+    first = UNIT_SECONDS["tracking"] * 1.2 / 20.0 * 6.0 / 16.0  # 1.2 s in six cameras
+    expected = {"tracking": pytest.approx(3.0 * first)}
+    assert expected_work(store, match, units * 3, None) == expected
+
+
+def test_a_first_run_is_expected_to_take_as_long_as_its_footage_asks(tmp_path):
+    clip = {"id": "clip", "frame_count": 150, "broadcast": "tv"}
+    cameras = [{"id": name, "width": 3840, "height": 2160} for name in ("left", "right")]
+    cameras.append({"id": "tv", "kind": "broadcast", "width": 1920, "height": 1080})
+    spec = MatchSpec(match_id="match", fps=50.0, cameras=cameras, clips=[clip])
+    folder = MatchFolder(tmp_path, spec, {}, {}, None, {"left": tmp_path / "left.mp4"}, {}, {}, {})
+    seconds = functools.partial(first_seconds, folder)
+    assert seconds("detection", "left.clip") == pytest.approx(150 * 4 * DETECTION_SECONDS)
+    assert seconds("detection", "tv.clip") == pytest.approx(150 * DETECTION_SECONDS)
+    assert seconds("static_calibration", "left") == PAINT_SECONDS
+    assert seconds("static_calibration", "right") == UNIT_SECONDS["static_calibration"]
+    assert seconds("tracking", "clip") == pytest.approx(2.8 * 3.0 / 20.0 * 2.0 / 16.0)
+    assert seconds("broadcast_calibration", "clip") == pytest.approx(40.0 * 3.0 / 20.0)
+    assert seconds("ingest", "clip") == UNIT_SECONDS["ingest"]
 
 
 def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
