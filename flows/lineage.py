@@ -110,7 +110,14 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
             todo="Write it as MATCH/STAGE/UNIT.",
         )
     status = unit_status(store, planned[unit_name], latest)
-    return Explanation(name, status.state.value, status.planned.key, status.describe())
+    failed = () if latest is None else latest.failed
+    failures = tuple(
+        f"run {match_id}/{latest.run_id} failed with the same input and settings: {each.message}"
+        for each in failed
+        if latest is not None and each.unit == unit_name and each.key == status.planned.key
+    )
+    reasons = failures or status.describe()
+    return Explanation(name, status.state.value, status.planned.key, reasons)
 
 
 def _method_order(unit: str) -> tuple[int, str]:

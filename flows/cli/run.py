@@ -202,7 +202,7 @@ def _print(record: RunRecord, project: str, seconds: float) -> None:
 def _next_command(record: RunRecord) -> str:
     """Return the most useful command after a run."""
     if record.failed:
-        return f"worldpose why {record.match_id}, which says what failed and why"
+        return f"worldpose why {record.match_id}/{record.failed[0].unit}"
     if record.waiting:
         return f"worldpose review serve, to decide; then worldpose run {record.match_id} again"
     if {"body_fitting", "broadcast_tracking"} & {n.partition("/")[0] for n in record.results}:

@@ -146,6 +146,7 @@ def ended(state):
     [
         ("complete", 0, "is complete: 1 computed, 0 reused, 0 failed"),
         ("failed", 1, "is failed: 1 computed, 0 reused, 1 failed"),
+        ("failed", 1, "next: worldpose why a/tracking/clip"),
         ("waiting", 3, "2 reviews pending, 1 rejected and to be corrected:"),
         ("partial", 4, "1 failed and 1 blocked by that"),
     ],

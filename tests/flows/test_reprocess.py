@@ -14,6 +14,7 @@ from data_contracts.run import UnitFailure
 from flows import reprocess, run_plan
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
+from flows.lineage import explain_unit
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.reprocess import Reprocessed, reprocess_matches
@@ -136,6 +137,8 @@ def test_what_failed_is_tried_again_when_something_is_another(store, error, agai
     results = without(store.run(TINY), *later)
     finish(store, state="failed", results=results, failed=(failure,), figures={}, reused=())
     assert run_status(store, TINY).is_stale == again
+    told = f"run {TINY}/0002 failed with the same input and settings: x"
+    assert explain_unit(store, f"{TINY}/tracking/clip", {}).reasons == (told,)
     if not again:
         said = CliRunner().invoke(app, ["reprocess", "--project", store.url]).stdout
         assert "nothing was edited since run 0002, which is failed; --retry" in " ".join(

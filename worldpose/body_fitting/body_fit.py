@@ -28,8 +28,14 @@ from worldpose.body_fitting.monocular import (
     deviations,
     learn_precision,
 )
-from worldpose.body_fitting.objective import ANKLES, Evidence, Ground, Pose
-from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
+from worldpose.body_fitting.objective import (
+    ANKLES,
+    Evidence,
+    Ground,
+    Pose,
+    differentiate_points,
+)
+from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import body_axes
@@ -283,11 +289,7 @@ class FittedArrays:
         self.body_pose[span, person] = plant_feet.body_pose
         self.transl[span, person] = plant_feet.transl
         self.joints[span, person] = body.keypoints
-        pose_part = body.body_pose @ SPREAD
-        by_frame = np.concatenate(
-            [np.broadcast_to(np.eye(3), (*pose_part.shape[:-1], 3)), body.global_orient, pose_part],
-            axis=-1,
-        )
+        by_frame = differentiate_points(body.pose)
         spread = factor.inverse_blocks()[:, None]
         axes = body_axes(body.keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.

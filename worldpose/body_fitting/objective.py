@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17_SIGMAS
 from worldpose.body import BodyModel, BodyParameters
-from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
+from worldpose.compiled import compile_kernel
 
 JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
 """Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
@@ -176,8 +177,95 @@ ACCELERATION_SCALE: Final = np.array(
     [1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64
 )
 """Accelerations of joints as multiples of the hips'; averages of simulated players."""
+CACHED_FRAMES: Final = 64
+"""Frames that are differentiated together: 2 MB of derivatives."""
 _MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
+
+
+SPREAD_ANGLE, SPREAD_UNKNOWN = np.nonzero(SPREAD)
+SPREAD_FACTOR: Final = SPREAD[SPREAD_ANGLE, SPREAD_UNKNOWN]
+
+
+def differentiate_points(pose: Floats) -> Floats:
+    """Return derivatives of points by the unknowns (frames, points, 3, 36).
+
+    Args:
+        pose: (frames, points, 3, 72), by the angles of all joints.
+    """
+    return _gather_angles(pose, 3 + SPREAD_ANGLE, 6 + SPREAD_UNKNOWN, SPREAD_FACTOR)
+
+
+@compile_kernel
+def _gather_angles(
+    pose: Floats, angle: NDArray[np.int64], unknown: NDArray[np.int64], factor: Floats
+) -> Floats:
+    """Return derivatives by the unknowns: sums of those by angles, with factors, (terms,) each."""
+    frames, points = pose.shape[:2]
+    rows = np.zeros((frames, points, 3, UNKNOWNS))
+    for t in range(frames):
+        for p in range(points):
+            for a in range(3):
+                rows[t, p, a, a] = 1.0
+                for c in range(3):
+                    rows[t, p, a, 3 + c] = pose[t, p, a, c]
+                for i in range(len(angle)):
+                    rows[t, p, a, unknown[i]] += factor[i] * pose[t, p, a, angle[i]]
+    return rows
+
+
+@compile_kernel
+def _accumulate(
+    rows: Floats, own: Floats, next_frame: Floats, second_frame: Floats, force: Floats
+) -> tuple[Floats, Floats]:
+    """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
+
+    A point moves with few of the angles: products skip those that leave it in place.
+
+    Args:
+        rows: (frames, points, 3, 36), derivatives of points.
+        own: (frames, points, 3, 3), their information.
+        next_frame: (frames, points), weight of the product with the point in the next frame.
+        second_frame: (frames, points), the same with the frame after.
+        force: (frames, points, 3), derivative of the cost by the points.
+    """
+    frames, points, _, size = rows.shape
+    blocks, gradient = np.zeros((3, frames, size, size)), np.zeros((frames, size))
+    scaled, active = np.empty((3, size)), np.empty(size, dtype=np.int64)
+    for t in range(frames):
+        slope = gradient[t]
+        for p in range(points):
+            r = rows[t, p]
+            for a in range(3):
+                f0, f1, f2 = own[t, p, a, 0], own[t, p, a, 1], own[t, p, a, 2]
+                pull = force[t, p, a]
+                for j in range(size):
+                    scaled[a, j] = f0 * r[0, j] + f1 * r[1, j] + f2 * r[2, j]
+                    slope[j] += pull * r[a, j]
+            _add_product(blocks[0, t], r, scaled, active)
+            for ahead in (1, 2):
+                weight = next_frame[t, p] if ahead == 1 else second_frame[t, p]
+                if t + ahead < frames and weight != 0.0:
+                    for a in range(3):
+                        for j in range(size):
+                            scaled[a, j] = weight * r[a, j]
+                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active)
+    return blocks, gradient
+
+
+@compile_kernel
+def _add_product(target: Floats, left: Floats, right: Floats, active: NDArray[np.int64]) -> None:
+    """Add `left^T right` of two (3, n) matrices; `active` is room for n indices."""
+    size, count = len(target), 0
+    for i in range(size):
+        if left[0, i] != 0.0 or left[1, i] != 0.0 or left[2, i] != 0.0:
+            active[count] = i
+            count += 1
+    for place in range(count):
+        i = active[place]
+        f0, f1, f2 = left[0, i], left[1, i], left[2, i]
+        for j in range(size):
+            target[i, j] += f0 * right[0, j] + f1 * right[1, j] + f2 * right[2, j]
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,12 +339,8 @@ class Track:
             bordered: whether the equations have a border for betas and offsets.
         """
         frames, settings = len(pose.transl), self.settings
-        body = self.chained.differentiate(pose.parameters())
-        shapes = body.betas.shape[-1]
-        by_frame = np.empty((frames, 17, 3, UNKNOWNS))
-        by_frame[..., :3] = np.eye(3)
-        by_frame[..., 3:6] = body.global_orient
-        by_frame[..., 6:] = body.body_pose @ SPREAD
+        body = self._differentiate(pose)
+        by_frame, shapes = body.pose, body.betas.shape[-1]
         rows = by_frame.reshape(frames, 51, UNKNOWNS)
 
         axes = body_axes(body.keypoints)
@@ -271,16 +355,11 @@ class Track:
         weighted = weight[..., None] * weighted
 
         bands, smooth_gradient, smooth_cost = self._smoothness(body.keypoints)
-        turned = np.swapaxes(rows, 1, 2)
-        blocks = np.zeros((3, frames, UNKNOWNS, UNKNOWNS))
         stiff = information.copy()
         stiff[..., np.arange(3), np.arange(3)] += bands[0][..., None]
-        blocks[0] = turned @ (stiff @ by_frame).reshape(rows.shape)
-        for ahead in (1, 2):
-            if frames > ahead:
-                scaled = np.repeat(bands[ahead][:-ahead], 3, axis=1)[..., None] * rows[:-ahead]
-                blocks[ahead, :-ahead] = turned[ahead:] @ scaled
-        gradient = (turned @ (weighted + smooth_gradient).reshape(frames, 51, 1))[..., 0]
+        blocks, gradient = _accumulate(
+            by_frame, stiff, bands[1], bands[2], weighted + smooth_gradient
+        )
         cost += smooth_cost + self._add_angles(pose.angles, blocks[0], gradient)
         if self.monocular_prior is not None:
             matrix, slope, prior_cost = self.monocular_prior.normal_equations(
@@ -299,13 +378,31 @@ class Track:
             by_shared[..., shapes:] = np.einsum("fab,jbu->fjau", axes, MIRRORED_OFFSETS)
             columns = by_shared.reshape(frames, 51, width)
             held = (information @ by_shared).reshape(columns.shape)
-            border = turned @ held
+            border = np.swapaxes(rows, 1, 2) @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
             shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 51))
         equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
         return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
+
+    def _differentiate(self, pose: Pose) -> KeypointJacobian:
+        """Return the keypoints with derivatives by the unknowns (frames, 17, 3, 36) in `pose`.
+
+        Some frames at a time, so that the derivatives by all angles stay in the processor's cache.
+        """
+        parameters, frames = pose.parameters(), len(pose.transl)
+        keypoints, betas, rows = (np.empty(0) for _ in range(3))
+        for start in range(0, frames, CACHED_FRAMES):
+            part = slice(start, start + CACHED_FRAMES)
+            body = self.chained.differentiate(parameters[part])
+            if not start:
+                keypoints = np.empty((frames, *body.keypoints.shape[1:]))
+                betas = np.empty((frames, *body.betas.shape[1:]))
+                rows = np.empty((*keypoints.shape, UNKNOWNS))
+            keypoints[part], betas[part] = body.keypoints, body.betas
+            rows[part] = differentiate_points(body.pose)
+        return KeypointJacobian(keypoints, betas, rows)
 
     def _smoothness(self, keypoints: Floats) -> tuple[list[Floats], Floats, float]:
         """Return weights (frames, 17) on the three diagonals, gradient (frames, 17, 3) and cost.

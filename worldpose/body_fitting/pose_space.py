@@ -157,8 +157,10 @@ def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     sure = np.flatnonzero(seen.sum(-1) >= 3)
     if len(sure):
         frames = np.arange(len(torso))
-        nearest = sure[np.abs(frames[:, None] - sure).argmin(axis=1)]
-        turns = turns[nearest]
+        after = np.searchsorted(sure, frames).clip(max=len(sure) - 1)
+        before = (after - 1).clip(min=0)
+        is_nearer = np.abs(frames - sure[before]) <= np.abs(sure[after] - frames)
+        turns = turns[sure[np.where(is_nearer, before, after)]]
     else:
         turns = np.broadcast_to(
             Rigid.from_rotvec([np.pi / 2, 0.0, 0.0], np.zeros(3)).rotation, turns.shape

@@ -164,7 +164,7 @@ def factor_information(track: Track, pose: Pose, offsets: Floats) -> BandedFacto
 
 
 def factor(blocks: Floats) -> BandedFactor:
-    """Return the factor of blocks with a little damping.
+    """Return the factor of blocks with a little damping, which overwrites the blocks.
 
     Raises:
         DegenerateError: rounding leaves no positive definite system.
@@ -173,7 +173,7 @@ def factor(blocks: Floats) -> BandedFactor:
     blocks[0][:, places, places] *= 1.0 + 1e-4
     # 10 m and 10 rad: only a lone joint leaves a direction that uncertain.
     blocks[0][:, places, places] += 0.01
-    solved = BandedFactor.of(blocks)
+    solved = BandedFactor.of(blocks, overwrite=True)
     if not solved.determined:
         raise DegenerateError(
             "body fitting: the weights of the joints differ by more than double precision can "

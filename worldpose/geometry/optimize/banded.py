@@ -26,19 +26,25 @@ class BandedFactor:
     """Whether the matrix was positive definite; the factor is invalid otherwise."""
 
     @classmethod
-    def of(cls, blocks: Floats) -> BandedFactor:
+    def of(cls, blocks: Floats, *, overwrite: bool = False) -> BandedFactor:
         """Return the factor of the matrix with these lower blocks.
 
         Args:
             blocks: (3, frames, n, n); `blocks[k, t]` stands in block row t + k, column t.
+            overwrite: whether the factor may take the memory of `blocks`.
         """
-        lower = np.ascontiguousarray(blocks).copy()
+        lower = np.ascontiguousarray(blocks)
+        if lower is blocks and not overwrite:
+            lower = lower.copy()
         return cls(lower, _factorize(lower))
 
     def solve(self, right: Floats) -> Floats:
         """Return the solutions (frames, n, columns) for right sides (frames, n, columns)."""
         solution = np.ascontiguousarray(right).copy()
-        _substitute(self.lower, solution)
+        if solution.shape[-1] == 1:
+            _substitute_vector(self.lower, solution[..., 0])
+        else:
+            _substitute(self.lower, solution)
         return solution
 
     def inverse_blocks(self) -> Floats:
@@ -46,24 +52,14 @@ class BandedFactor:
 
         Takahashi's recursion from the last frame needs only the band of the inverse.
         """
-        frames, size = self.lower.shape[1:3]
-        inverse = np.zeros((3, frames + 2, size, size))
-        for t in range(frames - 1, -1, -1):
-            own = np.linalg.inv(self.lower[0, t])
-            below = [self.lower[k, t] @ own for k in (1, 2)]
-            # Inverse blocks (t + 1, t), (t + 2, t) from those of later frames.
-            a, b, c = inverse[0, t + 1], inverse[1, t + 1], inverse[0, t + 2]
-            inverse[1, t] = -(a @ below[0] + b.T @ below[1])
-            inverse[2, t] = -(b @ below[0] + c @ below[1])
-            corner = own.T @ own - below[0].T @ inverse[1, t] - below[1].T @ inverse[2, t]
-            inverse[0, t] = 0.5 * (corner + corner.T)
-        return inverse[0, :frames]
+        return _invert_band(self.lower)
 
 
 @compile_kernel
 def _factorize(lower: Floats) -> bool:
     """Factorise in place, left to right; False when the matrix is not positive definite."""
     frames, size = lower.shape[1], lower.shape[2]
+    turned = np.empty((size, size))
     for t in range(frames):
         for back in (1, 2):
             if t >= back:
@@ -72,20 +68,25 @@ def _factorize(lower: Floats) -> bool:
         if t >= 1 and t + 1 < frames:
             _subtract(lower[1, t], lower[2, t - 1], lower[1, t - 1], False)
         block = lower[0, t]
-        for j in range(size):
+        for j in range(size):  # column by column, so that inner loops run along rows of `turned`
             pivot = block[j, j]
             for k in range(j):
-                pivot -= block[j, k] * block[j, k]
+                pivot -= turned[k, j] * turned[k, j]
             if not pivot > 0.0:
                 return False
-            block[j, j] = math.sqrt(pivot)
+            root = math.sqrt(pivot)
+            for i in range(j, size):
+                turned[j, i] = block[i, j]
+            for k in range(j):
+                factor = turned[k, j]
+                for i in range(j, size):
+                    turned[j, i] -= factor * turned[k, i]
+            for i in range(j, size):
+                turned[j, i] /= root
+            block[j, j] = root
             for i in range(j + 1, size):
-                value = block[i, j]
-                for k in range(j):
-                    value -= block[i, k] * block[j, k]
-                block[i, j] = value / block[j, j]
-            for k in range(j + 1, size):
-                block[j, k] = 0.0
+                block[i, j] = turned[j, i]
+                block[j, i] = 0.0
         for ahead in (1, 2):
             if t + ahead < frames:
                 _divide(lower[ahead, t], block)
@@ -99,9 +100,16 @@ def _subtract(target: Floats, first: Floats, second: Floats, below: bool) -> Non
     """Subtract `first second^T`; only the lower triangle where `below`."""
     size = len(target)
     turned = np.ascontiguousarray(second.T)
+    whole = size - size % 4
     for i in range(size):
         end = i + 1 if below else size
-        for k in range(size):
+        for k in range(0, whole, 4):  # four at once read and write the target a quarter as often
+            f0, f1, f2, f3 = first[i, k], first[i, k + 1], first[i, k + 2], first[i, k + 3]
+            for j in range(end):
+                target[i, j] -= (f0 * turned[k, j] + f1 * turned[k + 1, j]) + (
+                    f2 * turned[k + 2, j] + f3 * turned[k + 3, j]
+                )
+        for k in range(whole, size):
             factor = first[i, k]
             for j in range(end):
                 target[i, j] -= factor * turned[k, j]
@@ -113,7 +121,14 @@ def _divide(target: Floats, block: Floats) -> None:
     size = len(target)
     turned = np.ascontiguousarray(target.T)
     for j in range(size):
-        for k in range(j):
+        whole = j - j % 4
+        for k in range(0, whole, 4):
+            f0, f1, f2, f3 = block[j, k], block[j, k + 1], block[j, k + 2], block[j, k + 3]
+            for i in range(size):
+                turned[j, i] -= (f0 * turned[k, i] + f1 * turned[k + 1, i]) + (
+                    f2 * turned[k + 2, i] + f3 * turned[k + 3, i]
+                )
+        for k in range(whole, j):
             factor = block[j, k]
             for i in range(size):
                 turned[j, i] -= factor * turned[k, i]
@@ -123,6 +138,34 @@ def _divide(target: Floats, block: Floats) -> None:
     for i in range(size):
         for j in range(size):
             target[i, j] = turned[j, i]
+
+
+@compile_kernel
+def _invert_band(lower: Floats) -> Floats:
+    """Return the diagonal blocks (frames, n, n) of the inverse of a factorised matrix."""
+    frames, size = lower.shape[1], lower.shape[2]
+    result = np.empty((frames, size, size))
+    # Blocks (t + 1, t + 1), (t + 2, t + 1) and (t + 2, t + 2) of the inverse.
+    corner, side, second = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
+    for t in range(frames - 1, -1, -1):
+        own = np.eye(size)  # inverse of the factor's diagonal block
+        block = lower[0, t]
+        for i in range(size):
+            for k in range(i):
+                factor = block[i, k]
+                for j in range(k + 1):
+                    own[i, j] -= factor * own[k, j]
+            for j in range(i + 1):
+                own[i, j] /= block[i, i]
+        first_below, second_below = lower[1, t] @ own, lower[2, t] @ own
+        first = corner @ first_below + side.T @ second_below
+        both = side @ first_below + second @ second_below
+        new = own.T @ own + first_below.T @ first + second_below.T @ both
+        for i in range(size):
+            for j in range(size):
+                result[t, i, j] = 0.5 * (new[i, j] + new[j, i])
+        corner, side, second = result[t], -first, corner
+    return result
 
 
 @compile_kernel
@@ -166,3 +209,47 @@ def _substitute(lower: Floats, right: Floats) -> None:
             factor = 1.0 / block[i, i]
             for c in range(columns):
                 right[t, i, c] *= factor
+
+
+@compile_kernel
+def _substitute_vector(lower: Floats, right: Floats) -> None:
+    """Substitute forward and backward in place in one vector (frames, n)."""
+    frames, size = lower.shape[1], lower.shape[2]
+    for t in range(frames):
+        own, block = right[t], lower[0, t]
+        for back in (1, 2):
+            if t >= back:
+                side, known = lower[back, t - back], right[t - back]
+                for i in range(size):
+                    own[i] -= _dot(side[i], known, size)
+        for i in range(size):
+            own[i] = (own[i] - _dot(block[i], own, i)) / block[i, i]
+    for t in range(frames - 1, -1, -1):
+        own, block = right[t], lower[0, t]
+        for ahead in (1, 2):
+            if t + ahead < frames:
+                side, known = lower[ahead, t], right[t + ahead]
+                for i in range(size):
+                    factor = known[i]
+                    for k in range(size):
+                        own[k] -= factor * side[i, k]
+        for i in range(size - 1, -1, -1):
+            own[i] /= block[i, i]
+            factor = own[i]
+            for k in range(i):
+                own[k] -= factor * block[i, k]
+
+
+@compile_kernel
+def _dot(first: Floats, second: Floats, count: int) -> float:
+    """Return the product of the first `count` elements, four sums at a time."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    whole = count - count % 4
+    for k in range(0, whole, 4):
+        s0 += first[k] * second[k]
+        s1 += first[k + 1] * second[k + 1]
+        s2 += first[k + 2] * second[k + 2]
+        s3 += first[k + 3] * second[k + 3]
+    for k in range(whole, count):
+        s0 += first[k] * second[k]
+    return (s0 + s1) + (s2 + s3)
