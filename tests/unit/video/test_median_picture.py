@@ -32,6 +32,15 @@ def test_median_is_that_of_all_frames_where_all_are_kept():
     assert (median_picture(frames) == np.median(frames, axis=0)).all()
 
 
+@pytest.mark.parametrize("count", [1, 2, 6, 255, 256, 300])
+def test_an_even_number_of_frames_has_the_lower_middle_level(count):
+    frames = np.random.default_rng(count).integers(0, 256, (count, 70, 9, 3), dtype=np.uint8)
+    frames[:, 0] = 0
+    frames[:, 1] = 255
+    lower = np.sort(frames, axis=0)[(count - 1) // 2]
+    np.testing.assert_array_equal(median_picture(frames, most=400), lower)
+
+
 def test_frames_are_kept_evenly_over_the_clip():
     # Frame n is n bright everywhere: the median of an even choice is the middle of the clip.
     frames = (np.full((2, 2), index // 4, dtype=np.uint8) for index in range(1000))
