@@ -29,10 +29,10 @@ from prefect.deployments import arun_deployment
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
 from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
+from flows.service.match_runs import run_name
 from flows.service.metrics import ProjectMetrics, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan, deployment_names
-from flows.service.match_runs import run_name
 from flows.service.recovery import begin_again, may_begin_again, name_scheduled_runs
 from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
