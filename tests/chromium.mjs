@@ -32,13 +32,16 @@ let shots = 0;
 export const shoot = (page, name) =>
   task.shots && page.screenshot({ path: `${task.shots}/${String(++shots).padStart(2, "0")}_${name}.png` });
 
+// Evaluate on a page; one that loads itself again in between is asked once more.
+export const ask = (page, what) => page.evaluate(what).catch(() => page.waitForLoadState().then(() => page.evaluate(what)));
+
 // Pictures of a page at three widths; how far it is wider than the window goes to seen.
 export async function shootSizes(page, seen, name) {
   const before = page.viewportSize();
   for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
     await page.setViewportSize({ width, height });
     await page.waitForTimeout(500);
-    seen[`overflow_${name}_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+    seen[`overflow_${name}_${width}`] = await ask(page, () => document.documentElement.scrollWidth - innerWidth);
     await shoot(page, `${name}_${width}`);
   }
   await page.setViewportSize(before);

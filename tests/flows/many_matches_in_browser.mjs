@@ -1,12 +1,10 @@
 // First paint of the pages of a project with many matches and corrections; prints it as one JSON object.
 
-import { logIn, open, shootSizes, task, tell } from "../chromium.mjs";
+import { ask, logIn, open, shootSizes, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [], paint: {}, shown: {} };
 const page = await open(seen, 900);
 await logIn(page, task.base, "Ada");
-// A page that loads itself again in between is asked once more.
-const ask = (what) => page.evaluate(what).catch(() => page.waitForLoadState().then(() => page.evaluate(what)));
 const match = encodeURIComponent(task.match);
 const places = {
   text: ["/login/page.css", "pre"],
@@ -25,7 +23,7 @@ for (const [name, [path, selector]] of Object.entries(places)) {
   await page.waitForSelector(selector);
   seen.errors = seen.errors.filter((text) => !text.includes("favicon"));
   seen.shown[name] = (Date.now() - begun) / 1000;
-  seen.paint[name] = await ask(() => performance.getEntriesByName("first-contentful-paint")[0].startTime / 1000);
+  seen.paint[name] = await ask(page, () => performance.getEntriesByName("first-contentful-paint")[0].startTime / 1000);
   await shootSizes(page, seen, name);
 }
 // All matches are there after some requests, each of which reads a part of them.
