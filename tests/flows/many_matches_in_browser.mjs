@@ -10,11 +10,11 @@ const places = {
   text: ["/login/page.css", "pre"],
   queue: ["/", "li.panel"],
   match: [`/#/match/${match}`, "[data-group]"],
-  status: ["/status", "table"],
   results: [`/#/results/${match}/clip`, '[data-scene="ready"]'],
   calibration: [`/#/picture/${match}/cam00`, "[data-figure]"],
   people: [`/#/detections/${match}/cam00`, "[data-keypoint]"],
   identities: [`/#/identities/${match}/clip`, "[data-person]"],
+  status: ["/status", "table"], // the last one, because it loads itself again
 };
 for (const [name, [path, selector]] of Object.entries(places)) {
   await page.goto("about:blank");
