@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse, Response
+from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival
 from flows.method import METHOD
@@ -25,8 +26,10 @@ WORST_FIRST: Final = ("failed", "waiting", "blocked", "done")
 REFRESH_SECONDS: Final = 15
 UNSEEN_SECONDS: Final = 1
 """Until the page asks for the matches that the server has not read yet."""
-BUDGET_SECONDS: Final = 0.25
+BUDGET_SECONDS: Final = 0.1
 """Time that one request spends on reading matches."""
+REST_SECONDS: Final = 2.0
+"""Time spent on matches that were never read, after the page was sent."""
 MAX_DETAILS: Final = 20
 """Matches whose cameras are on the page at once; of more matches, the one in the address."""
 STYLE: Final = """
@@ -116,7 +119,9 @@ def routes(context: PageContext) -> APIRouter:
         found = overview.look(BUDGET_SECONDS)
         rows = [StatusRow(each, *_run_of(context, each)) for each in found]
         text = status_html(rows, _arrivals(context), dashboard, inbox=inbox, opened=match)
-        return HTMLResponse(text)
+        is_whole = not any(each.is_unseen for each in found)
+        rest = None if is_whole else BackgroundTask(overview.look, REST_SECONDS)
+        return HTMLResponse(text, background=rest)
 
     @router.get("/status/page.css")
     def style() -> Response:
