@@ -267,10 +267,10 @@ def _figures(context: PageContext, match: Match, camera: str) -> dict[str, float
     if figures or clicked is None:
         return figures
     previewed, errors = context.previews.get((match.match_id, camera), (None, {}))
-    is_same = previewed is not None and _marked(previewed) == _marked(clicked)
+    is_same = previewed is not None and _list_marks(previewed) == _list_marks(clicked)
     return {name: value for name, value in errors.items() if is_same and isfinite(value)}
 
 
-def _marked(clicked: ClickedMarkings) -> set[tuple[Any, ...]]:
+def _list_marks(clicked: ClickedMarkings) -> set[tuple[Any, ...]]:
     points = {(point.name, *point.xy) for point in clicked.points}
     return points | {(marking.name, *marking.xy) for marking in clicked.drawn}

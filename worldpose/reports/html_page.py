@@ -11,7 +11,6 @@ from html import escape
 from importlib.resources import files
 from itertools import count
 from typing import Final
-from urllib.parse import quote
 
 import numpy as np
 
@@ -177,11 +176,21 @@ def _block(block: CaptionedImage | Table | EmbeddedPage | LinkedFile) -> str:
         html = block.html.replace("&", "&amp;").replace('"', "&quot;")
         return f'<iframe title="{escape(block.title)}" srcdoc="{html}"></iframe>'
     if isinstance(block, LinkedFile):
-        return f'<p><a href="{quote(block.name)}">{escape(block.title)}</a></p>'
+        return f'<p><a href="{_relative_address(block.name)}">{escape(block.title)}</a></p>'
     if isinstance(block, CaptionedImage):
         return _figure(block)
     heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
     return heading + _table(block.columns, block.rows)
+
+
+def _relative_address(name: str) -> str:
+    """Return a file's name as an address, percent-encoded; the library does not use urllib."""
+    return "".join(
+        letter
+        if letter.isascii() and (letter.isalnum() or letter in "._-")
+        else "".join(f"%{byte:02X}" for byte in letter.encode())
+        for letter in name
+    )
 
 
 def _folded_html(last: Folded) -> str:
