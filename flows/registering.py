@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 
 from data_contracts.match import MatchSpec, Registration, SourceFile
@@ -85,11 +86,13 @@ def find_registration(store: Store, name: str) -> Registration:
     known = store.matches()
     registration = store.registration(match_id) if match_id in known else None
     if registration is None:
+        close = get_close_matches(match_id, known, n=1)
+        meant = f"Did you mean {close[0]!r}? If not, register" if close else "Register"
         raise InputError(
             f"match {name}",
             expected=f"a match folder or one of {', '.join(known) or '(none registered)'}",
             found=repr(name),
-            todo="Register the match: worldpose ingest FOLDER.",
+            todo=f"{meant} the match: worldpose ingest FOLDER.",
         )
     return registration
 

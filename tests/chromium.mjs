@@ -32,6 +32,51 @@ let shots = 0;
 export const shoot = (page, name) =>
   task.shots && page.screenshot({ path: `${task.shots}/${String(++shots).padStart(2, "0")}_${name}.png` });
 
+// Evaluate on a page; one that loads itself again in between is asked once more.
+export const ask = (page, what) => page.evaluate(what).catch(() => page.waitForLoadState().then(() => page.evaluate(what)));
+
+// Pictures of a page at three widths; how far it is wider than the window goes to seen.
+export async function shootSizes(page, seen, name) {
+  const before = page.viewportSize();
+  for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
+    await page.setViewportSize({ width, height });
+    await page.waitForTimeout(500);
+    seen[`overflow_${name}_${width}`] = await ask(page, () => document.documentElement.scrollWidth - innerWidth);
+    await shoot(page, `${name}_${width}`);
+  }
+  await page.setViewportSize(before);
+  await page.waitForTimeout(500);
+}
+
+// The calibration page, of a camera with images of a size [px]: choose a marking by name, click roughly, or close up.
+export async function clicking(page, size) {
+  const box = await page.locator(".stage").boundingBox();
+  const scale = Math.min(box.width / size[0], box.height / size[1]);
+  const corner = [box.x + (box.width - scale * size[0]) / 2, box.y + (box.height - scale * size[1]) / 2];
+  const middle = [box.x + box.width / 2, box.y + box.height / 2];
+  const hundredth = (value) => Math.round(100 * value) / 100;
+  const choose = (name) => page.locator(`[data-name="${name}"]`).first().dispatchEvent("click");
+  const click = async ([x, y]) => {
+    const rough = [Math.round(corner[0] + scale * x), Math.round(corner[1] + scale * y)];
+    await page.mouse.click(...rough);
+    return rough.map((value, k) => hundredth((value - corner[k]) / scale));
+  };
+  // Roughly in the whole picture, then close up.
+  const place = async (name, at) => {
+    await choose(name);
+    const rough = await click(at);
+    await page.keyboard.press("z");
+    for (let k = 0; k < 3; k++) await page.keyboard.press("+");
+    await page.mouse.move(...middle);
+    await page.mouse.down();
+    await page.mouse.move(...at.map((value, k) => middle[k] + 6 * 1.4 ** 3 * (value - rough[k])), { steps: 3 });
+    await page.mouse.up();
+    await page.keyboard.press("0");
+  };
+  const saved = () => page.waitForSelector('[data-state="saved"]', { timeout: 60000 });
+  return { middle, choose, click, place, saved };
+}
+
 // Log in to the review pages.
 export async function logIn(page, base, who) {
   await page.goto(`${base}/login#token=${task.token}`);

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from difflib import get_close_matches
 from math import isnan
 from pathlib import Path
 from typing import Annotated
@@ -93,11 +94,13 @@ def simulate(
         print_table("scenarios", ("name", "what happens"), list(about.items()))
         return
     if scenario not in about:
+        close = get_close_matches(scenario, about, n=1)
+        meant = f"Did you mean {close[0]!r}? " if close else ""
         raise UsageError(
             f"--scenario {scenario}",
             expected=f"one of {', '.join(about)}",
             found=repr(scenario),
-            todo="List the scenarios: worldpose simulate --scenario list.",
+            todo=f"{meant}List the scenarios: worldpose simulate --scenario list.",
         )
     if out is None:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""Report section about a clip: people in camera images, from above, and in a 3D view."""
+"""Report section about a clip: people in camera images and from above."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from data_contracts.pitch import PitchSpec
 from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import (
     body_tracks,
-    broadcast_cameras,
     clip_title,
     estimated_pitch,
     joint_tracks,
@@ -20,7 +19,7 @@ from flows.stage import Match
 from flows.stages.redetection import seen_in
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
-from worldpose.reports import CaptionedImage, Scene
+from worldpose.reports import CaptionedImage
 from worldpose.reports.bodies import BodyTracks, plot_bodies
 from worldpose.reports.clips import (
     ImageDetections,
@@ -142,24 +141,3 @@ def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[
             png,
         )
     ]
-
-
-def clip_scene(run: Run, match: Match, clip: str) -> Scene:
-    """Return a clip's 3D scene, with the broadcast camera if it is known in all frames."""
-    tracks = joint_tracks(run, clip)
-    broadcast = broadcast_cameras(run).get(clip)
-    if broadcast is not None:
-        frames = run[f"broadcast_calibration/{clip}"]["frame"].values
-        both = np.intersect1d(frames, tracks.frames)
-        if len(both):
-            broadcast = broadcast[np.searchsorted(frames, both)]
-            here = np.searchsorted(tracks.frames, both)
-            tracks = JointTracks(both, tracks.person_ids, tracks.joints[here])
-    return Scene(
-        clip_title(clip),
-        tracks,
-        match.folder.spec.fps,
-        static_cameras(run, match.folder.spec),
-        broadcast,
-        estimated_pitch(run, match.folder.pitch, match.folder.spec),
-    )

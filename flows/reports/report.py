@@ -17,9 +17,10 @@ from flows.reports.broadcast import (
 )
 from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
-from flows.reports.clips import clip_pictures, clip_scene, detection_pictures
+from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.disagreements import disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
+from flows.reports.viewer import report_viewer
 from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, when
@@ -27,7 +28,7 @@ from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError
 from worldpose.formats import whole_file
-from worldpose.reports import Section, Table, report_page
+from worldpose.reports import LinkedFile, Section, Table, report_page
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.run_report import camera_table
 from worldpose.store import Run, Store, open_run
@@ -65,17 +66,25 @@ def write_report(
     scores: Evaluation | None = None
     if source is not None and len(clips_of(run.record)) == 1:
         scores = score(match.match_id, source, store.url, run_id=run_id).evaluation
+    films = _write_videos(store, run, match, out, camera) if videos else []
+    beside = [LinkedFile(film.stem.removeprefix(f"{out.stem}-"), film.name) for film in films]
+    shown = Section(
+        "Videos",
+        tuple(beside),
+        "With markings and people drawn over them, in the folder of this page.",
+    )
+    first, *others = _sections(store, run, match, source)
     page = report_page(
         match.match_id,
         run.record,
         seconds=_seconds(store, run.record),
         scores=scores,
-        sections=_sections(store, run, match, source),
+        sections=[first, shown, *others],
         tiles=tiles_of(run, match, scores),
     )
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
-    return _write_videos(store, run, match, out, camera) if videos else []
+    return films
 
 
 def _check_film(match: Match, camera: str) -> None:
@@ -108,11 +117,13 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
     filmed = clips if match.has_static_cameras else ()
     truth = None if reference is None else load_reference(reference)
     cameras = static_cameras(run, match.folder.spec)
+    viewer, left_out = report_viewer(run, match)
     return [
         Section(
             "3D view",
-            tuple(clip_scene(run, match, clip) for clip in clips),
-            "Drag to rotate, Shift and drag to pan, click and use the wheel to zoom; Space plays.",
+            viewer,
+            "Drag to rotate, Shift and drag to pan; click, then use the wheel or pinch to zoom. "
+            f"Space plays.{left_out}",
         ),
         Section(
             "Sample images",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -30,9 +30,51 @@ from worldpose.body import BodyModel, BodyParameters
 from worldpose.errors import UsageError
 from worldpose.formats import JointTracks
 from worldpose.formats.tables import Positions
-from worldpose.formats.viewer_file import ViewerClip, ViewerPerson, write_viewer
+from worldpose.formats.viewer_file import (
+    ViewerClip,
+    ViewerPerson,
+    viewer_pieces,
+    write_viewer,
+)
 from worldpose.ingest import read_match
+from worldpose.reports import EmbeddedPage
 from worldpose.store import Run
+
+REPORT_POSES: Final = 100_000
+"""Maximum people times frames in a report's 3D view: about 30 MB of text."""
+
+
+def report_viewer(run: Run, match: Match) -> tuple[tuple[EmbeddedPage, ...], str]:
+    """Return the 3D view of a run's clips for its report, and what the view leaves out.
+
+    The view has the clips in their order, until there are `REPORT_POSES` people times frames.
+
+    Returns:
+        The page, or nothing if there is nobody to show; and a sentence, empty if all is shown.
+    """
+    origin, spare, clips, all_frames = Origin(run, match.registration), REPORT_POSES, [], 0
+    for name in origin.clips:
+        clip = viewer_clip(origin, name, match.folder.pitch, None)
+        all_frames += len(clip.frames)
+        shown = clip.first_frames(spare // max(1, len(clip.people)))
+        if shown.has_people:
+            clips.append(shown)
+            spare -= len(shown.frames) * len(clip.people)
+    if not clips:
+        return (), ""
+    frames = sum(len(clip.frames) for clip in clips)
+    left_out = (
+        ""
+        if frames == all_frames
+        else f" It shows the first {frames / origin.spec.fps:.1f} s of "
+        f"{all_frames / origin.spec.fps:.1f} s; `worldpose export --format viewer` writes all."
+    )
+    html = "".join(viewer_pieces(_viewer_page(), clips, {}))
+    return (EmbeddedPage("3D view of all people", html),), left_out
+
+
+def _viewer_page() -> str:
+    return (files("flows.reports") / "viewer.html").read_text(encoding="utf-8")
 
 
 def write_viewers(origin: Origin, out: Path) -> list[Path]:
@@ -43,7 +85,7 @@ def write_viewers(origin: Origin, out: Path) -> list[Path]:
         InputError: there is nobody to show.
     """
     pitch = read_match(Path(origin.registration.folder)).pitch
-    page = (files("flows.reports") / "viewer.html").read_text(encoding="utf-8")
+    page = _viewer_page()
     written: dict[Path, tuple[str, ...]] = {
         out / "viewer" / f"{clip}.html": (clip,) for clip in origin.clips
     }

@@ -29,6 +29,7 @@ from prefect.deployments import arun_deployment
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
 from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
+from flows.service.match_runs import run_name
 from flows.service.metrics import ProjectMetrics, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan, deployment_names
@@ -138,7 +139,11 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
     """Start the intake of arrivals now; a second call for the same ones starts no second run."""
     key = hashlib.sha256("\n".join(sorted(ready)).encode()).hexdigest()[:16]
     await arun_deployment(
-        plan.ingest_deployment, timeout=0, as_subflow=False, idempotency_key=f"arrived-{key}"
+        plan.ingest_deployment,
+        timeout=0,
+        as_subflow=False,
+        idempotency_key=f"arrived-{key}",
+        flow_run_name=run_name("arrivals"),
     )
 
 

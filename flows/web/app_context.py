@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 
+from data_contracts.static_calibration import ClickedMarkings
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
@@ -36,11 +37,16 @@ class PageContext:
     Attributes:
         store: the project.
         access: access control.
+        previews: clicks of the last preview of each camera, by match and camera, and the expected
+            errors of the camera that they give [m].
         continuing: runs started or resumed from a page.
     """
 
     store: Store
     access: Access
+    previews: dict[tuple[str, str], tuple[ClickedMarkings, dict[str, float]]] = field(
+        default_factory=dict
+    )
     continuing: Continuing = field(init=False)
 
     def __post_init__(self) -> None:
@@ -141,7 +147,9 @@ class Continuing:
             if run.state in QUEUED:
                 ahead = [each for each in seen.active[: seen.active.index(run)] if each.is_ahead]
                 runs = "1 run is" if len(ahead) == 1 else f"{len(ahead)} runs are"
-                lines = [f"waits for its turn; {runs} before it"]
+                lines = ["The run starts in a moment."]
+                if ahead:
+                    lines = [f"The run waits for its turn: {runs} before it."]
             return {"state": "running", "lines": lines, "percent": percent, "prefect": run.link}
         last = seen.latest.get(match_id)
         if last is None or last.state not in ("FAILED", "CRASHED"):

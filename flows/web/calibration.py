@@ -171,6 +171,13 @@ def routes(context: PageContext) -> APIRouter:
         except InputError as error:
             advice = {"camera": None, "expected": error.expected, "todo": error.todo}
             return JSONResponse(advice)
+        if frame is None:
+            ground = found.report.ground_error
+            errors = {
+                "expected_ground_error_median_m": float(ground.median),
+                "expected_ground_error_p95_m": float(ground.p95),
+            }
+            context.previews[match_id, owner] = markings, errors
         return JSONResponse(_answer(found))
 
     return router

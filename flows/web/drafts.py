@@ -21,7 +21,9 @@ from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import Any, Final, Literal
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
 from data_contracts.match import MatchSpec
@@ -32,15 +34,17 @@ from flows.web.video_folders import VIDEO_SUFFIXES, is_video, open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats import whole_file
 from worldpose.ingest import MatchFolder, read_match
-from worldpose.ingest.footage import require_footage
+from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.validation import list_problems, validate_record
 from worldpose.store import Store
-from worldpose.video import FrameIndex, index_frames
+from worldpose.video import FrameIndex, VideoReader, index_frames
+from worldpose.video.folder import HEADER_BYTES, declared_size
+from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 
 DRAFTS: Final = ".drafts"
 """Folder of all drafts in the inbox."""
 MATCH_FILES: Final = frozenset({"calibration.toml", "lenses.toml", "pitch.json"})
-"""Files that a person can add to the videos."""
+"""Files that a person can add to videos and stills."""
 MAX_FILES: Final = 200
 """Files of one draft."""
 MAX_DRAFTS: Final = 200
@@ -101,7 +105,7 @@ class Drafts:
     store: Store
     _lock: Lock = field(default_factory=Lock)
     _locks: dict[str, Lock] = field(default_factory=dict)
-    _indexes: dict[str, FrameIndex | InputError] = field(default_factory=dict)
+    _indexes: dict[str, FrameIndex | tuple[int, int] | InputError] = field(default_factory=dict)
     _jobs: set[str] = field(default_factory=set)
     _copying: dict[str, str] = field(default_factory=dict)
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
@@ -175,15 +179,15 @@ class Drafts:
             file: its id and name in the match folder are chosen here.
 
         Raises:
-            InputError: the file is no video and no file of a match folder, the file is empty, the
-                disk is too small for it, or the draft has too many files.
+            InputError: the file is no video, still or file of a match folder, the file is empty,
+                the disk is too small for it, or the draft has too many files.
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
-        if title not in MATCH_FILES and not is_video(title):
-            known = " ".join(VIDEO_SUFFIXES)
+        if title not in MATCH_FILES and not _is_footage(title):
+            known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
             raise _refusal(
                 title,
-                f"a video ({known}) or one of {', '.join(sorted(MATCH_FILES))}",
+                f"{known} or one of {', '.join(sorted(MATCH_FILES))}",
                 "another file",
                 "Convert a video with any video tool.",
             )
@@ -239,6 +243,22 @@ class Drafts:
                 )
             self._write_piece(draft_id, file, chunk)
             return True, received + len(chunk)
+
+    def frame(self, draft_id: str, file_id: str, number: int, width: int) -> NDArray[np.uint8]:
+        """Return a frame of a video (height, width, 3) RGB, scaled to a width [px].
+
+        Raises:
+            InputError: there is no such video or frame, or the frame is damaged.
+        """
+        _, file = self._find(draft_id, file_id)
+        index = self._indexes.get(f"{draft_id} {file_id}")
+        if not isinstance(index, FrameIndex) or not 0 <= number < len(index):
+            raise _refusal(file.title, f"a video with frame {number}", "none", "Choose another.")
+        with VideoReader(self._whole(draft_id, file), index) as video:
+            for _, image in video.readable(number, number + 1, width=min(width, index.size[0])):
+                if image is not None:
+                    return image
+        raise _refusal(file.title, f"frame {number}", "a damaged one", "Choose another frame.")
 
     def view(self, draft_id: str) -> dict[str, Any]:
         """Return a draft for the pages, with all that is wrong or missing.
@@ -353,7 +373,9 @@ class Drafts:
                 raise
             size = before + len(piece)
         if size == file.size:
-            part.rename(self._whole(draft_id, file))
+            whole = self._whole(draft_id, file)
+            whole.parent.mkdir(exist_ok=True)
+            part.rename(whole)
 
     def _describe_file(self, draft_id: str, file: DraftFile) -> dict[str, Any]:
         """Return the state of a file; begin what is to be done with it in the background."""
@@ -367,7 +389,7 @@ class Drafts:
             if not problem:
                 self._begin(key, self._copy, draft_id, file)
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
-        if not is_video(file.name):
+        if not _is_footage(file.name):
             return {**content, "state": "ready"}
         index = self._indexes.get(key)
         if index is None:
@@ -376,8 +398,10 @@ class Drafts:
         if isinstance(index, InputError):
             problem = f"expected {index.expected}, found {_shorten(index.found)}. {index.todo}"
             return {**content, "state": "broken", "problem": problem}
-        width, height = index.size
-        shape = {"width": width, "height": height, "fps": index.fps, "frames": len(index)}
+        size = index.size if isinstance(index, FrameIndex) else index
+        shape: dict[str, Any] = dict(zip(("width", "height"), size, strict=True))
+        if isinstance(index, FrameIndex):
+            shape |= {"fps": index.fps, "frames": len(index)}
         return {**content, "state": "ready", **shape}
 
     def _begin(self, key: str, job: Any, draft_id: str, file: DraftFile) -> None:  # noqa: ANN401
@@ -406,7 +430,7 @@ class Drafts:
     def _read_index(self, key: str, draft_id: str, file: DraftFile) -> None:
         path = self._whole(draft_id, file)
         try:
-            self._indexes[key] = index_frames(path)
+            self._indexes[key] = index_frames(path) if is_video(file.name) else _still_size(path)
         except InputError as error:
             self._indexes[key] = error
 
@@ -443,9 +467,10 @@ class Drafts:
         ]
         cameras = draft.content.get("cameras")
         used = {
-            str(camera.get("video"))
+            str(camera.get(key))
             for camera in (cameras if isinstance(cameras, list) else [])
             if isinstance(camera, dict)
+            for key in ("video", "still")
         }
         for file in files:
             title, state = str(file["title"]), file["state"]
@@ -456,7 +481,7 @@ class Drafts:
                 "reading": f"{title} is being read",
                 "broken": f"{title}: {file['problem']}",
             }.get(state)
-            if said is None and is_video(title) and file["name"] not in used:
+            if said is None and _is_footage(title) and file["name"] not in used:
                 said = f"{title} belongs to no camera: choose it at its camera, or remove it"
             if said is not None:
                 found.append({"place": f"file {file['id']}", "message": said})
@@ -493,6 +518,16 @@ class Drafts:
             except InputError as error:
                 number = numbers[owners.get(unit) or unit]
                 yield {**_describe(error, match.folder), "place": f"cameras[{number}].video"}
+        for camera, path in match.stills.items():
+            size = (match.spec.camera(camera).width, match.spec.camera(camera).height)
+            file = by_name[path.relative_to(match.folder).as_posix()]
+            if self._indexes.get(f"{draft.id} {file.id}") == size:
+                continue
+            try:
+                read_still(path, size)
+            except InputError as error:
+                place = f"cameras[{numbers[camera]}].still"
+                yield {**_describe(error, match.folder), "place": place}
 
 
 _QUEUES: Final = ("urgent", "background")
@@ -518,9 +553,26 @@ def _choose_name(title: str, taken: set[str]) -> str:
             raise _refusal(title, "one such file", "a second one", "Remove the first one.")
         return title
     stem, suffix = PurePosixPath(title).stem, PurePosixPath(title).suffix.lower()
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or "video"
-    names = (f"videos/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
+    folder, usual = ("videos", "video") if is_video(title) else ("stills", "still")
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-")[:80] or usual
+    names = (f"{folder}/{stem}{end}{suffix}" for end in ("", *(f"-{n}" for n in range(2, 999))))
     return next(name for name in names if name not in taken)
+
+
+def _is_footage(name: str) -> bool:
+    """Return whether a file is a video or a still, which belongs to a camera."""
+    return is_video(name) or PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+
+
+def _still_size(path: Path) -> tuple[int, int]:
+    """Return width and height [px] of a still.
+
+    Raises:
+        InputError: no image.
+    """
+    size = declared_size(np.fromfile(path, dtype=np.uint8, count=HEADER_BYTES)) or (0, 0)
+    read_still(path, size)
+    return size
 
 
 def _shorten(text: str) -> str:

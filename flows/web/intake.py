@@ -9,8 +9,9 @@ from pathlib import Path
 from threading import Thread
 from typing import Annotated, Any, Final
 
+import cv2
 from fastapi import APIRouter, HTTPException, Query, Request
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import Field, JsonValue
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -27,6 +28,8 @@ CHUNK_BYTES: Final = 1 << 23
 """Maximum size of one chunk of an upload [byte]."""
 CHUNK_SUFFIX: Final = "/bytes"
 """Suffix of the paths that take chunks; all others take JSON."""
+FRAME_PX: Final = 960
+"""Maximum width of the frames that a page compares [px]."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,12 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
         # Writing waits for the disk: other requests are answered meanwhile.
         is_taken, received = await run_in_threadpool(drafts.append, draft, file, offset, chunk)
         return JSONResponse({"received": received}, status_code=200 if is_taken else 409)
+
+    @router.get("/{draft}/files/{file}/frames/{number}")
+    def frame(draft: str, file: str, number: int) -> Response:
+        image = drafts.frame(draft, file, number, FRAME_PX)
+        content = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+        return Response(bytes(content), media_type="image/jpeg")
 
     @router.post("/{draft}/files/{file}/removal")
     def remove(draft: str, file: str) -> dict[str, Any]:

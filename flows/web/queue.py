@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from threading import Lock
 from typing import Any, Final
@@ -12,6 +13,7 @@ from typing import Any, Final
 from fastapi import APIRouter
 
 from data_contracts.review import ReviewRequest
+from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
@@ -58,7 +60,7 @@ def routes(context: PageContext) -> APIRouter:
                     "given": camera.id in folder.calibrations,
                     "clicks": _clicks(opened, camera.id),
                     "has_picture": camera.id in folder.stills or camera.id in folder.videos,
-                    "figures": _figures(context, opened, f"static_calibration/{camera.id}"),
+                    "figures": _figures(context, opened, camera.id),
                 }
                 for camera in folder.spec.static_cameras
             ],
@@ -257,6 +259,18 @@ def _clicks(match: Match, camera: str) -> int:
     return 0 if clicked is None else len(clicked.points) + len(clicked.drawn)
 
 
-def _figures(context: PageContext, match: Match, unit: str) -> dict[str, float]:
+def _figures(context: PageContext, match: Match, camera: str) -> dict[str, float]:
+    """Return a camera's metrics in the latest run, or before it those of the preview."""
     latest = latest_run(context.store, match.match_id)
-    return {} if latest is None else latest.figures.get(unit, {})
+    figures = {} if latest is None else latest.figures.get(f"static_calibration/{camera}", {})
+    clicked = match.folder.clicked.get(camera)
+    if figures or clicked is None:
+        return figures
+    previewed, errors = context.previews.get((match.match_id, camera), (None, {}))
+    is_same = previewed is not None and _list_marks(previewed) == _list_marks(clicked)
+    return {name: value for name, value in errors.items() if is_same and isfinite(value)}
+
+
+def _list_marks(clicked: ClickedMarkings) -> set[tuple[Any, ...]]:
+    points = {(point.name, *point.xy) for point in clicked.points}
+    return points | {(marking.name, *marking.xy) for marking in clicked.drawn}

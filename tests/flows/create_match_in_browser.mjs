@@ -63,6 +63,34 @@ await page.fill('[data-field="match_id"]', "cup_final");
 await page.waitForSelector("text=Nothing is missing");
 await page.locator("select[data-side]").first().selectOption("far");
 await page.waitForSelector("text=Nothing is missing");
+
+// One moment is frame 5 of the first video and frame 8 of the second: the second camera's clock offset is 3.
+await page.click("[data-offsets]");
+const frames = page.locator("dialog input[type=number]");
+await frames.nth(0).fill("5");
+await frames.nth(1).fill("8");
+await page.waitForFunction(() => {
+  const [one, other] = [...document.querySelectorAll("dialog img")];
+  return one.src.endsWith("/5") && other.src.endsWith("/8") && one.naturalWidth && other.naturalWidth;
+});
+for (const [width, height] of [[1440, 900], [390, 844]]) {
+  await page.setViewportSize({ width, height });
+  seen[`overflow_dialog_${width}`] = await page.evaluate(() => document.querySelector("dialog").scrollWidth - document.querySelector("dialog").clientWidth);
+  await shoot(page, `offsets_${width}`);
+}
+await page.setViewportSize({ width: 1366, height: 900 });
+await page.click("[data-use]");
+
+// A still of a camera, and a roster from a list.
+await page.setInputFiles("[data-upload]", task.still);
+await page.waitForSelector('li[data-file="first.png"][data-state="ready"]');
+await page.locator("select[data-still]").first().selectOption("stills/first.png");
+await page.click("text=Paste a list");
+await page.fill("[data-paste]", "kane; Harry Kane; England\npickford\tJordan Pickford\tEngland\tgoalkeeper");
+await page.click("text=Add these people");
+await page.waitForSelector("[data-person='1']");
+await page.waitForSelector('[data-saving="saved"]');
+await page.waitForSelector("text=Nothing is missing");
 for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
   await page.setViewportSize({ width, height });
   seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);

@@ -1,6 +1,6 @@
 // Drives the review pages as a person would; prints what it saw as one JSON object.
 
-import { logIn, open, shoot, task, tell } from "../chromium.mjs";
+import { clicking, logIn, open, shoot, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [], states: [] };
 const page = await open(seen);
@@ -15,35 +15,12 @@ await page.click(`a.name[href="#/match/${match}"]`);
 await page.click(`p.note a >> text=${task.camera}`);
 await page.waitForSelector(".stage canvas");
 await shot("nothing");
-const box = await page.locator(".stage").boundingBox();
-const scale = Math.min(box.width / task.size[0], box.height / task.size[1]);
-const corner = [box.x + (box.width - scale * task.size[0]) / 2, box.y + (box.height - scale * task.size[1]) / 2];
-const middle = [box.x + box.width / 2, box.y + box.height / 2];
-const hundredth = (value) => Math.round(100 * value) / 100;
-const choose = (name) => page.locator(`[data-name="${name}"]`).first().dispatchEvent("click");
-
-// Roughly in the whole picture, then close up.
-async function click([x, y]) {
-  const rough = [Math.round(corner[0] + scale * x), Math.round(corner[1] + scale * y)];
-  await page.mouse.click(...rough);
-  return rough.map((value, k) => hundredth((value - corner[k]) / scale));
-}
-for (const [name, place] of Object.entries(task.points)) {
-  await choose(name);
-  const rough = await click(place);
-  await page.keyboard.press("z");
-  for (let k = 0; k < 3; k++) await page.keyboard.press("+");
-  await page.mouse.move(...middle);
-  await page.mouse.down();
-  await page.mouse.move(...place.map((value, k) => middle[k] + 6 * 1.4 ** 3 * (value - rough[k])), { steps: 3 });
-  await page.mouse.up();
-  await page.keyboard.press("0");
-}
+const { middle, choose, click, place, saved } = await clicking(page, task.size);
+for (const [name, at] of Object.entries(task.points)) await place(name, at);
 for (const [name, places] of Object.entries(task.lines)) {
   await choose(name);
-  for (const place of places) await click(place);
+  for (const at of places) await click(at);
 }
-const saved = () => page.waitForSelector('[data-state="saved"]', { timeout: 60000 });
 await saved();
 await page.waitForSelector('[data-figure="lines"]', { timeout: 60000 });
 seen.figures = await page.locator("[data-figure]").allTextContents();

@@ -1,6 +1,6 @@
 // Looks at the 3D view of a complete run; prints what it saw as one JSON object.
 
-import { logIn, open, shoot, task, tell } from "../chromium.mjs";
+import { logIn, open, shoot, shootSizes, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [] };
 const page = await open(seen, 900);
@@ -11,12 +11,7 @@ await page.waitForSelector('[data-scene="ready"]');
 const canvas = page.locator("[data-scene]");
 await page.waitForTimeout(1500);
 await canvas.screenshot({ path: task.picture });
-for (const [width, height] of [[1440, 900], [1280, 720], [390, 844]]) {
-  await page.setViewportSize({ width, height });
-  await page.waitForTimeout(700);
-  seen[`overflow_${width}`] = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
-  await shoot(page, `view_${width}`);
-}
+await shootSizes(page, seen, "view");
 await page.setViewportSize({ width: 1280, height: 720 });
 seen.first = Number(await canvas.getAttribute("data-frame"));
 await page.locator("[data-scrub]").fill("7");
@@ -44,5 +39,22 @@ if (await page.locator("[data-watch]").count()) {
   seen.video_s = await page.evaluate(() => document.querySelector("video").currentTime);
   await canvas.scrollIntoViewIfNeeded();
   await shoot(page, "video");
+}
+// The report has the same view, as the pages serve it and as a file; the wheel scrolls the report until the view is clicked.
+seen.reports = [];
+for (const address of [`${task.base}/api/matches/${encodeURIComponent(task.match)}/results/report`, `file://${task.report}`]) {
+  await page.goto(address);
+  const frame = page.frameLocator("iframe");
+  await frame.locator('[data-scene="ready"]').waitFor();
+  await page.locator("iframe").scrollIntoViewIfNeeded();
+  await page.waitForTimeout(1500);
+  const name = await frame.locator(".people button").count();
+  const at = await frame.locator("[data-scene]").boundingBox();
+  await page.mouse.move(at.x + at.width / 2, at.y + at.height / 2);
+  const before = await page.evaluate(() => scrollY);
+  await page.mouse.wheel(0, 120);
+  await page.waitForTimeout(500);
+  seen.reports.push([name, (await page.evaluate(() => scrollY)) - before]);
+  await shootSizes(page, seen, "report");
 }
 await tell(seen);

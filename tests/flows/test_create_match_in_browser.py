@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import page_client
 import pytest
@@ -50,6 +51,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     recordings.mkdir(parents=True)
     write_noise(tmp_path / "first.mp4", 60)
     write_noise(recordings / "second.mp4", 40)
+    cv2.imwrite(str(tmp_path / "first.png"), np.full((180, 320, 3), 90, dtype=np.uint8))
     size = (tmp_path / "first.mp4").stat().st_size
     assert size > 2_000_000
     port, signal = page_client.free_port(), tmp_path / "signal"
@@ -72,6 +74,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
             "base": base,
             "token": page_client.TOKEN,
             "video": str(tmp_path / "first.mp4"),
+            "still": str(tmp_path / "first.png"),
             "size": size,
             "signal": str(signal),
         }
@@ -86,6 +89,7 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert seen["kept"] >= 0.4 * size  # nothing that was sent before is sent again
     assert "letters, digits" in seen["message"]
     assert [seen[f"overflow_{width}"] for width in (1440, 1280, 390)] == [0, 0, 0]
+    assert [seen[f"overflow_dialog_{width}"] for width in (1440, 390)] == [0, 0]
     match = read_match(tmp_path / "inbox" / "cup_final")
     assert match.spec.cameras[0].side == "far"
     assert match.spec.cameras[1].side is None
@@ -94,3 +98,9 @@ def test_a_match_is_created_through_a_restart_and_a_reload(tmp_path):
     assert first == (tmp_path / "first.mp4").read_bytes()
     assert second == (recordings / "second.mp4").read_bytes()
     assert (match.spec.fps, match.spec.clips[0].frame_count) == (25, 40)
+    assert [camera.offset_frames for camera in match.spec.cameras] == [0, 3]
+    assert match.stills["first"].read_bytes() == (tmp_path / "first.png").read_bytes()
+    assert [(each.id, each.name, each.role) for each in match.spec.roster] == [
+        ("kane", "Harry Kane", "player"),
+        ("pickford", "Jordan Pickford", "goalkeeper"),
+    ]

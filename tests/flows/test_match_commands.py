@@ -13,7 +13,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.run import RunRecord, UnitFailure, WaitingUnit
 from flows.cli import run as run_command
 from flows.cli.app import app
-from flows.registering import open_for_review, register
+from flows.registering import find_registration, open_for_review, register
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.store import Store
@@ -192,3 +192,13 @@ def test_an_option_that_a_scenario_does_not_have_is_refused(tmp_path, scenario, 
     assert isinstance(done.exception, UsageError)
     assert done.exception.where == option
     assert not (tmp_path / "out").exists()
+
+
+def test_a_misspelt_match_or_scenario_is_guessed(store, tmp_path):
+    register(store, made(tmp_path / "cup_final", "cup_final"), unfinished=True)
+    with pytest.raises(InputError, match=r"Did you mean 'cup_final'\? If not, register the match"):
+        find_registration(store, "cup_fnal")
+    with pytest.raises(InputError, match=r"found 'derby'\. Register the match"):
+        find_registration(store, "derby")
+    words = ["simulate", "--scenario", "tinny", "--out", str(tmp_path / "out")]
+    assert "Did you mean 'tiny'?" in str(CliRunner().invoke(app, words).exception)

@@ -5,6 +5,7 @@ import shutil
 import threading
 import time
 
+import cv2
 import numpy as np
 import page_client
 import pytest
@@ -229,6 +230,70 @@ def test_a_video_is_picked_from_a_named_folder(place, footage):
     copied = place / "inbox" / "final" / "videos" / "cam.mp4"
     assert not copied.is_symlink()
     assert copied.stat().st_ino != (recordings / "cam.mp4").stat().st_ino
+
+
+def add_still(browser, draft, tmp_path, size):
+    """Upload an image of a size; return the draft."""
+    file = tmp_path / "near left.png"
+    cv2.imwrite(str(file), np.full((size[1], size[0], 3), 90, dtype=np.uint8))
+    new = {"name": file.name, "size": file.stat().st_size}
+    file_id = browser.post(f"{DRAFTS}/{draft}/files", json=new).json()["file"]
+    assert put(browser, draft, file_id, 0, file.read_bytes()).status_code == 200
+    return settle(browser, draft)
+
+
+def test_a_still_and_a_roster_arrive_with_the_match(place, footage, tmp_path):
+    ada = open_pages(place)
+    draft, _ = upload(ada, footage)
+    view = add_still(ada, draft, tmp_path, SIZE)
+    video, still = view["files"]
+    assert (still["name"], still["width"], still["height"]) == ("stills/near_left.png", *SIZE)
+    roster = [{"id": "kane", "name": "Harry Kane", "team": "England", "role": "player"}]
+    view = save(ada, view, a_match(video["name"], roster=roster)).json()
+    (problem,) = view["problems"]
+    assert "near left.png belongs to no camera" in problem["message"]
+    content = a_match(video["name"], camera={"still": still["name"]}, roster=roster)
+    view = save(ada, view, content).json()
+    assert view["problems"] == []
+    ada.post(f"{DRAFTS}/{draft}/finish", json={})
+    match = read_match(place / "inbox" / "final")
+    assert match.stills["near_left"].name == "near_left.png"
+    assert [person.name for person in match.spec.roster] == ["Harry Kane"]
+
+
+def test_a_still_of_another_size_is_said_at_its_field(place, footage, tmp_path):
+    ada = open_pages(place)
+    draft, _ = upload(ada, footage)
+    view = add_still(ada, draft, tmp_path, (SIZE[0] + 2, SIZE[1]))
+    video, still = view["files"]
+    view = save(ada, view, a_match(video["name"], camera={"still": still["name"]})).json()
+    (problem,) = view["problems"]
+    assert problem["place"] == "cameras[0].still"
+    assert "expected 96 x 64 px" in problem["message"]
+    assert "found 98 x 64" in problem["message"]
+    # A file that is no image is none, whatever is chosen.
+    content = a_match(video["name"], camera={"still": video["name"]})
+    ada.post(f"{DRAFTS}/{draft}/files/{still['id']}/removal", json={})
+    (problem,) = save(ada, view, content).json()["problems"]
+    assert "expected a PNG or JPEG image" in problem["message"]
+
+
+def test_frames_of_an_uploaded_video_are_shown(place, footage):
+    ada = open_pages(place)
+    draft, view = upload(ada, footage)
+    path = f"{DRAFTS}/{draft}/files/{view['files'][0]['id']}/frames"
+    shown = {}
+    for number in (0, FRAMES - 1):
+        answer = ada.get(f"{path}/{number}")
+        assert answer.headers["content-type"] == "image/jpeg"
+        shown[number] = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)
+        assert shown[number].shape == (SIZE[1], SIZE[0], 3)
+    # Each frame of the video is brighter by 5 than the one before.
+    change = shown[FRAMES - 1].mean() - shown[0].mean()
+    assert change == pytest.approx(5 * (FRAMES - 1), abs=6)
+    for number in (FRAMES, -1):
+        assert ada.get(f"{path}/{number}").status_code == 422
+    assert page_client.browser(ada.app).get(f"{path}/0").status_code == 401
 
 
 def test_an_interrupted_copy_continues_after_a_restart(place, footage):

@@ -106,3 +106,21 @@ def test_a_match_that_nobody_clicked_is_clicked_from_nothing(
     assert ada.post(f"{path}/corrections", json=edit).is_success
     assert ada.get(f"{path}/pictures/cam00").json()["points"] == {"center_mark": [900.0, 500.0]}
     assert ada.get(path).json()["to_click"] == []
+    # Before a run the match has the expected errors of the last preview, if its clicks are saved.
+    errors = "expected_ground_error_median_m", "expected_ground_error_p95_m"
+
+    def expected():
+        return {each["id"]: each["figures"] for each in ada.get(path).json()["cameras"]}
+
+    assert not any(expected().values())
+    pictures = f"{path}/pictures/cam01"
+    seen = ada.get(pictures).json()
+    clicked = {"points": seen["points"], "drawn": seen["drawn"]}
+    found = ada.post(f"{pictures}/preview", json=clicked).json()
+    assert [expected()["cam01"][name] for name in errors] == pytest.approx(
+        [found["median"], found["p95"]], rel=1e-3
+    )
+    name, place = next(iter(seen["points"].items()))
+    clicked["points"][name] = [place[0] + 0.5, place[1]]
+    ada.post(f"{pictures}/preview", json=clicked)  # while it is dragged
+    assert expected()["cam01"] == {}

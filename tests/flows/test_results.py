@@ -1,5 +1,6 @@
 """Outputs of a run: metrics against ground truth, exported files, a page, labelled arrays."""
 
+import base64
 import json
 import re
 from html.parser import HTMLParser
@@ -11,10 +12,13 @@ import yaml
 from command_line import TINY, succeed, worldpose
 
 from data_contracts.conventions import COCO17
+from flows.registering import open_match
+from flows.reports import viewer
 from worldpose import open_run
 from worldpose.body import fold_keypoints, load_open_body
 from worldpose.formats import read_camera, read_joints
 from worldpose.formats.joints_file import read_poses
+from worldpose.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")
 
@@ -149,6 +153,27 @@ def test_the_release_layout_holds_bodies_whose_keypoints_are_the_run_s_joints(ti
         )
 
 
+def test_the_view_of_a_report_is_cut_where_it_would_be_too_large(tiny, tiny_run, monkeypatch):
+    store = Store.open(str(tiny_run))
+    match, run = open_match(store, TINY), open_run(tiny_run, TINY)
+    (whole,), said = viewer.report_viewer(run, match)
+    assert said == ""
+    monkeypatch.setattr(viewer, "REPORT_POSES", 5 * 11 + 4)  # of five people
+    (page,), said = viewer.report_viewer(run, match)
+    assert "first 0.4 s of 1.2 s" in said
+    frames = [
+        json.loads(re.search(r'"frames":(\d+)', _scene(each.html))[1]) for each in (whole, page)
+    ]
+    assert frames == [30, 11]
+    monkeypatch.setattr(viewer, "REPORT_POSES", 4)
+    assert viewer.report_viewer(run, match) == ((), "")
+
+
+def _scene(html):
+    data = re.search(r'data-part="scene">([^<]*)</script>', html)[1]
+    return base64.b64decode(data).decode("latin-1")
+
+
 def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     out = tmp_path / "report.html"
     succeed("report", tiny, "--out", out, "--project", tiny_run)
@@ -157,7 +182,7 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     outside.feed(page)
     assert outside.asked == []
     assert page.count('src="data:image/') == 10
-    assert page.count('<div class="scene">') == 1
+    assert page.count("<iframe") == 1
     assert "Mean joint error" in page
     assert "expected ground error" in page
     people = re.search(r"<h2[^>]*>People</h2>.*?</table>", page, re.DOTALL)

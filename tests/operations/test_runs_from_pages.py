@@ -5,6 +5,7 @@ import shutil
 import signal
 import time
 from datetime import datetime
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -118,8 +119,9 @@ def test_a_service_killed_at_random_moments_loses_and_doubles_nothing(
     shutil.copytree(small_match, arriving)
     arriving.rename(arriving.with_name("arrived"))
     browser = Browser(served)
-    for name in names:
-        browser.ask(f"/api/matches/{name}/runs", {"gates": "never"})
+    for name in names:  # a person starts a run again that was not acknowledged
+        start = partial(browser.ask, f"/api/matches/{name}/runs", {"gates": "never"})
+        wait_until(start, served.explain)
     for _ in range(3):
         time.sleep(rng.uniform(1.0, 60.0))
         assert served.end(signal.SIGKILL) == 0

@@ -12,7 +12,7 @@ import json
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any, Final
@@ -106,6 +106,25 @@ class ViewerClip:
     """Texts about the data by a short name, such as `licence`."""
     video: Mapping[str, Any] | None = None
     """Camera, first match frame, number of frames and step [frame] of the clip's video."""
+
+    @property
+    def has_people(self) -> bool:
+        """Whether a person has joints, a body or a place on the pitch."""
+        shown = np.isfinite(self.joints).any() or np.isfinite(self.ground[..., 0]).any()
+        return bool(shown) or len(self.with_body) > 0
+
+    def first_frames(self, count: int) -> ViewerClip:
+        """Return the clip's first frames, `count` at most."""
+        return replace(
+            self,
+            frames=self.frames[:count],
+            joints=self.joints[:count],
+            spread=self.spread[:count],
+            views=self.views[:count],
+            ground=self.ground[:count],
+            bodies=None if self.bodies is None else self.bodies[:count],
+            broadcast=None if self.broadcast is None else self.broadcast[:count],
+        )
 
     @property
     def range_frames(self) -> int:
@@ -250,26 +269,33 @@ def write_viewer(
     Raises:
         InputError: nobody is in the clips, or the file would be too large.
     """
-    if not any(_anyone(clip) for clip in clips):
+    if not any(clip.has_people for clip in clips):
         raise InputError(
             str(path),
             expected="a person with joints, a body or a place on the pitch",
             found="none in " + ", ".join(clip.clip for clip in clips),
             todo="Run the match to the end, and see with `worldpose status` what it found.",
         )
-    before, _, after = page.partition(_DATA)
-    notes = clips[0].notes
-    title = escape(f"{notes.get('match', 'worldpose')}: {', '.join(c.clip for c in clips)}")
     size = 0
     with whole_file(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
-        size += file.write(before.replace(_TITLE, f"<title>{title}</title>"))
-        for number, clip in enumerate(clips):
-            for name, data in _parts(clip, videos.get(clip.clip)):
-                size += file.write(_SCRIPT.format(number, name))
-                size += file.write(base64.b64encode(data).decode())
-                size += file.write("</script>\n")
-                _require_size(path, size)
-        file.write(after)
+        for piece in viewer_pieces(page, clips, videos):
+            size += file.write(piece)
+            _require_size(path, size)
+
+
+def viewer_pieces(
+    page: str, clips: Sequence[ViewerClip], videos: Mapping[str, Path]
+) -> Iterator[str]:
+    """Yield the text of a page with clips inside, as `write_viewer` writes it."""
+    before, _, after = page.partition(_DATA)
+    title = escape(
+        f"{clips[0].notes.get('match', 'worldpose')}: {', '.join(c.clip for c in clips)}"
+    )
+    yield before.replace(_TITLE, f"<title>{title}</title>")
+    for number, clip in enumerate(clips):
+        for name, data in _parts(clip, videos.get(clip.clip)):
+            yield f"{_SCRIPT.format(number, name)}{base64.b64encode(data).decode()}</script>\n"
+    yield after
 
 
 def read_viewer(path: Path) -> list[dict[str, bytes]]:
@@ -297,11 +323,6 @@ def _require_size(path: Path, size: int) -> None:
             todo="Cut the match into shorter clips, export a folder with a file per clip, or leave "
             "out --video.",
         )
-
-
-def _anyone(clip: ViewerClip) -> bool:
-    shown = np.isfinite(clip.joints).any() or np.isfinite(clip.ground[..., 0]).any()
-    return bool(shown) or len(clip.with_body) > 0
 
 
 def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:

@@ -205,7 +205,7 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     """Return the image (height, width, 3), RGB.
 
     Args:
-        path: a PNG file.
+        path: a PNG or JPEG file.
         image_size: width and height of the camera [px].
 
     Raises:
@@ -228,7 +228,7 @@ def read_still(path: str | os.PathLike[str], image_size: tuple[int, int]) -> NDA
     if image is None:
         raise InputError(
             str(path),
-            expected=f"a PNG image of at most {STILL_BYTES} bytes",
+            expected=f"a PNG or JPEG image of at most {STILL_BYTES} bytes",
             found=f"{size} bytes that are none",
             todo="Export the still again.",
         )

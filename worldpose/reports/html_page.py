@@ -1,12 +1,11 @@
-"""Self-contained HTML pages from images, tables and scenes, without external resources."""
+"""Self-contained HTML pages from images, tables and embedded pages; they load nothing."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import json
-import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -14,143 +13,32 @@ from itertools import count
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-
-from data_contracts.conventions import COCO17_BONES
-from data_contracts.pitch import PitchSpec
-from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry import Camera
-
-UNIT: Final = 0.005
-"""Resolution of joint coordinates [m]: 164 m to either side fit into 16 bits."""
-MISSING: Final = -32768
-RATE: Final = 25.0
-"""Maximum frames per second [1/s]; the browser interpolates."""
-NUMBERS: Final = 1_500_000
-"""Maximum coordinates per clip: 4 MB of text, or 58 s of 20 people."""
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Content of the 3D view of one clip.
+@dataclass(frozen=True)
+class EmbeddedPage:
+    """A whole HTML page that is shown in a frame of its own, such as the 3D viewer with clips.
 
     Attributes:
-        caption: names the clip.
-        tracks: all people.
-        fps: frames per second [1/s].
-        cameras: single static cameras by id.
-        broadcast: a batch, one per frame of `tracks`; None without a broadcast camera.
-        pitch: draw its markings; None without a pitch.
+        title: names the frame to screen readers.
+        html: the page; its scripts are modules and stand inside.
     """
 
-    caption: str
-    tracks: JointTracks
-    fps: float
-    cameras: Mapping[str, Camera]
-    broadcast: Camera | None = None
-    pitch: PitchSpec | None = None
+    title: str
+    html: str
 
 
-def scene_html(scene: Scene) -> str:
-    """Return the HTML of a scene for the page's script."""
-    data = json.dumps(_content(scene), separators=(",", ":"), allow_nan=False)
-    # Only this text could end the enclosing element.
-    data = data.replace("</", "<\\/")
-    buttons = "".join(
-        f'<button type="button" data-do="{name}">{label}</button>'
-        for name, label in (
-            ("play", "Play"),
-            ("home", "Perspective"),
-            ("above", "From above"),
-            ("side", "From the side"),
-            ("through", "Broadcast camera"),
-        )
-    )
-    caption = escape(scene.caption)
-    return (
-        f'<div class="scene"><canvas tabindex="0" role="img" aria-label="{caption}"></canvas>'
-        f'<div class="bar">{buttons}<input type="range" min="0" value="0" step="any" '
-        'aria-label="Time"><output></output></div>'
-        f'<script type="application/json">{data}</script></div>'
-    )
+@dataclass(frozen=True)
+class LinkedFile:
+    """A file beside the page, which a reader opens by a link.
 
+    Attributes:
+        title: text of the link.
+        name: name of the file, in the folder of the page.
+    """
 
-def _content(scene: Scene) -> dict[str, object]:
-    from worldpose.reports.drawing import HIPS, markings, person_color
-
-    joints = scene.tracks.joints
-    every = max(round(scene.fps / RATE), math.ceil(joints.size / NUMBERS), 1)
-    shown = joints[::every]
-    hips = shown[:, :, HIPS].mean(2)
-    there = hips[np.isfinite(hips).all(-1)]
-    there = there if len(there) else np.zeros((1, 3))
-    low, high = np.percentile(there[:, :2], [2, 98], axis=0)
-    middle = 0.5 * (low + high)
-    return {
-        "first": int(scene.tracks.frames[0]) if len(scene.tracks.frames) else 0,
-        "every": every,
-        "fps": scene.fps,
-        "frames": len(shown),
-        "persons": shown.shape[1],
-        "ids": [str(person) for person in scene.tracks.person_ids],
-        "colors": [person_color(int(person)) for person in scene.tracks.person_ids],
-        "bones": [list(bone) for bone in COCO17_BONES],
-        "unit": UNIT,
-        "joints": _text(_whole(shown)),
-        "middle": [*_round_values(middle), 0.8],
-        "reach": round(max(9.0, 0.75 * float(np.linalg.norm(high - low))), 1),
-        "markings": []
-        if scene.pitch is None
-        else [_round_values(line) for line in markings(scene.pitch)],
-        "grid": [] if scene.pitch is not None else _grid(middle),
-        "cameras": [
-            {"name": name, "center": _round_values(camera.center)}
-            for name, camera in scene.cameras.items()
-        ],
-        "broadcast": None
-        if scene.broadcast is None
-        else _text(_moving_camera_rows(scene.broadcast, every)),
-    }
-
-
-def _whole(joints: NDArray[np.float64]) -> NDArray[np.int16]:
-    """Return joints in integer units; `MISSING` for missing or too distant joints."""
-    known = np.isfinite(joints) & (np.abs(joints) < -MISSING * UNIT - 1.0)
-    scaled = np.where(known, joints, 0.0) / UNIT
-    whole = np.where(known.all(-1, keepdims=True), np.round(scaled), MISSING)
-    return whole.astype("<i2")
-
-
-def _moving_camera_rows(camera: Camera, every: int) -> NDArray[np.float32]:
-    """Return rotation, translation, focal length, width and height of every shown frame."""
-    pose = camera.cam_from_world
-    count = len(pose.translation)
-    size = np.broadcast_to(camera.image_size, (count, 2))
-    rows = np.concatenate(
-        [pose.rotation.reshape(count, 9), pose.translation, camera.focal[:, :1], size], axis=1
-    )
-    return rows[::every].astype("<f4")
-
-
-def _grid(middle: NDArray[np.float64]) -> list[list[list[float]]]:
-    """Return a ground grid of 1 m spacing, for scenes without markings."""
-    around = np.round(middle)
-    lines = []
-    for step in np.arange(-8.0, 9.0):
-        for axis in (0, 1):
-            ends = np.zeros((2, 3))
-            ends[:, axis] = around[axis] + step
-            ends[:, 1 - axis] = around[1 - axis] + np.array([-8.0, 8.0])
-            lines.append(_round_values(ends))
-    return lines
-
-
-def _text(numbers: NDArray[np.generic]) -> str:
-    return base64.b64encode(np.ascontiguousarray(numbers).tobytes()).decode("ascii")
-
-
-def _round_values(values: NDArray[np.float64]) -> list:  # type: ignore[type-arg]
-    return np.round(values, 2).tolist()  # type: ignore[no-any-return]
+    title: str
+    name: str
 
 
 @dataclass(frozen=True)
@@ -187,7 +75,7 @@ class Section:
     """
 
     heading: str
-    blocks: tuple[CaptionedImage | Table | Scene, ...]
+    blocks: tuple[CaptionedImage | Table | EmbeddedPage | LinkedFile, ...]
     lead: str = ""
 
 
@@ -226,10 +114,9 @@ def whole_page(
         last: folded tables after the sections.
     """
     shown = [section for section in sections if section.blocks]
-    script = _part("scene.js") if any(map(_has_scene, shown)) else ""
-    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    allowed = " ".join(dict.fromkeys(map(_allow, _scripts(shown))))
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-    policy += f"; script-src 'sha256-{allowed}'" if script else ""
+    policy += f"; script-src {allowed}" if allowed else ""
     numbers = count(1)
     parts = "\n".join(_section(section, next(numbers)) for section in shown)
     links = "".join(
@@ -253,9 +140,7 @@ def whole_page(
         f"<header><div><h1>{escape(title)}</h1><p>{escape(about)}</p>"
         f'<div class="tiles">{marks}</div></div></header>\n'
         f'<nav aria-label="Parts of this page"><div>{links}</div></nav>\n'
-        f"<main>\n{parts}{end}\n</main>\n"
-        + (f"<script>{script}</script>\n" if script else "")
-        + "</body>\n</html>\n"
+        f"<main>\n{parts}{end}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -264,8 +149,18 @@ def _part(name: str) -> str:
     return (files("worldpose.reports") / "page" / name).read_text(encoding="utf-8")
 
 
-def _has_scene(section: Section) -> bool:
-    return any(isinstance(block, Scene) for block in section.blocks)
+def _scripts(sections: Sequence[Section]) -> Iterator[str]:
+    """Yield the scripts of embedded pages, which inherit the policy of this page."""
+    for section in sections:
+        for block in section.blocks:
+            if isinstance(block, EmbeddedPage):
+                yield from re.findall(r'<script type="module">(.*?)</script>', block.html, re.S)
+
+
+def _allow(script: str) -> str:
+    """Return the source of a Content-Security-Policy that allows exactly this script."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return f"'sha256-{digest}'"
 
 
 def _section(section: Section, number: int) -> str:
@@ -276,13 +171,26 @@ def _section(section: Section, number: int) -> str:
     )
 
 
-def _block(block: CaptionedImage | Table | Scene) -> str:
-    if isinstance(block, Scene):
-        return scene_html(block)
+def _block(block: CaptionedImage | Table | EmbeddedPage | LinkedFile) -> str:
+    if isinstance(block, EmbeddedPage):
+        html = block.html.replace("&", "&amp;").replace('"', "&quot;")
+        return f'<iframe title="{escape(block.title)}" srcdoc="{html}"></iframe>'
+    if isinstance(block, LinkedFile):
+        return f'<p><a href="{_relative_address(block.name)}">{escape(block.title)}</a></p>'
     if isinstance(block, CaptionedImage):
         return _figure(block)
     heading = f"<h3>{escape(block.heading)}</h3>\n" if block.heading else ""
     return heading + _table(block.columns, block.rows)
+
+
+def _relative_address(name: str) -> str:
+    """Return a file's name as an address, percent-encoded; the library does not use urllib."""
+    return "".join(
+        letter
+        if letter.isascii() and (letter.isalnum() or letter in "._-")
+        else "".join(f"%{byte:02X}" for byte in letter.encode())
+        for letter in name
+    )
 
 
 def _folded_html(last: Folded) -> str:

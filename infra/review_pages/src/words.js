@@ -8,6 +8,21 @@ export function shown(value) {
   return Number(value.toPrecision(3)).toString();
 }
 
+const UNITS = { m: "m", mm: "mm", px: "px", rad: "rad", deg: "°", s: "s", frames: "frames", hz: "Hz" };
+
+const unitOf = (name) => UNITS[/_([a-z]+)$/.exec(name)?.[1]];
+const withoutUnit = (name) => spoken(unitOf(name) ? name.replace(/_[a-z]+$/, "") : name);
+
+// The name of a metric, `offset_rms_m`, as a title: `offset rms [m]`.
+export const metric = (name) => (unitOf(name) ? `${withoutUnit(name)} [${unitOf(name)}]` : spoken(name));
+
+// Why a gate holds a result, `offset_rms_m is 0.05, at most 0.03 passes`, as a person reads it: `offset rms: 0.05 m, limit 0.03 m`.
+export const reason = (text) =>
+  text.replace(/^(\w+) is (\S+), at most (\S+) passes$/, (_, name, value, limit) => {
+    const behind = unitOf(name) ? ` ${unitOf(name)}` : "";
+    return `${withoutUnit(name)}: ${value}${behind}, limit ${limit}${behind}`;
+  });
+
 // An expected error on the ground, in the unit that a person thinks in.
 export function ground(metres) {
   if (metres === null || metres === undefined) return "–";

@@ -2,6 +2,7 @@ import base64
 import hashlib
 import re
 from datetime import UTC, datetime
+from html import unescape
 from html.parser import HTMLParser
 
 import cv2
@@ -10,8 +11,14 @@ import pytest
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
-from worldpose.formats import JointTracks
-from worldpose.reports import CameraSummary, CaptionedImage, Scene, Section, report_page
+from worldpose.reports import (
+    CameraSummary,
+    CaptionedImage,
+    EmbeddedPage,
+    LinkedFile,
+    Section,
+    report_page,
+)
 from worldpose.reports.html_page import compress_image
 from worldpose.reports.run_report import MEANINGS, camera_table
 
@@ -130,15 +137,22 @@ def test_nothing_is_asked_from_outside():
     assert "script-src" not in text
 
 
-def test_a_scene_brings_the_one_script_that_the_page_may_run():
-    joints = np.full((2, 1, 17, 3), np.nan)
-    scene = Scene("</script>", JointTracks(np.arange(2), np.arange(1), joints), 50.0, {})
-    text = report_page("A run", run(), seconds={}, sections=[Section("3D view", (scene,))])
-    (script,) = re.findall(r"<script>(.*?)</script>", text, re.S)
+def test_an_embedded_page_brings_the_one_script_that_the_page_may_run():
+    script = 'const a = "&amp; <b>" && 1 < 2;'
+    data = '<p title="a">&lt;</p><script data-clip="0">YQ==</script>'
+    block = EmbeddedPage('3D "view"', f'{data}<script type="module">{script}</script>')
+    text = report_page("A run", run(), seconds={}, sections=[Section("3D view", (block,))])
     allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{allowed}'" in text
-    assert text.count("<script") == 2  # the other one is data
+    (frame,) = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)"></iframe>', text)
+    assert [unescape(each) for each in frame] == [block.title, block.html]
     assert Page(text).open == []
+
+
+def test_files_beside_the_page_are_linked():
+    section = Section("Videos", (LinkedFile("goal & corner", 'a "1".mp4'),))
+    text = report_page("A run", run(), seconds={}, sections=[section])
+    assert '<a href="a%20%221%22.mp4">goal &amp; corner</a>' in text
 
 
 def test_parts_without_content_are_left_out():

@@ -1,0 +1,100 @@
+"""An operator's day in a real browser: no command after `worldpose serve`."""
+
+import json
+import random
+import time
+import zipfile
+from pathlib import Path
+from signal import SIGKILL
+from threading import Thread
+
+import pytest
+from chromium import IN_BROWSER, drive
+from command_line import succeed
+from faults.checker import doubled
+from service import TOKEN
+
+from worldpose.store import Store, verify
+
+pytestmark = [*IN_BROWSER, pytest.mark.timeout(3600)]
+SCRIPT = Path(__file__).with_name("day_in_browser.mjs")
+SIZE = (1920, 1080)
+KILLS = 3
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Four videos in a folder, the pitch's file, and where markings are seen in each camera.
+
+    In one camera a click is at the wrong place.
+    """
+    folder = tmp_path / "recorded"
+    few = ("--seed", 5, "--duration", 0.4, "--cameras", 4)
+    succeed("simulate", "--scenario", "tiny", *few, "--render", "--out", folder)
+    clicks = {
+        file.stem: {point["name"]: point["xy"] for point in json.loads(file.read_text())["points"]}
+        for file in sorted((folder / "annotations" / "static_calibration").glob("*.json"))
+    }
+    wrong = json.loads((folder / "reference" / "clicks.json").read_text())
+    assert [camera for camera in clicks if wrong[camera]["wrong"]] == ["cam03"]
+    return folder, clicks
+
+
+def kill_when_asked(served, signal, rng):
+    """Kill the service at a random moment after each signal of the browser, and start it again."""
+    for number in range(KILLS):
+        while not signal.with_suffix(f".{number}").exists():
+            time.sleep(0.2)
+        time.sleep(rng.uniform(0.0, 40.0))
+        served.end(SIGKILL)
+        served.begin()
+        signal.with_suffix(f".{number}.restarted").touch()
+
+
+@pytest.mark.parametrize("seed", [None, 1], ids=["undisturbed", "killed thrice"])
+def test_a_match_of_videos_becomes_results_by_clicks_alone(seed, served, recorded, tmp_path):
+    folder, clicks = recorded
+    served.options = {"--videos": folder / "videos"}
+    served.begin()
+    saved = tmp_path / "joints.zip"
+    task = {
+        "prefect": f"http://127.0.0.1:{served.ports['prefect']}",
+        "pages": f"http://127.0.0.1:{served.ports['pages']}",
+        "token": TOKEN,
+        "login": served.secret("prefect"),
+        "match": "derby",
+        "videos": len(clicks),
+        "pitch": str(folder / "pitch.json"),
+        "clicks": clicks,
+        "size": SIZE,
+        "saved": str(saved),
+        "patience": 1200,
+        "kills": None if seed is None else str(tmp_path / "kill"),
+    }
+    if seed is not None:
+        killing = (served, tmp_path / "kill", random.Random(seed))
+        Thread(target=kill_when_asked, args=killing, daemon=True).start()
+    seen = drive(SCRIPT, task, tmp_path, 3500)
+    assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
+    # The gate asks about the camera with the wrong click, over images of its video.
+    assert seen["asked"] == ["static_calibration/cam03"]
+    assert seen["blank"] == 0
+    assert seen["states"][-1] == "complete"
+    assert seen["named"] == 1
+    store = Store.open(str(served.project))
+    record = store.run("derby")
+    assert (record.state, record.failed, record.waiting) == ("complete", (), ())
+    assert record.figures["static_calibration/cam03"]["clicks_wrong"] == 0
+    assert list(verify(store)) == []
+    assert list(doubled(store)) == []
+    assert [store.unfinished_runs(name) for name in store.matches()] == [()]
+    with zipfile.ZipFile(saved) as archive:
+        assert archive.testzip() is None
+        assert [name for name in archive.namelist() if name.endswith("joints.npz")]
+    deployment = served.ask("/deployments/name/reprocess/worldpose-reprocess")
+    (schedule,) = deployment["schedules"]
+    assert (schedule["active"], schedule["schedule"]["cron"]) == (True, "0 3 * * *")
+    # Nothing was started past the service's one way, and nothing was computed twice.
+    runs = served.ask("/flow_runs/filter", {"flows": {"name": {"any_": ["match"]}}})
+    assert {run["work_pool_name"] for run in runs} == {"worldpose"}
+    assert served.end() == 0
