@@ -1,0 +1,225 @@
+"""Sides of the pitch on which cameras stand, decided by people whom several cameras see (C2).
+
+The pitch looks the same after half a turn, so that the paint in one image does not tell from which
+side it was taken. People do: under the right choice, feet in two images meet on the ground. One
+stated side then decides all cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Integers
+from worldpose.geometry import Camera, Rigid
+from worldpose.pitch import PitchTemplate
+
+MIN_EVIDENCE: Final = 7.0
+"""Minimum log probability ratio that decides a side [1]: a thousand to one."""
+INDEPENDENT_S: Final = 1.0
+"""Time after which people stand elsewhere [s]: frames closer together count together as one."""
+_SHARES: Final = np.array([0.3, 0.6, 0.9])
+"""Shares of one camera's people that the other may have found [1]; the likeliest counts."""
+_CALIBRATION_STD: Final = 0.5
+"""Standard deviation of places by the error of a proposed camera and its clock, each axis [m]."""
+_OUTSIDE: Final = 0.5
+"""Largest distance of people outside of the lines [m]: benches beside both touch lines are as
+alike as the lines."""
+_CELL: Final = 2.0
+"""Cells in which the shared view is measured [m]."""
+_MARGIN: Final = 0.01
+"""Border of the image in which people may be cut off, in image widths [1]."""
+_MIN_AREA: Final = 50.0
+"""Minimum shared area for a comparison [m^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPeople:
+    """People whom one camera sees, placed by their feet with the camera on its assumed side.
+
+    Attributes:
+        camera: the camera.
+        xy: (frames, people, 2) places [m], world; NaN where nobody is.
+        noise: (frames, people, 2, 2) their covariance [m^2].
+    """
+
+    camera: Camera
+    xy: Floats
+    noise: Floats
+
+
+@dataclass(frozen=True)
+class SideDecision:
+    """Whether a camera stands where it is assumed to, or half a turn about the centre spot away.
+
+    Attributes:
+        turned: whether it has to be turned; None = the people do not tell.
+        evidence: log probability ratio of the decision, from the people alone [1].
+        contradicted: whether people contradict the stated side.
+        partners: cameras that see the same people, the surest first.
+    """
+
+    turned: bool | None
+    evidence: float
+    contradicted: bool
+    partners: tuple[str, ...]
+
+
+class _Points(NamedTuple):
+    """People of one camera on the pitch and in view of another: places and covariances."""
+
+    xy: Floats
+    noise: Floats
+    frame: Integers
+
+
+def turn_camera(camera: Camera) -> Camera:
+    """Return a camera after half a turn about the vertical axis through the centre spot."""
+    pose = camera.cam_from_world
+    half = np.array([-1.0, -1.0, 1.0])
+    return replace(camera, cam_from_world=Rigid(pose.rotation * half, pose.translation))
+
+
+def decide_sides(
+    seen: Mapping[str, SeenPeople],
+    stated: Collection[str],
+    pitch: PitchTemplate,
+    seconds: Floats,
+) -> dict[str, SideDecision]:
+    """Return for every camera whether it has to be turned by half a turn.
+
+    Groups of cameras with known relative sides are joined, the surest two first. Those joined to a
+    camera whose side is stated are decided.
+
+    Args:
+        seen: people of each camera, at the same times.
+        stated: cameras whose side is known; they are not turned.
+        pitch: the template.
+        seconds: (frames,) time of each frame [s].
+    """
+    names = tuple(seen)
+    evidence = np.zeros((len(names), len(names)))
+    for a in range(len(names)):
+        for b in range(a + 1, len(names)):
+            same, turned = compare_sides(seen[names[a]], seen[names[b]], pitch, seconds)
+            evidence[a, b] = evidence[b, a] = same - turned
+    sign = np.ones(len(names))
+    anchored = [k for k, name in enumerate(names) if name in stated]
+    groups = [anchored, *([k] for k in range(len(names)) if names[k] not in stated)]
+    surety = np.zeros(len(names))
+    while True:
+        best, pair = MIN_EVIDENCE, (0, 0)
+        for a in range(len(groups)):
+            for b in range(a + 1, len(groups)):
+                total = float(_between(evidence, sign, groups[a], groups[b]).sum())
+                if abs(total) >= best:
+                    best, pair = abs(total), (a, b)
+        if pair == (0, 0):
+            break
+        first, second = (groups[k] for k in pair)
+        joined = _between(evidence, sign, first, second)
+        sign[second] *= np.sign(joined.sum())
+        surety[[*first, *second]] = np.where(
+            surety[[*first, *second]] > 0.0, np.minimum(surety[[*first, *second]], best), best
+        )
+        groups[pair[0]] = [*first, *second]
+        del groups[pair[1]]
+    decided = {}
+    for k, name in enumerate(names):
+        support = evidence[k] * sign[k] * sign
+        others = [j for j in np.argsort(-support, kind="stable") if support[j] > 0.0]
+        total = float(support[groups[0]].sum()) if k in groups[0] else 0.0
+        known = k in groups[0]
+        decided[name] = SideDecision(
+            turned=bool(sign[k] < 0.0) if known else None,
+            evidence=total if k in anchored else float(surety[k]),
+            contradicted=k in anchored and total <= -MIN_EVIDENCE,
+            partners=tuple(names[j] for j in others),
+        )
+    return decided
+
+
+def _between(evidence: Floats, sign: Floats, first: list[int], second: list[int]) -> Floats:
+    """Return the evidence (a, b) between two groups of cameras, as they stand now."""
+    return evidence[np.ix_(first, second)] * sign[first][:, None] * sign[second]
+
+
+def compare_sides(
+    first: SeenPeople, second: SeenPeople, pitch: PitchTemplate, seconds: Floats
+) -> tuple[float, float]:
+    """Return how well people agree if two cameras stand as assumed, and with one of them turned.
+
+    Each is the log probability ratio to people who have nothing to do with each other, under the
+    likeliest share of people whom both cameras found; it is 0 or more, since people whom only one
+    camera found decide nothing.
+
+    Args:
+        first: people of the first camera.
+        second: people of the second camera, at the same times.
+        pitch: the template.
+        seconds: (frames,) time of each frame [s].
+    """
+    frames = max(1, len(seconds))
+    moments = 1.0 + (float(np.ptp(seconds)) / INDEPENDENT_S if len(seconds) else 0.0)
+    weight = min(1.0, moments / frames)
+    return tuple(
+        0.5 * weight * (_agreement(first, other, pitch) + _agreement(other, first, pitch))
+        for other in (second, _turn(second))
+    )  # type: ignore[return-value]
+
+
+def _turn(seen: SeenPeople) -> SeenPeople:
+    """Return the camera and its people after half a turn; covariances stay."""
+    return replace(seen, camera=turn_camera(seen.camera), xy=-seen.xy)
+
+
+def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> float:
+    """Return the log probability ratio of one camera's people, given those of the other."""
+    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width])
+    x, y = (np.arange(-limit + 0.5 * _CELL, limit, _CELL) for limit in limits)
+    cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shared = _sees(own.camera, cells, pitch) & _sees(other.camera, cells, pitch)
+    area = _CELL**2 * float(np.count_nonzero(shared))
+    if area < _MIN_AREA:
+        return 0.0
+    density: list[Floats] = []
+    points, partners = (_shared(a, b, pitch) for a, b in ((own, other), (other, own)))
+    for frame in np.unique(points.frame):
+        here, there = points.frame == frame, partners.frame == frame
+        if not there.any():
+            density.append(np.zeros(np.count_nonzero(here)))
+            continue
+        away = points.xy[here][:, None] - partners.xy[there]
+        spread = points.noise[here][:, None] + partners.noise[there]
+        spread = spread + _CALIBRATION_STD**2 * np.eye(2)
+        squared = (away * np.linalg.solve(spread, away[..., None])[..., 0]).sum(axis=-1)
+        peak = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
+        density.append((peak * np.exp(-0.5 * squared)).mean(axis=1))
+    if not density:
+        return 0.0
+    ratio = area * np.concatenate(density)
+    scores = np.log1p(_SHARES[:, None] * (ratio - 1.0)).sum(axis=1)
+    return float(max(0.0, scores.max()))
+
+
+def _shared(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
+    """Return one camera's people on the pitch whom the other should see."""
+    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _OUTSIDE
+    known = np.isfinite(own.xy[..., 0])
+    frame, _ = np.nonzero(known)
+    xy = own.xy[known]
+    kept = (np.abs(xy) <= limits).all(axis=1) & _sees(other.camera, xy, pitch)
+    return _Points(xy[kept], own.noise[known][kept], frame[kept])
+
+
+def _sees(camera: Camera, xy: Floats, pitch: PitchTemplate) -> Flags:
+    """Return whether places (n, 2) [m] on the pitch are in a camera's image (n,)."""
+    ground = np.concatenate([xy, pitch.height(xy[:, 0], xy[:, 1])[:, None]], axis=1)
+    pixels = camera.project(ground)
+    margin = _MARGIN * float(camera.image_size[0])
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= margin) & (pixels <= camera.image_size - 1.0 - margin)
+    return np.asarray(inside.all(axis=1))
