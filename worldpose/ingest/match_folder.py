@@ -65,12 +65,15 @@ class MatchFolder:
     def to_click(self) -> tuple[str, ...]:
         """Static cameras without calibration and clicks that cannot be proposed either.
 
-        A proposal needs the camera's side, its image and the pitch.
+        A proposal needs the camera's image, the pitch, and the side of one camera at least: a
+        stated one, or that of a camera with clicks or a given calibration.
         """
         known = {*self.calibrations, *self.clicked}
         if self.pitch is not None:
             seen = {*self.stills, *self.videos}
-            known |= {each.id for each in self.spec.cameras if each.side and each.id in seen}
+            sides = {each.id: each.side for each in self.spec.static_cameras if each.id in seen}
+            if known or any(sides.values()):
+                known |= sides.keys()
         return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
 
     @property
@@ -182,8 +185,8 @@ def require_calibrated(match: MatchFolder) -> None:
             needed = (
                 f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or click "
                 f"on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
-                "give the camera a side (near, far, left, right) in match.yaml, so that its image "
-                "is calibrated without clicks; or add the camera to calibration.toml"
+                "give one camera a side (near, far, left, right) in match.yaml, so that the images "
+                "are calibrated without clicks; or add the camera to calibration.toml"
             )
         raise InputError(
             str(match.folder),

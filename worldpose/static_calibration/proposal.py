@@ -10,9 +10,9 @@ The pitch looks the same after half a turn. The side on which the camera stands 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -40,6 +40,7 @@ from worldpose.static_calibration.line_samples import LineSamples, sample_markin
 from worldpose.static_calibration.paint_segments import PaintMap, find_paint
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
+from worldpose.static_calibration.sides import turn_camera
 
 _FOCALS: Final = np.geomspace(0.45, 5.0, 13)
 """Focal lengths to try, in image widths [1]."""
@@ -123,6 +124,76 @@ class Proposal:
         """Whether the proposal may be used without a click."""
         enough = self.found >= MIN_FOUND and self.explained >= MIN_EXPLAINED
         return self.margin >= MIN_MARGIN and enough
+
+    def require_clear(self, where: str) -> None:
+        """Refuse a proposal that may not be used without a click.
+
+        Args:
+            where: file or camera, for messages.
+
+        Raises:
+            InputError: the image shows too little, or other cameras explain it nearly as well; the
+                message says what to click.
+        """
+        if self.is_clear:
+            return
+        lacking = [each.name for each in self.markings if each.found < 0.5]
+        raise InputError(
+            where,
+            expected=f"one camera that explains the paint (margin {MIN_MARGIN:g}, "
+            f"{MIN_FOUND:.0%} of the markings on paint, "
+            f"{MIN_EXPLAINED:.0%} of the paint on markings)",
+            found=f"margin {self.margin:.0f}, {self.found:.0%} and {self.explained:.0%}; "
+            f"not found: {', '.join(lacking[:4]) or 'nothing, but other cameras fit as well'}",
+            todo=_TO_CLICK,
+        )
+
+    def turn(self) -> Proposal:
+        """Return the proposal of the same camera half a turn about the centre spot away."""
+        drawn = tuple(
+            each.model_copy(update={"name": _turn_name(each.name)}) for each in self.drawn.drawn
+        )
+        return replace(
+            self,
+            camera=turn_camera(self.camera),
+            drawn=ClickedMarkings(drawn=drawn),
+            markings=tuple(replace(each, name=_turn_name(each.name)) for each in self.markings),
+        )
+
+    def attributes(self) -> dict[str, Any]:
+        """Return all but the camera, for a store."""
+        return {
+            "drawn": {each.name: [list(xy) for xy in each.xy] for each in self.drawn.drawn},
+            "markings": [[each.name, each.visible_px, each.found] for each in self.markings],
+            "score": self.score,
+            "margin": self.margin,
+            "found": self.found,
+            "explained": self.explained,
+        }
+
+    @classmethod
+    def from_attributes(cls, camera: Camera, stored: Mapping[str, Any]) -> Proposal:
+        """Return a proposal from its camera and its stored attributes."""
+        drawn = tuple(DrawnMarking(name=name, xy=xy) for name, xy in stored["drawn"].items())
+        return cls(
+            camera=camera,
+            drawn=ClickedMarkings(drawn=drawn),
+            markings=tuple(
+                MarkingSupport(name, visible, found) for name, visible, found in stored["markings"]
+            ),
+            score=stored["score"],
+            margin=stored["margin"],
+            found=stored["found"],
+            explained=stored["explained"],
+        )
+
+
+_HALF_TURN: Final = {"left": "right", "right": "left", "near": "far", "far": "near"}
+
+
+def _turn_name(name: str) -> str:
+    """Return the name of the marking that lies half a turn about the centre spot away."""
+    return "_".join(_HALF_TURN.get(word, word) for word in name.split("_"))
 
 
 def propose_camera(
@@ -230,8 +301,33 @@ def calibrate_without_clicks(
     """
     stated = settings or StaticCalibrationSettings()
     proposal = propose_camera(picture, pitch, side=side, prior=stated.prior, lens=lens, where=where)
-    if not proposal.is_clear:
-        raise _unclear(proposal, where)
+    return calibrate_proposal(pitch, proposal, picture, settings=stated, where=where, lens=lens)
+
+
+def calibrate_proposal(
+    pitch: PitchTemplate,
+    proposal: Proposal,
+    picture: Image,
+    *,
+    settings: StaticCalibrationSettings | None = None,
+    where: str = "image",
+    lens: LensCalibration | None = None,
+) -> StaticCalibration:
+    """Return the camera of a clear proposal, its covariance and its report.
+
+    Args:
+        pitch: the stadium's template.
+        proposal: found in the image.
+        picture: (height, width, 3) RGB.
+        settings: noise, prior and thresholds; the defaults if None.
+        where: file or camera, for messages.
+        lens: a lens that was calibrated before; None = not known.
+
+    Raises:
+        InputError: the proposal is not clear, or the calibration disagrees with it.
+    """
+    stated = settings or StaticCalibrationSettings()
+    proposal.require_clear(where)
     height, width = picture.shape[:2]
     calibration = calibrate_camera(
         pitch,
@@ -262,18 +358,6 @@ def calibrate_without_clicks(
     report = calibration.report
     report = replace(report, decisions=(decision, *report.decisions))
     return replace(calibration, report=report)
-
-
-def _unclear(proposal: Proposal, where: str) -> InputError:
-    lacking = [each.name for each in proposal.markings if each.found < 0.5]
-    return InputError(
-        where,
-        expected=f"one camera that explains the paint (margin {MIN_MARGIN:g}, "
-        f"{MIN_FOUND:.0%} of the markings on paint, {MIN_EXPLAINED:.0%} of the paint on markings)",
-        found=f"margin {proposal.margin:.0f}, {proposal.found:.0%} and {proposal.explained:.0%}; "
-        f"not found: {', '.join(lacking[:4]) or 'nothing, but other cameras fit as well'}",
-        todo=_TO_CLICK,
-    )
 
 
 def _rank_under_lenses(

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
+from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 
@@ -66,6 +67,34 @@ class SideDecision:
     evidence: float
     contradicted: bool
     partners: tuple[str, ...]
+
+    def require_side(self, where: str) -> bool:
+        """Return whether the camera has to be turned.
+
+        Args:
+            where: file or camera, for messages.
+
+        Raises:
+            InputError: the people do not tell the side, or they contradict the stated one.
+        """
+        if self.contradicted:
+            raise InputError(
+                where,
+                expected="people at the places where the other cameras see them",
+                found=f"agreement only after half a turn about the centre spot (evidence "
+                f"{-self.evidence:.0f}): the stated side is wrong, or that of the others",
+                todo="State the opposite side in match.yaml, or take `side` out of this camera.",
+            )
+        if self.turned is None:
+            raise InputError(
+                where,
+                expected="people whom this camera and one with a known side both see",
+                found=f"no agreement that decides between two sides (evidence below "
+                f"{MIN_EVIDENCE:g})"
+                + (f"; it agrees with {', '.join(self.partners[:3])}" if self.partners else ""),
+                todo="State the camera's side (near, far, left, right) in match.yaml.",
+            )
+        return self.turned
 
 
 class _Points(NamedTuple):
