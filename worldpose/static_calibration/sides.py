@@ -58,9 +58,10 @@ class SideDecision:
 
     Attributes:
         turned: whether it has to be turned; None = the people do not tell.
-        evidence: log probability ratio of the decision, from the people alone [1].
+        evidence: log probability ratio of the least sure step of the decision [1].
         contradicted: whether people contradict the stated side.
-        partners: cameras that see the same people, the surest first.
+        partners: cameras that see the same people, the surest first; those against a contradicted
+            side.
     """
 
     turned: bool | None
@@ -81,8 +82,8 @@ class SideDecision:
             raise InputError(
                 where,
                 expected="people at the places where the other cameras see them",
-                found=f"agreement only after half a turn about the centre spot (evidence "
-                f"{-self.evidence:.0f}): the stated side is wrong, or that of the others",
+                found=f"agreement with {', '.join(self.partners[:3])} only after half a turn about "
+                "the centre spot: the stated side is wrong, or theirs",
                 todo="State the opposite side in match.yaml, or take `side` out of this camera.",
             )
         if self.turned is None:
@@ -135,45 +136,72 @@ def decide_sides(
         for b in range(a + 1, len(names)):
             same, turned = compare_sides(seen[names[a]], seen[names[b]], pitch, seconds)
             evidence[a, b] = evidence[b, a] = same - turned
-    sign = np.ones(len(names))
     anchored = [k for k, name in enumerate(names) if name in stated]
-    groups = [anchored, *([k] for k in range(len(names)) if names[k] not in stated)]
-    surety = np.zeros(len(names))
-    while True:
-        best, pair = MIN_EVIDENCE, (0, 0)
-        for a in range(len(groups)):
-            for b in range(a + 1, len(groups)):
-                total = float(_between(evidence, sign, groups[a], groups[b]).sum())
-                if abs(total) >= best:
-                    best, pair = abs(total), (a, b)
-        if pair == (0, 0):
-            break
-        first, second = (groups[k] for k in pair)
-        joined = _between(evidence, sign, first, second)
-        sign[second] *= np.sign(joined.sum())
-        surety[[*first, *second]] = np.where(
-            surety[[*first, *second]] > 0.0, np.minimum(surety[[*first, *second]], best), best
-        )
-        groups[pair[0]] = [*first, *second]
-        del groups[pair[1]]
+    wrong = _contradicted(evidence, anchored)
+    trusted = [k for k in anchored if k not in wrong]
+    groups = [trusted or anchored, *([k] for k in range(len(names)) if k not in anchored)]
+    groups, sign, surety = _join(evidence, groups)
     decided = {}
     for k, name in enumerate(names):
         support = evidence[k] * sign[k] * sign
         others = [j for j in np.argsort(-support, kind="stable") if support[j] > 0.0]
-        total = float(support[groups[0]].sum()) if k in groups[0] else 0.0
-        known = k in groups[0]
+        against = [j for j in np.argsort(support, kind="stable") if support[j] < 0.0]
         decided[name] = SideDecision(
-            turned=bool(sign[k] < 0.0) if known else None,
-            evidence=total if k in anchored else float(surety[k]),
-            contradicted=k in anchored and total <= -MIN_EVIDENCE,
-            partners=tuple(names[j] for j in others),
+            turned=bool(sign[k] < 0.0) if k in groups[0] or k in anchored else None,
+            evidence=float(surety[k]),
+            contradicted=k in wrong,
+            partners=tuple(names[j] for j in (against if k in wrong else others)),
         )
     return decided
 
 
+def _contradicted(evidence: Floats, anchored: list[int]) -> set[int]:
+    """Return the cameras whose stated side fewer others share than the opposite one.
+
+    Of two cameras that contradict each other, either may be wrong: both are.
+    """
+    groups, sign, _ = _join(evidence, [[k] for k in anchored])
+    wrong: set[int] = set()
+    for group in groups:
+        for side in (1.0, -1.0):
+            own = [k for k in group if sign[k] == side]
+            if 2 * len(own) <= len(group):
+                wrong |= set(own)
+    return wrong
+
+
+def _join(evidence: Floats, groups: list[list[int]]) -> tuple[list[list[int]], Floats, Floats]:
+    """Join groups of cameras whose relative side the evidence decides, the surest two first.
+
+    Args:
+        evidence: (n, n) log probability ratio of pairs that stand as assumed to turned ones.
+        groups: indices of cameras with known relative sides.
+
+    Returns:
+        The groups; the sign (n,) of every camera, -1 if it is turned against the first camera of
+        its group; the evidence (n,) of the least sure join that decides the camera.
+    """
+    groups, count = [list(each) for each in groups], len(evidence)
+    sign, surety = np.ones(count), np.full(count, np.inf)
+    while True:
+        best, pair = MIN_EVIDENCE, (0, 0)
+        for a in range(len(groups)):
+            for b in range(a + 1, len(groups)):
+                total = abs(float(_between(evidence, sign, groups[a], groups[b]).sum()))
+                if total >= best:
+                    best, pair = total, (a, b)
+        if pair == (0, 0):
+            return groups, sign, np.where(np.isfinite(surety), surety, 0.0)
+        first, second = (groups[k] for k in pair)
+        sign[second] *= np.sign(_between(evidence, sign, first, second).sum())
+        surety[[*first, *second]] = np.minimum(surety[[*first, *second]], best)
+        groups[pair[0]] = [*first, *second]
+        del groups[pair[1]]
+
+
 def _between(evidence: Floats, sign: Floats, first: list[int], second: list[int]) -> Floats:
     """Return the evidence (a, b) between two groups of cameras, as they stand now."""
-    return evidence[np.ix_(first, second)] * sign[first][:, None] * sign[second]
+    return np.asarray(evidence[np.ix_(first, second)] * sign[first][:, None] * sign[second])
 
 
 def compare_sides(
