@@ -113,6 +113,14 @@ def turn_camera(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=Rigid(pose.rotation * half, pose.translation))
 
 
+_HALF_TURN: Final = {"left": "right", "right": "left", "near": "far", "far": "near"}
+
+
+def turn_name(name: str) -> str:
+    """Return the name of the marking that lies half a turn about the centre spot away."""
+    return "_".join(_HALF_TURN.get(word, word) for word in name.split("_"))
+
+
 def decide_sides(
     seen: Mapping[str, SeenPeople],
     stated: Collection[str],
