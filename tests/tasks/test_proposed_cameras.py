@@ -51,6 +51,14 @@ def take_clicks(folder, sides, image=None):
     (folder / "match.yaml").write_text(yaml.safe_dump(spec))
 
 
+def state_side(folder, camera_id, side):
+    spec = yaml.safe_load((folder / "match.yaml").read_text())
+    spec["cameras"] = [
+        each | ({"side": side} if each["id"] == camera_id else {}) for each in spec["cameras"]
+    ]
+    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+
+
 def calibrate(folder, tmp_path, *cameras):
     """Return the published static cameras, and the reasons of those that are left out."""
     store = Store.create(tmp_path / "project")
@@ -79,6 +87,7 @@ def test_a_camera_with_a_side_is_calibrated_from_its_image(folder, tmp_path):
 
 def test_shared_people_decide_the_side_of_a_camera(folder, tmp_path):
     take_clicks(folder, {TURNED: None})
+    state_side(folder, "cam00", "near")
     found, reasons = calibrate(folder, tmp_path, TURNED)
     assert not reasons
     off = camera_from_arrays(found[TURNED].data_vars).center - true_camera(folder, TURNED).center
@@ -121,6 +130,7 @@ def test_only_cameras_without_clicks_have_proposals_unless_people_must_decide(fo
     assert stated["static_calibration/cam00"] == set()
     text = (folder / "match.yaml").read_text()
     (folder / "match.yaml").write_text(text.replace("  side: far\n", ""))
+    state_side(folder, "cam00", "near")
     together = planned()
     cameras = {f"cam0{number}" for number in range(6)}
     assert together["proposal/cam00"] == {"ingest/cam00"}
@@ -128,16 +138,13 @@ def test_only_cameras_without_clicks_have_proposals_unless_people_must_decide(fo
     assert together["static_calibration/cam00"] == set()
 
 
-def test_one_side_has_to_be_stated_where_no_camera_has_clicks(folder, tmp_path):
+def test_one_side_has_to_be_stated(folder, tmp_path):
     store = Store.create(tmp_path / "project")
     grass = np.full((SIZE[1], SIZE[0], 3), (60, 120, 50), np.uint8)
     take_clicks(folder, {f"cam0{number}": None for number in range(6)}, grass)
     with pytest.raises(InputError, match=r"missing camera cam00, cam01.*give one camera a side"):
         register(store, folder)
-    text = (folder / "match.yaml").read_text()
-    spec = yaml.safe_load(text)
-    spec["cameras"][3]["side"] = "left"
-    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
+    state_side(folder, "cam03", "left")
     match, _ = register(store, folder)
     assert match.folder.to_click == ()
 

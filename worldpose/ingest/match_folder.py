@@ -65,15 +65,12 @@ class MatchFolder:
     def to_click(self) -> tuple[str, ...]:
         """Static cameras without calibration and clicks that cannot be proposed either.
 
-        A proposal needs the camera's image, the pitch, and the side of one camera at least: a
-        stated one, or that of a camera with clicks or a given calibration.
+        A proposal needs the camera's image, the pitch, and a static camera with a stated side.
         """
         known = {*self.calibrations, *self.clicked}
-        if self.pitch is not None:
-            seen = {*self.stills, *self.videos}
-            sides = {each.id: each.side for each in self.spec.static_cameras if each.id in seen}
-            if known or any(sides.values()):
-                known |= sides.keys()
+        is_stated = any(each.side is not None for each in self.spec.static_cameras)
+        if self.pitch is not None and is_stated:
+            known |= {*self.stills, *self.videos}
         return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
 
     @property

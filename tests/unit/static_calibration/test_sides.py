@@ -128,9 +128,7 @@ def test_a_wrong_stated_side_is_named(people):
     seen["goal"] = turn(seen["goal"])
     decided = decide_sides(seen, set(seen), PITCH, SECONDS)
     assert [name for name, each in decided.items() if each.contradicted] == ["goal"]
-    with pytest.raises(
-        InputError, match=r"with near, far only after half a turn.*opposite side"
-    ):
+    with pytest.raises(InputError, match=r"with near, far only after half a turn.*opposite side"):
         decided["goal"].require_side("image of goal")
 
 
