@@ -169,8 +169,8 @@ def proposal_evidence(
         still=background_image(store, match, name),
     )
     caption = (
-        "The pitch as the proposed camera projects it. If its lines lie on the painted ones, accept "
-        "the proposal on the page of its clicks; else click the markings."
+        "The pitch as the proposed camera projects it. If its lines lie on the painted ones, "
+        "accept the proposal on the page of its clicks; else click the markings."
     )
     rows = tuple(
         (marking.replace("_", " "), f"{visible:.0f}", f"{share:.0%}")
