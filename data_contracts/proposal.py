@@ -1,4 +1,4 @@
-"""Result of stage `proposal`: a camera without a click, and the people whom it sees."""
+"""Result of stage `proposal`: a camera without a click, and the people in its images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task of stage `proposal`: one camera before its calibration, and the people whom it sees."""
+"""Task of stage `proposal`: one camera before its calibration, and the people in its images."""
 
 from __future__ import annotations
 

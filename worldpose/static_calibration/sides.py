@@ -1,4 +1,4 @@
-"""Sides of the pitch on which cameras stand, decided by people whom several cameras see (C2).
+"""Sides of the pitch on which cameras stand, decided by people in view of several cameras (C2).
 
 The pitch looks the same after half a turn, so that the paint in one image does not tell from which
 side it was taken. People do: under the right choice, feet in two images meet on the ground. One
@@ -27,7 +27,7 @@ _SHARES: Final = np.array([0.3, 0.6, 0.9])
 _CALIBRATION_STD: Final = 0.5
 """Standard deviation of places by the error of a proposed camera and its clock, each axis [m]."""
 _OUTSIDE: Final = 0.5
-"""Largest distance of people outside of the lines [m]: benches beside both touch lines are as
+"""Largest distance of people outside of the lines [m]: benches behind both touch lines are as
 alike as the lines."""
 _CELL: Final = 2.0
 """Cells in which the shared view is measured [m]."""
@@ -39,11 +39,11 @@ _MIN_AREA: Final = 50.0
 
 @dataclass(frozen=True, eq=False)
 class SeenPeople:
-    """People whom one camera sees, placed by their feet with the camera on its assumed side.
+    """People in one camera's images, placed by their feet with the camera on its assumed side.
 
     Attributes:
         camera: the camera.
-        xy: (frames, people, 2) places [m], world; NaN where nobody is.
+        xy: (frames, people, 2) places [m], world; NaN where there is no person.
         noise: (frames, people, 2, 2) their covariance [m^2].
     """
 
@@ -89,7 +89,7 @@ class SideDecision:
         if self.turned is None:
             raise InputError(
                 where,
-                expected="people whom this camera and one with a known side both see",
+                expected="people that both this camera and one with a known side detect",
                 found=f"no agreement that decides between two sides (evidence below "
                 f"{MIN_EVIDENCE:g})"
                 + (f"; it agrees with {', '.join(self.partners[:3])}" if self.partners else ""),
@@ -218,7 +218,7 @@ def compare_sides(
     """Return how well people agree if two cameras stand as assumed, and with one of them turned.
 
     Each is the log probability ratio to people who have nothing to do with each other, under the
-    likeliest share of people whom both cameras found; it is 0 or more, since people whom only one
+    likeliest share of people that both cameras detect; it is 0 or more, since people that only one
     camera found decide nothing.
 
     Args:
@@ -271,7 +271,7 @@ def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> floa
 
 
 def _shared(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
-    """Return one camera's people on the pitch whom the other should see."""
+    """Return one camera's people on the pitch that the other should detect."""
     limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _OUTSIDE
     known = np.isfinite(own.xy[..., 0])
     frame, _ = np.nonzero(known)

@@ -98,7 +98,7 @@ def test_a_camera_that_sees_nobody_whom_the_others_see_is_not_guessed(people):
     seen = {seat: watch(seat, places, rng, false=0) for seat in ("near", "far", "other_end")}
     decided = decide_sides(seen, {"near"}, PITCH, SECONDS)["other_end"]
     assert decided.turned is None
-    with pytest.raises(InputError, match=r"people whom this camera.*State the camera's side"):
+    with pytest.raises(InputError, match=r"people that both this camera.*State the camera's side"):
         decided.require_side("image of other_end")
 
 
