@@ -139,10 +139,11 @@ def decide_sides(
         seconds: (frames,) time of each frame [s].
     """
     names = tuple(seen)
+    views = [_View(seen[name], _seen_cells(seen[name].camera, pitch)) for name in names]
     evidence = np.zeros((len(names), len(names)))
     for a in range(len(names)):
         for b in range(a + 1, len(names)):
-            same, turned = compare_sides(seen[names[a]], seen[names[b]], pitch, seconds)
+            same, turned = _compare(views[a], views[b], pitch, seconds)
             evidence[a, b] = evidence[b, a] = same - turned
     anchored = [k for k, name in enumerate(names) if name in stated]
     wrong = _contradicted(evidence, anchored)
@@ -227,27 +228,63 @@ def compare_sides(
         pitch: the template.
         seconds: (frames,) time of each frame [s].
     """
+    views = (_View(each, _seen_cells(each.camera, pitch)) for each in (first, second))
+    return _compare(next(views), next(views), pitch, seconds)
+
+
+class _View(NamedTuple):
+    """People of one camera, and which cells of the pitch it sees, row by row."""
+
+    people: SeenPeople
+    cells: Flags
+
+    def turn(self) -> _View:
+        """Return the view after half a turn: covariances stay, and cells come in reverse."""
+        turned = turn_camera(self.people.camera)
+        people = replace(self.people, camera=turned, xy=-self.people.xy)
+        return _View(people, self.cells[::-1])
+
+
+def _compare(
+    first: _View, second: _View, pitch: PitchTemplate, seconds: Floats
+) -> tuple[float, float]:
+    """Return what `compare_sides` returns."""
     frames = max(1, len(seconds))
     moments = 1.0 + (float(np.ptp(seconds)) / INDEPENDENT_S if len(seconds) else 0.0)
-    weight = min(1.0, moments / frames)
-    return tuple(
-        0.5 * weight * (_agreement(first, other, pitch) + _agreement(other, first, pitch))
-        for other in (second, _turn(second))
-    )  # type: ignore[return-value]
+    weight = 0.5 * min(1.0, moments / frames)
+    found = []
+    for other in (second, second.turn()):
+        area = _CELL**2 * float(np.count_nonzero(first.cells & other.cells))
+        found.append(
+            weight
+            * (
+                _agreement(first.people, other.people, pitch, area)
+                + _agreement(other.people, first.people, pitch, area)
+            )
+        )
+    return found[0], found[1]
 
 
-def _turn(seen: SeenPeople) -> SeenPeople:
-    """Return the camera and its people after half a turn; covariances stay."""
-    return replace(seen, camera=turn_camera(seen.camera), xy=-seen.xy)
+def _seen_cells(camera: Camera, pitch: PitchTemplate) -> Flags:
+    """Return which cells of the pitch a camera sees (cells,)."""
+    limits = (0.5 * pitch.length, 0.5 * pitch.width)
+    counts = (max(1, round(2.0 * limit / _CELL)) for limit in limits)
+    x, y = (
+        np.linspace(-limit, limit, 2 * count + 1)[1::2]
+        for limit, count in zip(limits, counts, strict=True)
+    )
+    return _sees(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), pitch)
 
 
-def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> float:
-    """Return the log probability ratio of one camera's people, given those of the other."""
-    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width])
-    x, y = (np.arange(-limit + 0.5 * _CELL, limit, _CELL) for limit in limits)
-    cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shared = _sees(own.camera, cells, pitch) & _sees(other.camera, cells, pitch)
-    area = _CELL**2 * float(np.count_nonzero(shared))
+def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate, area: float) -> float:
+    """Return the log probability ratio of one camera's people, given those of the other.
+
+    Args:
+        own: people of the one camera.
+        other: people of the other camera.
+        pitch: the template.
+        area: what both cameras see of the pitch [m^2].
+    """
     if area < _MIN_AREA:
         return 0.0
     density: list[Floats] = []
