@@ -146,7 +146,7 @@ def decide_sides(
             same, turned = _compare(views[a], views[b], pitch, seconds)
             evidence[a, b] = evidence[b, a] = same - turned
     anchored = [k for k, name in enumerate(names) if name in stated]
-    wrong = _contradicted(evidence, anchored)
+    wrong = _find_contradicted(evidence, anchored)
     trusted = [k for k in anchored if k not in wrong]
     groups = [trusted or anchored, *([k] for k in range(len(names)) if k not in anchored)]
     groups, sign, surety = _join(evidence, groups)
@@ -164,7 +164,7 @@ def decide_sides(
     return decided
 
 
-def _contradicted(evidence: Floats, anchored: list[int]) -> set[int]:
+def _find_contradicted(evidence: Floats, anchored: list[int]) -> set[int]:
     """Return the cameras whose stated side fewer others share than the opposite one.
 
     Of two cameras that contradict each other, either may be wrong: both are.
@@ -288,7 +288,7 @@ def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate, area: f
     if area < _MIN_AREA:
         return 0.0
     density: list[Floats] = []
-    points, partners = (_shared(a, b, pitch) for a, b in ((own, other), (other, own)))
+    points, partners = (_people_in_both(a, b, pitch) for a, b in ((own, other), (other, own)))
     for frame in np.unique(points.frame):
         here, there = points.frame == frame, partners.frame == frame
         if not there.any():
@@ -307,7 +307,7 @@ def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate, area: f
     return float(max(0.0, scores.max()))
 
 
-def _shared(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
+def _people_in_both(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
     """Return one camera's people on the pitch that the other should detect."""
     limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _OUTSIDE
     known = np.isfinite(own.xy[..., 0])
