@@ -1,11 +1,13 @@
 """Markings proposed without a click: on the calibration page, and at the gate of its camera."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import page_client
 import pytest
 import yaml
+from chromium import IN_BROWSER, drive
 from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 
@@ -19,6 +21,15 @@ from worldpose.simulation.scene import look_at
 from worldpose.store import Store
 
 SIZE = (1920, 1080)
+
+
+def in_browser(test):
+    """Mark a test that needs a browser."""
+    for mark in IN_BROWSER:
+        test = mark(test)
+    return test
+
+
 PITCH = PitchTemplate.standard()
 
 
@@ -117,3 +128,20 @@ def test_an_unclear_proposal_waits_with_its_image_and_the_reason(folder, tmp_pat
     found = ada.post(f"{MATCH}/pictures/cam01/proposal", json={"side": "far"}).json()
     assert "Click four or more named points" in found["reason"]
     assert found["drawn"]
+
+
+@in_browser
+def test_a_person_accepts_a_proposal_and_takes_it_back_at_once(folder, tiny, tmp_path):
+    true = read_camera(tiny / "reference" / "cameras" / "cam01.npz", SIZE)
+    write_image(folder, "cam01", render_pitch(true, PITCH, None, 1), side="far")
+    project = tmp_path / "project"
+    succeed("ingest", folder, "--project", project)
+    script = Path(__file__).with_name("proposal_in_browser.mjs")
+    with page_client.serving(project, tmp_path) as base:
+        task = {"base": base, "token": page_client.TOKEN, "match": TINY, "camera": "cam01"}
+        seen = drive(script, task, tmp_path, 600)
+    assert seen["side"] == "far"
+    assert "Found: " in seen["names"]
+    first, undone, redone = seen["drawn"]
+    assert first >= 4
+    assert (undone, redone) == (0, first)

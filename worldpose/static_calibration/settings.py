@@ -92,7 +92,7 @@ class ProposalSettings(Record):
     """Gaussian prior of the camera."""
     people_frames: int = Field(default=12, ge=1, le=1000)
     """Number of frames, evenly spaced, in which the bundled detector finds people if a camera has
-    no stated side [1]: a second of one core per frame."""
+    no stated side [frame]: one or two seconds of one core each."""
 
 
 class StaticCalibrationSettings(Record):
