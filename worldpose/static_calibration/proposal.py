@@ -45,13 +45,11 @@ from worldpose.static_calibration.sides import turn_camera, turn_name
 _FOCALS: Final = np.geomspace(0.45, 5.0, 13)
 """Focal lengths to try, in image widths [1]."""
 _ROLLS: Final = ((0.0,), (-0.14, -0.07, 0.07, 0.14))
-"""Rolls to try, and those to try as well while the proposal is not clear [rad]: cameras on masts
-hang 4 to 8 degrees off the level."""
+"""Rolls to try, and more while nothing is clear [rad]: cameras on masts hang 4 to 8 degrees off."""
 PROPOSED: Final = "markings proposed from the image"
 """How the first decision of a camera without clicks begins."""
 MIN_MARGIN: Final = 25.0
-"""Minimum margin of a proposal to be used without a click [1]; below, more rolls and lenses are
-tried."""
+"""Minimum margin without a click [1]; below, more rolls and lenses are tried."""
 MIN_FOUND: Final = 0.6
 """Minimum share of its markings on paint [1]."""
 MIN_EXPLAINED: Final = 0.25
@@ -546,8 +544,9 @@ def _support(
         support.append(MarkingSupport(name, length, found))
         if found * length < INDEPENDENT * paint.size[0] or found < 0.5:
             continue
-        nearest = np.unique(seen.nearest[0, on])
+        nearest, place = np.unique(seen.nearest[0, on], return_index=True)
         chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _DRAWN)).astype(np.int64)
+        chosen = chosen[np.argsort(place[chosen])]  # in order along the marking
         pixels = paint.origins[nearest[chosen]]
         drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
     support.sort(key=lambda each: -each.visible_px)
