@@ -3,6 +3,7 @@
     python benchmarks/proposals.py simulation [SCENARIO ...] [--surveys 4] [--first 0]
     python benchmarks/proposals.py lines DATA [--count 100] [--drop 0.2] [--clutter 4] [--first 0]
     python benchmarks/proposals.py images FILE ... [--out FOLDER]
+    python benchmarks/proposals.py sides [SCENARIO ...] [--surveys 4] [--first 0] [--duration 4]
 
 simulation: rendered stills of the static cameras of simulated stadiums. Ground: the true pixel of a
 player's place, back through the calibrated camera onto the pitch.
@@ -12,6 +13,10 @@ without their names, as paint; some are dropped, and random segments are added. 
 half of the drawn lines are farther than 5 px of 960 from their marking.
 
 images: files, each with one line and an overlay in the folder.
+
+sides: simulated people seen by cameras with errors of calibration, half of them turned by half a
+turn. The side of the first camera is stated; those of the others follow from the people in twelve
+frames. A side is wrong, or right, or not decided.
 """
 
 from __future__ import annotations
@@ -29,15 +34,24 @@ import numpy as np
 from static_accuracy import ground_errors
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import Proposal, calibrate_without_clicks, propose_camera
+from worldpose.static_calibration import (
+    Proposal,
+    SeenPeople,
+    calibrate_without_clicks,
+    decide_sides,
+    propose_camera,
+)
 from worldpose.static_calibration.paint_segments import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.proposal import propose_from_paint
+from worldpose.static_calibration.sides import turn_camera
+from worldpose.tracking import locate_feet
 
 SIZE = (1280, 720)
 """Width, height of the images of drawn lines [px]."""
@@ -45,6 +59,8 @@ RIGHT_PX = 5.0
 """Largest distance of a drawn line from its marking, at a width of 960 [px]."""
 WRONG_M = 0.5
 """Median ground error from which an accepted camera is wrong [m]."""
+SIDE_FRAMES = 12
+"""Frames whose people decide the sides, as many as the stage `proposal` takes [1]."""
 SIDES = {"top": "far", "bottom": "near"}
 
 
@@ -97,6 +113,34 @@ def simulate(scenario: str, seeds: range) -> Iterator[Outcome]:
             seconds = time.perf_counter() - start
             off = ground_errors(found.estimate.camera, true, places, painted)
             yield Outcome(label, True, float(np.median(off)) if len(off) else 0.0, seconds)
+
+
+def simulate_sides(scenario: str, seeds: range, duration: float) -> Iterator[Outcome]:
+    """Yield for all cameras but the first whether people decide their sides; error 1 is wrong."""
+    settings = SCENARIOS[scenario].model_copy(update={"duration": duration, "broadcast": None})
+    for seed in seeds:
+        scene = simulate_scene(settings, seed)
+        pitch, rng = PitchTemplate.from_spec(scene.surveyed), np.random.default_rng(seed)
+        frames = scene.truth.frames
+        frames = frames[np.linspace(0, len(frames) - 1, SIDE_FRAMES).astype(int)]
+        seen: dict[str, SeenPeople] = {}
+        turned: dict[str, bool] = {}
+        for name, camera in scene.given.items():
+            turned[name] = bool(seen) and rng.random() < 0.5
+            assumed = turn_camera(camera) if turned[name] else camera
+            own = scene.observations[name]
+            people = KeypointDetections.stack([own[np.flatnonzero(np.isin(own.frame, frames))]])
+            feet = locate_feet(Camera.stack([assumed]), people, pitch)
+            seen[name] = SeenPeople(assumed, feet.xy[:, 0], feet.noise[:, 0])
+        start = time.perf_counter()
+        decided = decide_sides(seen, (next(iter(seen)),), pitch, frames / settings.fps)
+        seconds = time.perf_counter() - start
+        for name, decision in list(decided.items())[1:]:
+            is_wrong = float(decision.turned is not turned[name])
+            known = decision.turned is not None
+            reason = f"evidence {decision.evidence:.0f}"
+            label = f"{scenario} {seed} {name}"
+            yield Outcome(label, known, is_wrong if known else np.nan, seconds, reason)
 
 
 def law_name(drawn: str) -> str | None:
@@ -243,7 +287,7 @@ def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("simulation", "lines", "images"))
+    parser.add_argument("part", choices=("simulation", "lines", "images", "sides"))
     parser.add_argument("names", nargs="*")
     parser.add_argument("--surveys", type=int, default=4)
     parser.add_argument("--first", type=int, default=0)
@@ -251,11 +295,17 @@ def main() -> None:
     parser.add_argument("--drop", type=float, default=0.2)
     parser.add_argument("--clutter", type=int, default=4)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--duration", type=float, default=4.0)
     arguments = parser.parse_args()
     if arguments.part == "simulation":
         seeds = range(arguments.first, arguments.first + arguments.surveys)
         parts = [simulate(name, seeds) for name in arguments.names or ("match",)]
         limit, unit = WRONG_M, "m"
+    elif arguments.part == "sides":
+        seeds = range(arguments.first, arguments.first + arguments.surveys)
+        names = arguments.names or ("match",)
+        parts = [simulate_sides(name, seeds, arguments.duration) for name in names]
+        limit, unit = 0.5, "wrong side"
     elif arguments.part == "lines":
         parts = [drawn_lines(Path(name), arguments) for name in arguments.names]
         limit, unit = RIGHT_PX, "px"

@@ -49,8 +49,9 @@ class CameraSpec(Record):
     still: str | None = None
     """One image of a static camera without a video, relative to the match folder."""
     side: Side | None = None
-    """Side of the pitch on which the camera stands. With it a camera without clicks is calibrated
-    from its image: the pitch looks the same after half a turn, and the side decides."""
+    """Side of the pitch on which the camera stands. A camera without clicks is calibrated from its
+    image. The pitch looks the same after half a turn: the side of one camera, and people whom
+    cameras share, decide."""
 
 
 class ClipSpec(Record):

@@ -27,6 +27,7 @@ from data_contracts.ingest import INGEST
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pin import Pin
 from data_contracts.pitch import PitchSpec
+from data_contracts.proposal import PROPOSAL
 from data_contracts.records import Record, field_docstrings
 from data_contracts.redetection import REDETECTION
 from data_contracts.refitting import REFITTING
@@ -75,6 +76,7 @@ RECORDS: dict[str, type[Record]] = {
 
 LAYOUTS: tuple[GroupLayout, ...] = (
     INGEST,
+    PROPOSAL,
     STATIC_CALIBRATION,
     DETECTION,
     REDETECTION,

@@ -17,6 +17,7 @@ from flows.stages import (
     detection,
     filtering,
     ingest,
+    proposal,
     redetection,
     refitting,
     retriangulation,
@@ -27,6 +28,7 @@ from flows.stages import (
 
 METHOD: tuple[Stage, ...] = (
     ingest.STAGE,  # [camera]
+    proposal.STAGE,  # [camera], without clicks  C2
     static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
     detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
     redetection.STAGE,  # [camera, clip]  R2, from the second iteration on

@@ -18,20 +18,23 @@ from data_contracts.static_calibration import (
     DrawnMarking,
 )
 from data_contracts.work import Work
-from tasks.unit import require_registered, unit_task
+from tasks.unit import open_input, require_registered, unit_task
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_arrays
+from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
 from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CalibrationReport,
+    Proposal,
+    SeenPeople,
     StaticCalibrationSettings,
     calibrate_camera,
-    calibrate_without_clicks,
+    calibrate_proposal,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
+    decide_sides,
     given_attributes,
     left_out_attributes,
 )
@@ -50,7 +53,8 @@ def static_calibration(work: Work) -> str:
     A camera that its clicks do not determine is published as left out, with the reason.
     """
     sources: dict[str, Any] = work.recipe.sources
-    with Store.open(work.project).publish(work) as result:
+    store = Store.open(work.project)
+    with store.publish(work) as result:
         if sources["calibration"] is not None:
             given = CameraCalibration.model_validate(sources["calibration"])
             result.write(
@@ -62,9 +66,8 @@ def static_calibration(work: Work) -> str:
         width, height = sources["image_size"]
         pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
         settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
-        picture = _still(work)
-        lens = sources.get("lens")
-        known = None if lens is None else LensCalibration.model_validate(lens)
+        picture = open_still(work)
+        known = given_lens(sources)
         try:
             if sources["clicked"]:
                 ((file, clicked),) = sources["clicked"].items()
@@ -78,12 +81,13 @@ def static_calibration(work: Work) -> str:
                     lens=known,
                 )
             else:
-                calibration = calibrate_without_clicks(
+                where = f"image of {work.recipe.unit}"
+                calibration = calibrate_proposal(
                     pitch,
-                    _require_picture(work.recipe.unit, picture),
-                    side=sources["side"],
+                    _open_proposal(store, work, pitch, where),
+                    require_picture(work.recipe.unit, picture),
                     settings=settings,
-                    where=f"image of {work.recipe.unit}",
+                    where=where,
                     lens=known,
                 )
         except InputError as error:  # a failed calibration of one camera must not end the match
@@ -102,7 +106,43 @@ def static_calibration(work: Work) -> str:
     return work.key
 
 
-def _require_picture(camera_id: str, picture: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+def _open_proposal(store: Store, work: Work, pitch: PitchTemplate, where: str) -> Proposal:
+    """Return the camera's proposal on its side of the pitch.
+
+    Raises:
+        InputError: there is none, it is not clear, or people do not tell the side, or contradict
+            the stated one.
+    """
+    found = {name.partition("/")[2]: open_input(store, work, name) for name in work.recipe.inputs}
+    own = found[work.recipe.unit]
+    if own.attrs["origin"] == "none":
+        raise InputError(**own.attrs["problem"])
+    proposal = Proposal.from_attributes(camera_from_arrays(own.data_vars), own.attrs)
+    proposal.require_clear(where)
+    if len(found) == 1:
+        return proposal
+    seen = {
+        name: SeenPeople(
+            camera_from_arrays(each.data_vars),
+            each["place"].values,
+            each["place_covariance"].values,
+        )
+        for name, each in found.items()
+        if each.attrs["is_clear"]
+    }
+    stated = [name for name in seen if found[name].attrs["is_stated"]]
+    seconds = own["frame"].values / own.attrs["fps"]
+    decision = decide_sides(seen, stated, pitch, seconds)[work.recipe.unit]
+    return proposal.turn() if decision.require_side(where) else proposal
+
+
+def given_lens(sources: Mapping[str, Any]) -> LensCalibration | None:
+    """Return the given lens of a recipe, if any."""
+    lens = sources.get("lens")
+    return None if lens is None else LensCalibration.model_validate(lens)
+
+
+def require_picture(camera_id: str, picture: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
     """Return the camera's image.
 
     Raises:
@@ -127,7 +167,7 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
     )
 
 
-def _still(work: Work) -> NDArray[np.uint8] | None:
+def open_still(work: Work) -> NDArray[np.uint8] | None:
     """Return the unit's still, or one without people from its video, from the files of its key.
 
     Raises:

@@ -13,7 +13,9 @@ from flows.reports.match_pictures import background_image
 from flows.results.best_results import estimated_pitch
 from flows.stage import Match
 from worldpose.geometry import Camera
+from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.reports import CameraSummary, CaptionedImage
+from worldpose.reports.html_page import Table
 from worldpose.reports.static_cameras import (
     NEAR,
     Click,
@@ -145,6 +147,37 @@ def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Cam
             result["ground_x"].values, result["ground_y"].values, result["ground_error"].values
         ),
     )
+
+
+def proposal_evidence(
+    store: Store, run: Run, match: Match, name: str
+) -> tuple[CaptionedImage, Table] | None:
+    """Draw the camera that was proposed for an image, and list the markings that it expects.
+
+    None if no camera was proposed.
+    """
+    pitch = match.folder.pitch
+    if pitch is None or f"proposal/{name}" not in run.record.results:
+        return None
+    found = run[f"proposal/{name}"]
+    if found.attrs["origin"] != "image":
+        return None
+    png = plot_calibration(
+        camera_from_arrays(found.data_vars),
+        f"camera {name}, as proposed",
+        pitch,
+        still=background_image(store, match, name),
+    )
+    caption = (
+        "The pitch as the proposed camera projects it. If its lines lie on the painted ones, "
+        "accept the proposal on the page of its clicks; else click the markings."
+    )
+    rows = tuple(
+        (marking.replace("_", " "), f"{visible:.0f}", f"{share:.0%}")
+        for marking, visible, share in found.attrs["markings"]
+    )
+    columns = ("marking", ">length in the image [px]", ">on paint")
+    return CaptionedImage(caption, png), Table("Markings that the proposal expects", columns, rows)
 
 
 def _names(run: Run, camera_id: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from threading import Lock
 from typing import Any, Final
@@ -14,17 +15,19 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.match import Side
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
 from flows.review.verdicts import reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.browser_words import describe_error
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
-from worldpose.static_calibration import StaticCalibrationSettings
+from worldpose.static_calibration import StaticCalibrationSettings, propose_camera
 from worldpose.video import open_video
 
 KEPT: Final = 2
@@ -41,6 +44,13 @@ class Clicked(Record):
     """Line name to positions along it [px]."""
     refine: bool = False
     """Refine on the painted lines of the image: seconds, not milliseconds."""
+
+
+class Wanted(Record):
+    """A request for markings without clicks."""
+
+    side: Side = "near"
+    """Side of the pitch on which the camera stands."""
 
 
 class Pictures:
@@ -125,6 +135,7 @@ def routes(context: PageContext) -> APIRouter:
             "frame": frame,
             "size": size,
             "given": owner in match.folder.calibrations,
+            "side": _stated_side(match, owner),
             "has_picture": owner in match.folder.stills or owner in match.folder.videos,
             "points": {point.name: point.xy for point in clicked.points},
             "drawn": {marking.name: marking.xy for marking in clicked.drawn},
@@ -179,6 +190,36 @@ def routes(context: PageContext) -> APIRouter:
             }
             context.previews[match_id, owner] = markings, errors
         return JSONResponse(_answer(found))
+
+    @router.post("/proposal")
+    def propose(
+        match_id: str, owner: str, wanted: Wanted, frame: int | None = None
+    ) -> dict[str, Any]:
+        """Propose the camera from its image alone; a few seconds."""
+        size_of(match_id, owner)
+        match = context.match(match_id)
+        drawing, where = load_pitch(match_id)[0], f"image of {owner}"
+        try:
+            found = propose_camera(
+                pictures.decode_image(match, owner, frame),
+                drawing.template,
+                side=wanted.side,
+                lens=match.folder.lenses.get(owner),
+                where=where,
+            )
+        except InputError as error:
+            reason = describe_error(error)
+            return {"drawn": {}, "markings": {}, "reason": reason}
+        reason = ""
+        try:
+            found.require_clear(where)
+        except InputError as error:
+            reason = describe_error(error)
+        return {
+            "drawn": {each.name: each.xy for each in found.drawn.drawn},
+            "markings": _round_pieces(drawing.project_markings(found.camera)),
+            "reason": reason,
+        }
 
     return router
 
@@ -243,6 +284,16 @@ def _pitch(drawing: PitchDrawing) -> dict[str, Any]:
     }
 
 
+def _stated_side(match: Match, owner: str) -> str | None:
+    """Return the side of a static camera, or of a clip's broadcast camera, if it is stated."""
+    static = {each.id: each.side for each in match.folder.spec.static_cameras}
+    return static[owner] if owner in static else match.folder.broadcast_side(owner)
+
+
+def _round_pieces(markings: Mapping[str, list[NDArray[np.float64]]]) -> dict[str, Any]:
+    return {name: [_round_numbers(each, 1) for each in pieces] for name, pieces in markings.items()}
+
+
 def _answer(found: Preview) -> dict[str, Any]:
     report, camera = found.report, found.camera
     ground = report.ground_error
@@ -251,10 +302,7 @@ def _answer(found: Preview) -> dict[str, Any]:
             "center": _round_numbers(camera.center, 3),
             "focal": round(float(camera.focal[0]), 1),
         },
-        "markings": {
-            name: [_round_numbers(piece, 1) for piece in pieces]
-            for name, pieces in found.markings.items()
-        },
+        "markings": _round_pieces(found.markings),
         "points": {name: _round_numbers(place, 2) for name, place in found.points.items()},
         "residuals": [
             {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from data_contracts.review import ReviewRequest
 from flows.reports.broadcast import broadcast_pictures, broadcast_tables
-from flows.reports.cameras import camera_evidence
+from flows.reports.cameras import camera_evidence, proposal_evidence
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.people import adjustment_tables, body_tables
@@ -123,7 +123,9 @@ def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidenc
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
     if "point_inlier" not in run[f"static_calibration/{camera}"]:
-        return Evidence()  # a given camera, or one that is left out
+        # A given camera, or one that is left out.
+        proposed = proposal_evidence(store, run, match, camera)
+        return Evidence() if proposed is None else Evidence(proposed[:1], proposed[1:])
     cameras = static_cameras(run, match.folder.spec, "triangulation")
     png = camera_evidence(store, run, match, camera, cameras[camera])
     caption = (

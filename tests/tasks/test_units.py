@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import yaml
 from prefect.states import Failed
 
 from flows.match import task_of
@@ -23,8 +22,6 @@ from worldpose.formats import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest import import_lenses, read_match
 from worldpose.ingest.footage import write_still
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation.renderer import render_pitch
 from worldpose.store import Store, recipe_differences, recipe_key
 
 
@@ -111,62 +108,6 @@ def test_a_clicked_camera_says_how_well_it_is_known(clicked, tiny):
     found = camera_from_arrays(stored.data_vars)
     # Clicked at 1 px from 60 m and more: metres would be a wrong camera, not an uncertain one.
     assert np.linalg.norm(found.center - true.center) < 3.0
-
-
-def without_clicks(folder, camera_id, side):
-    """Take a camera's clicks away, and state its side instead."""
-    (folder / "annotations" / "static_calibration" / f"{camera_id}.json").unlink()
-    text = (folder / "match.yaml").read_text()
-    spec = yaml.safe_load(text)
-    for camera in spec["cameras"]:
-        if camera["id"] == camera_id:
-            camera["side"] = side
-            camera["still"] = f"stills/{camera_id}.png"
-    (folder / "match.yaml").write_text(yaml.safe_dump(spec))
-
-
-def test_a_camera_with_a_side_is_calibrated_from_its_image(clicked, tiny, tmp_path):
-    store, _, _ = clicked
-    folder = tmp_path / "match"
-    true = read_camera(tiny / "reference" / "cameras" / "cam00.npz", (1920, 1080))
-    x, y = true.center[:2] / [52.5, 34.0]
-    ends = ("left", "right") if abs(x) > abs(y) else ("near", "far")
-    without_clicks(folder, "cam00", ends[int((x if abs(x) > abs(y) else y) > 0.0)])
-    write_still(
-        folder / "stills" / "cam00.png", render_pitch(true, PitchTemplate.standard(), None, 1)
-    )
-    match, changed = register(store, folder)
-    assert changed
-    assert match.folder.to_click == ()
-    unit = {u.name: u for u in plan_run(store, match, {})}["static_calibration/cam00"]
-    static_calibration.fn(unit.work(store.url, match, "0001"))
-    stored = store.open_result(match.match_id, "static_calibration", "cam00", unit.key)
-    assert stored.attrs["decisions"][0].startswith("markings proposed from the image")
-    found = camera_from_arrays(stored.data_vars)
-    assert np.linalg.norm(found.center - true.center) < 0.5
-
-
-def test_an_image_that_shows_too_little_leaves_its_camera_out(clicked, tmp_path):
-    store, _, _ = clicked
-    folder = tmp_path / "match"
-    without_clicks(folder, "cam00", "near")
-    grass = np.full((1080, 1920, 3), (60, 120, 50), np.uint8)
-    write_still(folder / "stills" / "cam00.png", grass)
-    match, _ = register(store, folder)
-    unit = {u.name: u for u in plan_run(store, match, {})}["static_calibration/cam00"]
-    static_calibration.fn(unit.work(store.url, match, "0001"))
-    manifest = store.manifest(match.match_id, "static_calibration", "cam00", unit.key)
-    (reason,) = manifest.left_out.values()
-    assert "image of cam00: expected at least three straight markings" in reason
-    assert "Click four or more named points" in reason
-
-
-def test_a_camera_without_clicks_and_side_has_to_be_clicked(clicked, tmp_path):
-    store, _, _ = clicked
-    folder = tmp_path / "match"
-    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
-    with pytest.raises(InputError, match=r"missing camera cam00.*give the camera a side"):
-        register(store, folder)
 
 
 def test_how_far_cameras_misplace_people_is_learned_from_the_second_iteration_on(clicked):

@@ -178,7 +178,7 @@ def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int, fps: f
         )
     return {
         "flipped": "its calibration is rotated by 180 degrees about the centre spot: check whether "
-        "its clicks have the names of the other end of the pitch",
+        "its clicks have the names of the other end, or match.yaml states the wrong side",
         "mirrored": f"it is mirrored: {detail}. Correct its clicks, calibration or images",
         "focal": f"its focal length is {value:.3g} times that which the other cameras show: "
         "correct its calibration",

@@ -65,12 +65,12 @@ class MatchFolder:
     def to_click(self) -> tuple[str, ...]:
         """Static cameras without calibration and clicks that cannot be proposed either.
 
-        A proposal needs the camera's side, its image and the pitch.
+        A proposal needs the camera's image, the pitch, and a static camera with a stated side.
         """
         known = {*self.calibrations, *self.clicked}
-        if self.pitch is not None:
-            seen = {*self.stills, *self.videos}
-            known |= {each.id for each in self.spec.cameras if each.side and each.id in seen}
+        is_stated = any(each.side is not None for each in self.spec.static_cameras)
+        if self.pitch is not None and is_stated:
+            known |= {*self.stills, *self.videos}
         return tuple(each.id for each in self.spec.static_cameras if each.id not in known)
 
     @property
@@ -182,8 +182,8 @@ def require_calibrated(match: MatchFolder) -> None:
             needed = (
                 f"Click {CLICKS_NEEDED} into {match.folder / clicked_file(missing[0])}, or click "
                 f"on the pages: worldpose ingest {match.folder}, then worldpose review serve; or "
-                "give the camera a side (near, far, left, right) in match.yaml, so that its image "
-                "is calibrated without clicks; or add the camera to calibration.toml"
+                "give one camera a side (near, far, left, right) in match.yaml, so that the images "
+                "are calibrated without clicks; or add the camera to calibration.toml"
             )
         raise InputError(
             str(match.folder),

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from worldpose.static_calibration.proposal import (
         MarkingSupport,
         Proposal,
+        calibrate_proposal,
         calibrate_without_clicks,
         propose_camera,
     )
@@ -35,7 +36,12 @@ if TYPE_CHECKING:
         image_problems,
         left_out_attributes,
     )
-    from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
+    from worldpose.static_calibration.settings import (
+        CameraPrior,
+        ProposalSettings,
+        StaticCalibrationSettings,
+    )
+    from worldpose.static_calibration.sides import SeenPeople, SideDecision, decide_sides
 
 __all__ = [
     "PARAMETERS",
@@ -47,13 +53,18 @@ __all__ = [
     "MarkingSupport",
     "PointResidual",
     "Proposal",
+    "ProposalSettings",
+    "SeenPeople",
+    "SideDecision",
     "StaticCalibration",
     "StaticCalibrationSettings",
     "calibrate_camera",
+    "calibrate_proposal",
     "calibrate_without_clicks",
     "calibration_arrays",
     "calibration_attributes",
     "calibration_coordinates",
+    "decide_sides",
     "given_attributes",
     "ground_error_map",
     "image_problems",
@@ -80,6 +91,7 @@ __getattr__ = import_on_use(
         "worldpose.static_calibration.proposal": (
             "MarkingSupport",
             "Proposal",
+            "calibrate_proposal",
             "calibrate_without_clicks",
             "propose_camera",
         ),
@@ -97,7 +109,13 @@ __getattr__ = import_on_use(
         ),
         "worldpose.static_calibration.settings": (
             "CameraPrior",
+            "ProposalSettings",
             "StaticCalibrationSettings",
+        ),
+        "worldpose.static_calibration.sides": (
+            "SeenPeople",
+            "SideDecision",
+            "decide_sides",
         ),
     },
 )

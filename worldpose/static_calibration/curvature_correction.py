@@ -18,8 +18,12 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.geometry import Camera
 from worldpose.pitch.template import Surface
-from worldpose.static_calibration.adjustment import Problem, camera_from_row, camera_row
-from worldpose.static_calibration.descent import step_row
+from worldpose.static_calibration.adjustment import (
+    Problem,
+    camera_from_row,
+    camera_row,
+    step_row,
+)
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import (
     CameraOnPitch,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Integers
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 
@@ -472,3 +472,98 @@ def _split(points: Floats, across: Floats, offset: float) -> list[tuple[int, Flo
         if length > _MIN_LENGTH and count > _MIN_FILL * length:
             segments.append((count, across * offset + np.outer(way[[start, stop]], along)))
     return segments
+
+
+_TRACE_REACH: Final = 0.004
+"""Largest distance of thin paint from its projection, in image widths [1]."""
+_TRACE_SPACING: Final = 8.0
+"""Distance of neighboring cross sections [px]: errors of paint are correlated over as much."""
+_TRACE_STEP: Final = 0.5
+"""Step along a cross section [px]."""
+_TRACE_CONTRAST: Final = 6.0
+"""Minimum brightness of thin paint above both sides [levels of 255], as of painted lines."""
+_TRACE_TOLERANCE: Final = 1.0
+"""Largest distance of a ridge from the curve of its marking [px]."""
+_TRACE_SHARE: Final = 0.4
+"""Minimum share of the cross sections with the ridge on the curve [1], as of painted lines."""
+_TRACE_MIN: Final = 15
+"""Minimum number of such cross sections [1]: fewer lie on a curve by chance."""
+_TRACE_RIVAL: Final = 0.75
+"""Maximum number of cross sections of any other curve, of those of the best one [1]."""
+_TRACE_TRIALS: Final = 400
+"""Curves through three random ridges to try [1]."""
+
+
+def trace_marking(picture: Image, pixels: Floats) -> Floats:
+    """Return pixels (n, 2) on thin paint along a projected marking; none if there is no clear one.
+
+    The paint of a far line is thinner than a pixel and a few pixels beside its projection. Beside
+    it are letters, boards and people. The ridge counts that follows one smooth curve.
+
+    Args:
+        picture: (height, width, 3) RGB.
+        pixels: (m, 2) projected points along the marking in order [px]; NaN where not visible.
+    """
+    height, width = picture.shape[:2]
+    inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
+    pixels = pixels[inside]
+    if len(pixels) < 2:
+        return np.zeros((0, 2))
+    way = np.append(0.0, np.linalg.norm(np.diff(pixels, axis=0), axis=1).cumsum())
+    places = np.arange(0.0, way[-1], _TRACE_SPACING)
+    if len(places) < _TRACE_MIN:
+        return np.zeros((0, 2))
+    at = np.stack([np.interp(places, way, pixels[:, axis]) for axis in (0, 1)], axis=1)
+    along = np.gradient(at, axis=0)
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    reach = _TRACE_REACH * width
+    offsets = np.arange(-reach, reach + _TRACE_STEP, _TRACE_STEP)
+    cuts = (at[:, None] + offsets[:, None] * normals[:, None]).astype(np.float32)
+    light = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[..., 0], dtype=np.float32)
+    light = np.asarray(cv2.GaussianBlur(light, (0, 0), 0.8), dtype=np.float32)
+    profiles = cv2.remap(light, cuts[..., 0], cuts[..., 1], cv2.INTER_LINEAR)
+    side = round(2.0 / _TRACE_STEP)
+    middle = profiles[:, side:-side]
+    contrast = middle - np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
+    peak = contrast >= _TRACE_CONTRAST
+    peak[:, 1:] &= contrast[:, 1:] >= contrast[:, :-1]
+    peak[:, :-1] &= contrast[:, :-1] > contrast[:, 1:]
+    row, column = np.nonzero(peak)
+    if len(np.unique(row)) < _TRACE_MIN:
+        return np.zeros((0, 2))
+    ridge = offsets[side:-side][column]
+    share = row / max(1, len(places) - 1)
+    on = _follow_curve(row, share, ridge)
+    if len(np.unique(row[on])) < max(_TRACE_MIN, _TRACE_SHARE * len(places)):
+        return np.zeros((0, 2))
+    others = ~np.isin(row, row[on]) | (np.abs(ridge - _curve(share[on], ridge[on], share)) > 3.0)
+    rival = _follow_curve(row[others], share[others], ridge[others])
+    if len(np.unique(row[others][rival])) > _TRACE_RIVAL * len(np.unique(row[on])):
+        return np.zeros((0, 2))
+    return np.asarray(at[row[on]] + ridge[on, None] * normals[row[on]])
+
+
+def _follow_curve(row: Integers, share: Floats, ridge: Floats) -> NDArray[np.bool_]:
+    """Return which ridges (n,) lie on the parabola that passes most cross sections' ridges."""
+    best = np.zeros(len(row), np.bool_)
+    if len(np.unique(row)) < 3:
+        return best
+    rng = np.random.default_rng(0)
+    for _ in range(_TRACE_TRIALS):
+        chosen = rng.choice(len(row), 3, replace=False)
+        if np.ptp(share[chosen]) < 0.3 or len(np.unique(row[chosen])) < 3:
+            continue
+        on = np.abs(ridge - _curve(share[chosen], ridge[chosen], share)) < _TRACE_TOLERANCE
+        if len(np.unique(row[on])) > len(np.unique(row[best])):
+            best = on
+    for _ in range(3 if best.any() else 0):
+        best = np.abs(ridge - _curve(share[best], ridge[best], share)) < _TRACE_TOLERANCE
+    return best
+
+
+def _curve(share: Floats, ridge: Floats, at: Floats) -> Floats:
+    """Return the parabola through given places, at other places."""
+    powers = np.arange(3)
+    fitted = np.linalg.lstsq(share[:, None] ** powers, ridge, rcond=None)[0]
+    return np.asarray(at[:, None] ** powers @ fitted)

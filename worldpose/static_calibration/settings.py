@@ -85,6 +85,16 @@ class CameraPrior(Record):
     bracket."""
 
 
+class ProposalSettings(Record):
+    """Prior of cameras without clicks, and the people who decide their sides."""
+
+    prior: CameraPrior = CameraPrior()
+    """Gaussian prior of the camera."""
+    people_frames: int = Field(default=12, ge=1, le=1000)
+    """Number of frames, evenly spaced, in which the bundled detector finds people if a camera has
+    no stated side [frame]: one or two seconds of one core each."""
+
+
 class StaticCalibrationSettings(Record):
     """Click noise, camera prior, and thresholds of outliers and accuracy."""
 

@@ -48,13 +48,25 @@ export class Edits {
     this.#keep({ kind, name, was, xy });
   }
 
+  // Several markings as one edit, for undo and redo.
+  commitTogether(drawn) {
+    const group = newId("redrawn_marking");
+    for (const [name, xy] of Object.entries(drawn)) {
+      const edit = { kind: "marking", name, was: this.value("marking", name), xy, group };
+      this.show(edit.kind, name, xy);
+      this.done.push(edit);
+      this.#keep(edit);
+    }
+    this.undone = [];
+  }
+
   undo() {
     const edit = this.done.pop();
     if (!edit) return null;
     this.undone.push(edit);
     this.show(edit.kind, edit.name, edit.was);
     this.#keep({ ...edit, was: edit.xy, xy: edit.was });
-    return edit;
+    return edit.group && this.done.at(-1)?.group === edit.group ? this.undo() : edit;
   }
 
   redo() {
@@ -63,7 +75,7 @@ export class Edits {
     this.done.push(edit);
     this.show(edit.kind, edit.name, edit.xy);
     this.#keep(edit);
-    return edit;
+    return edit.group && this.undone.at(-1)?.group === edit.group ? this.redo() : edit;
   }
 
   get pending() {

@@ -6,8 +6,7 @@ import pytest
 
 from worldpose.geometry import Camera
 from worldpose.static_calibration import step_camera
-from worldpose.static_calibration.adjustment import build_problem, camera_row
-from worldpose.static_calibration.descent import step_row
+from worldpose.static_calibration.adjustment import build_problem, camera_row, step_row
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.parameters import PARAMETERS

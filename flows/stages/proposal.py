@@ -1,0 +1,127 @@
+"""Stage `proposal`: one unit per static camera without clicks; of all, where a side is unknown."""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from data_contracts.static_calibration import ClickedMarkings
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import detection
+from flows.stages.ingest import video_sources
+from worldpose.detection import DetectionSettings
+from worldpose.ingest import unit_frames
+from worldpose.ingest.annotations import clicked_file
+from worldpose.static_calibration import ProposalSettings
+
+
+@once_a_match
+def units(match: Match) -> tuple[str, ...]:
+    """Return the static cameras without clicks, in order.
+
+    If one of them has no stated side, the people of all static cameras decide.
+    """
+    static = tuple(camera.id for camera in match.folder.spec.static_cameras)
+    return static if _needs_people(match) else tuple(proposed_cameras(match))
+
+
+@once_a_match
+def proposed_cameras(match: Match) -> dict[str, str | None]:
+    """Return the cameras that are neither given nor clicked, each with its side if it is stated."""
+    folder = match.folder
+    known = {*folder.calibrations, *folder.clicked}
+    return {each.id: each.side for each in folder.spec.static_cameras if each.id not in known}
+
+
+def inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the camera's given 2D poses or the index of its video, if people decide."""
+    return (f"ingest/{unit}",) if _needs_people(match) else ()
+
+
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return the camera's image, pitch and lens, its stated side, and the clips with people."""
+    folder = match.folder
+    people: JsonValue = None
+    if _needs_people(match):
+        filmed = unit not in folder.detections
+        people = {
+            "video": video_sources(match, unit)["video"] if filmed else None,
+            "ranges": [[first, count] for first, count in unit_frames(folder.spec, unit).ranges],
+        }
+    return {
+        **camera_sources(match, unit),
+        "side": folder.spec.camera(unit).side,
+        "fps": folder.spec.fps,
+        "people": people,
+    }
+
+
+def external_inputs(settings: ProposalSettings) -> dict[str, JsonValue]:
+    """Return the versions of the libraries that run the bundled detector."""
+    return detection.outside(DetectionSettings())
+
+
+def needed_proposals(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the proposals that the calibration of a camera needs; none if it has clicks."""
+    if unit not in proposed_cameras(match):
+        return ()
+    names = units(match) if _needs_people(match) else (unit,)
+    return tuple(f"proposal/{name}" for name in names)
+
+
+def camera_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return the given calibration alone, or else clicks, pitch, lens and an image of the camera.
+
+    Clicks are listed under the file's name, by marking, so that a difference between two runs names
+    the file and the point.
+    """
+    folder = match.folder
+    camera = folder.spec.camera(unit)
+    given = folder.calibrations.get(unit)
+    if given is not None:
+        return {"calibration": given.model_dump(mode="json")}
+    clicked = folder.clicked.get(unit)
+    still = folder.stills.get(unit)
+    path = None if still is None else still.relative_to(folder.folder).as_posix()
+    lens = folder.lenses.get(unit)
+    return {
+        "calibration": None,
+        **({} if lens is None else {"lens": lens.model_dump(mode="json")}),
+        "clicked": {} if clicked is None else {clicked_file(unit): _by_name(clicked)},
+        "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),
+        "image_size": [camera.width, camera.height],
+        "still": path,
+        "still_sha256": None if path is None else match.registration.digest_of(path),
+        "filmed": _video_for_still(match, unit) if still is None else None,
+    }
+
+
+def _needs_people(match: Match) -> bool:
+    """Return whether a camera without clicks has no stated side."""
+    return None in proposed_cameras(match).values()
+
+
+def _by_name(clicked: ClickedMarkings) -> dict[str, JsonValue]:
+    return {
+        "points": {point.name: list(point.xy) for point in clicked.points},
+        "drawn": {marking.name: [list(xy) for xy in marking.xy] for marking in clicked.drawn},
+    }
+
+
+def _video_for_still(match: Match, unit: str) -> dict[str, JsonValue] | None:
+    """Return the camera's video, for a still without people if none is given."""
+    if unit not in match.folder.videos:
+        return None
+    offset = unit_frames(match.folder.spec, unit).offset
+    return {**video_sources(match, unit), "offset_frames": offset}
+
+
+STAGE = Stage(
+    name="proposal",
+    about="propose the cameras without clicks",
+    settings=ProposalSettings,
+    units=units,
+    inputs=inputs,
+    sources=sources,
+    external_inputs=external_inputs,
+    needs_static_cameras=True,
+)

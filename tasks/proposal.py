@@ -1,0 +1,160 @@
+"""Task of stage `proposal`: one camera before its calibration, and the people in its images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.cameras import CameraCalibration
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.pitch import PitchSpec
+from data_contracts.proposal import PROPOSAL
+from data_contracts.work import Work
+from tasks.detection import footage_index, require_weights
+from tasks.static_calibration import clicked_markings, given_lens, open_still, require_picture
+from tasks.unit import open_input, unit_task
+from worldpose.detection import DetectionSettings, load_detectors
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.geometry.cameras import camera_arrays
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration import (
+    ProposalSettings,
+    StaticCalibrationSettings,
+    calibrate_camera,
+    propose_camera,
+)
+from worldpose.store import Store
+from worldpose.tracking import locate_feet
+from worldpose.video import open_video
+
+_NOT_PROPOSED: Mapping[str, Any] = {
+    "drawn": {},
+    "markings": [],
+    **dict.fromkeys(("score", "margin", "found", "explained")),
+}
+
+
+@unit_task
+def proposal(work: Work) -> str:
+    """Publish the camera, proposed from its image unless it is known, and people's places."""
+    sources: dict[str, Any] = work.recipe.sources
+    settings = ProposalSettings.model_validate(work.recipe.settings)
+    store = Store.open(work.project)
+    with store.publish(work) as result:
+        attributes = {
+            "camera_id": work.recipe.unit,
+            "fps": sources["fps"],
+            "is_stated": True,
+            "is_clear": True,
+            "problem": None,
+            **_NOT_PROPOSED,
+        }
+        pitch = None
+        if sources.get("pitch") is not None:
+            pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
+        try:
+            camera, found = _find_camera(work, pitch, settings)
+        except InputError as error:  # one camera must not end the match
+            words = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
+            none = {"origin": "none", "is_clear": False, "problem": words}
+            result.write(PROPOSAL, arrays={}, attributes={**attributes, **none})
+            return work.key
+        arrays: dict[str, Any] = dict(camera_arrays(camera))
+        frames = {}
+        if sources["people"] is not None:
+            people = _find_people(store, work, settings.people_frames)
+            feet = locate_feet(Camera.stack([camera]), people, pitch or PitchTemplate.standard())
+            arrays |= {"place": feet.xy[:, 0], "place_covariance": feet.noise[:, 0]}
+            frames = {"frame": people.frame}
+        result.write(
+            PROPOSAL, arrays=arrays, coordinates=frames, attributes={**attributes, **found}
+        )
+        if found["origin"] == "image":
+            result.figures.update(
+                {name: float(found[name]) for name in ("margin", "found", "explained")}
+            )
+    return work.key
+
+
+def _find_camera(
+    work: Work, pitch: PitchTemplate | None, settings: ProposalSettings
+) -> tuple[Camera, Mapping[str, Any]]:
+    """Return the camera, and the stored attributes that tell how it was found.
+
+    Raises:
+        InputError: clicks or image do not determine it.
+    """
+    sources: dict[str, Any] = work.recipe.sources
+    if sources["calibration"] is not None:
+        given = CameraCalibration.model_validate(sources["calibration"])
+        return Camera.from_calibration(given), {"origin": "given"}
+    assert pitch is not None  # registration requires it
+    lens = given_lens(sources)
+    if sources["clicked"]:
+        ((file, clicked),) = sources["clicked"].items()
+        calibration = calibrate_camera(
+            pitch,
+            clicked_markings(clicked),
+            tuple(sources["image_size"]),
+            settings=StaticCalibrationSettings(prior=settings.prior, lines=False),
+            where=file,
+            lens=lens,
+        )
+        return calibration.estimate.camera, {"origin": "points"}
+    side = sources["side"]
+    proposed = propose_camera(
+        require_picture(work.recipe.unit, open_still(work)),
+        pitch,
+        side=side or "near",
+        prior=settings.prior,
+        lens=lens,
+        where=f"image of {work.recipe.unit}",
+    )
+    return proposed.camera, {
+        "origin": "image",
+        "is_stated": side is not None,
+        "is_clear": proposed.is_clear,
+        **proposed.attributes(),
+    }
+
+
+def _find_people(store: Store, work: Work, count: int) -> KeypointDetections:
+    """Return the people (frames, 1 camera, people) of evenly spaced frames."""
+    sources: dict[str, Any] = work.recipe.sources
+    wanted = sources["people"]
+    every = np.concatenate([np.arange(first, first + size) for first, size in wanted["ranges"]])
+    frames = every[np.linspace(0, len(every) - 1, min(count, len(every))).astype(np.int64)]
+    stored = open_input(store, work, f"ingest/{work.recipe.unit}")
+    if wanted["video"] is None:
+        given = KeypointDetections.from_arrays(stored.sel(frame=frames))
+        return KeypointDetections.stack([given])
+    settings = DetectionSettings()
+    require_weights(settings, sources["weights"])
+    (detector,) = load_detectors(settings)
+    boxes: list[NDArray[np.float64]] = []
+    numbers = stored["picture_of_frame"].sel(frame=frames).values
+    with open_video(Path(work.folder) / wanted["video"], footage_index(stored)) as video:
+        for number in numbers.tolist():
+            shown = video.readable(number, number + 1) if number >= 0 else ()
+            picture = next((each for _, each in shown), None)
+            if picture is None:
+                boxes.append(np.empty((0, 4)))
+                continue
+            (people,) = detector.detect([picture])
+            boxes.append(people.boxes[people.scores >= settings.high_score_threshold])
+    most = max(1, *(len(each) for each in boxes))
+    placed = np.full((len(frames), 1, most, 4), np.nan)
+    for row, each in enumerate(boxes):
+        placed[row, 0, : len(each)] = each
+    return KeypointDetections(
+        keypoints=np.full((*placed.shape[:3], 17, 2), np.nan),
+        confidence=np.full((*placed.shape[:3], 17), np.nan),
+        boxes=placed,
+        score=np.where(np.isnan(placed[..., 0]), np.nan, 1.0),
+        frame=frames,
+    )

@@ -1,0 +1,135 @@
+"""Paint thinner than the search for lines admits, and half turns of what was found."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation.scene import look_at
+from worldpose.static_calibration.paint_segments import trace_marking
+from worldpose.static_calibration.proposal import MarkingSupport, Proposal
+from worldpose.static_calibration.sides import turn_name
+
+PITCH = PitchTemplate.standard()
+SIZE = (1920, 400)
+
+
+def grass(seed=80):
+    rng = np.random.default_rng(seed)
+    image = np.full((SIZE[1], SIZE[0], 3), (70, 110, 60), np.float64)
+    return image + rng.normal(0.0, 3.0, (SIZE[1], SIZE[0], 1))
+
+
+def paint(image, places, strength=0.45):
+    """Add a line one pixel wide along places (n, 2), at sub-pixel accuracy."""
+    cover = np.zeros(image.shape[:2], np.uint8)
+    shift = 4
+    points = np.round(places * 2**shift).astype(np.int32)
+    cv2.polylines(cover, [points], False, 255, 1, cv2.LINE_AA, shift)
+    return image + (230.0 - image) * strength * (cover[..., None] / 255.0)
+
+
+def as_picture(image):
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def projected():
+    x = np.linspace(20.0, 1900.0, 200)
+    return np.stack([x, 200.0 - 0.03 * x], axis=1)
+
+
+def true_places(offset=4.0, sag=2.0):
+    """The real line: beside its projection and bent."""
+    line = projected()
+    share = (line[:, 0] - 960.0) / 960.0
+    return line + np.stack([np.zeros(len(line)), offset - sag * share**2], axis=1)
+
+
+def test_thin_paint_beside_its_projection_is_traced_despite_letters():
+    image = paint(grass(), true_places())
+    rng = np.random.default_rng(81)
+    for x in range(900, 1500, 14):  # letters behind the line
+        y = 200.0 - 0.03 * x - 4.0 + rng.uniform(-2.0, 2.0)
+        cv2.rectangle(image, (x, int(y)), (x + 9, int(y) + 2), (220.0, 220.0, 220.0), -1)
+    found = trace_marking(as_picture(image), projected())
+    assert len(found) > 150
+    expected = np.interp(found[:, 0], *true_places().T)
+    assert np.abs(np.median(found[:, 1] - expected)) < 0.15
+    assert np.quantile(np.abs(found[:, 1] - expected), 0.95) < 1.0
+
+
+def test_without_paint_nothing_is_traced():
+    assert len(trace_marking(as_picture(grass()), projected())) == 0
+    edge = grass()
+    edge[:190] = 150.0  # a step in brightness is no line
+    assert len(trace_marking(as_picture(edge), projected())) == 0
+
+
+def test_of_two_equal_lines_none_is_traced():
+    image = paint(paint(grass(), true_places(4.0)), true_places(-4.0))
+    assert len(trace_marking(as_picture(image), projected())) == 0
+
+
+def test_a_marking_outside_of_the_image_is_not_traced():
+    outside = projected() + [0.0, 1000.0]
+    assert len(trace_marking(as_picture(grass()), outside)) == 0
+    assert len(trace_marking(as_picture(grass()), np.full((5, 2), np.nan))) == 0
+
+
+@pytest.fixture
+def proposal():
+    camera = Camera(
+        focal=np.array([1300.0, 1300.0]),
+        principal_point=np.array([639.5, 359.5]),
+        distortion=np.array([-0.05, 0.0, 0.0, 0.0, 0.0]),
+        cam_from_world=look_at(np.array([-24.0, -60.0, 22.0]), np.array([-33.0, -2.0, 0.0]), 0.01),
+        image_size=np.array([1280, 720]),
+    )
+    drawn = []
+    for name in ("penalty_area_left_near", "halfway_line", "center_circle", "penalty_arc_left"):
+        pixels = camera.project(PITCH.marking_points(name, 2.0))
+        pixels = pixels[((pixels > 0.0) & (pixels < [1279.0, 719.0])).all(axis=1)]
+        drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
+    markings = (MarkingSupport("penalty_area_left_near", 200.0, 0.9),)
+    return Proposal(camera, ClickedMarkings(drawn=tuple(drawn)), markings, 90.0, 40.0, 0.9, 0.5)
+
+
+def test_a_turned_proposal_draws_the_same_pixels_under_the_names_of_the_other_half(proposal):
+    turned = proposal.turn()
+    assert [each.name for each in turned.drawn.drawn] == [
+        *("penalty_area_right_far", "halfway_line", "center_circle", "penalty_arc_right")
+    ]
+    for before, after in zip(proposal.drawn.drawn, turned.drawn.drawn, strict=True):
+        assert before.xy == after.xy
+        lines = [
+            camera.project(PITCH.marking_points(name, 0.1))
+            for camera, name in ((proposal.camera, before.name), (turned.camera, after.name))
+        ]
+        away = np.linalg.norm(lines[0][:, None] - lines[1], axis=-1).min(axis=1)
+        assert np.nanmax(away) < 2.0
+    assert turned.markings[0].name == "penalty_area_right_far"
+    again = turned.turn()
+    assert again.drawn == proposal.drawn
+    assert np.allclose(again.camera.center, proposal.camera.center)
+
+
+def test_every_marking_of_the_template_has_a_partner():
+    names = {*PITCH.lines, *PITCH.arcs}
+    for name in names:
+        assert turn_name(name) in names
+        mine, other = (PITCH.marking_points(each, 0.5) for each in (name, turn_name(name)))
+        away = np.linalg.norm(mine[:, None] * [-1.0, -1.0, 1.0] - other, axis=-1).min(axis=1)
+        assert away.max() < 0.3
+
+
+def test_a_stored_proposal_is_read_back(proposal):
+    stored = json.loads(json.dumps(proposal.attributes()))
+    read = Proposal.from_attributes(proposal.camera, stored)
+    assert read.drawn == proposal.drawn
+    assert read.markings == proposal.markings
+    assert (read.score, read.margin, read.found, read.explained) == (90.0, 40.0, 0.9, 0.5)
+    assert read.is_clear
