@@ -28,11 +28,10 @@ from worldpose.body_fitting.monocular import (
     deviations,
     learn_precision,
 )
-from worldpose.body_fitting.objective import ANKLES, Evidence, Ground, Pose
+from worldpose.body_fitting.objective import ANKLES, Evidence, Ground, Pose, body_axes
 from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.body_fitting.solver import Shapes, Solver, fit_shapes
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
@@ -44,6 +43,8 @@ cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 KEPT_BIAS: Final = 0.01
 """Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
 model the rest."""
+MAX_OFFSET: Final = 3.0
+"""Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
 MONOCULAR_TIME: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 
@@ -135,8 +136,7 @@ def fit_bodies(
     """
     joints, fps = evidence.joints, evidence.fps
     bias = np.zeros(17) if evidence.common_bias is None else evidence.common_bias
-    modelled = np.maximum(bias**2 - KEPT_BIAS**2, 0.0)
-    covariance = evidence.covariance - modelled[:, None, None] * np.eye(3)
+    covariance = random_covariance(evidence.covariance, bias)
     frames, persons = joints.shape[:2]
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
@@ -187,6 +187,17 @@ def fit_bodies(
         gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
         result.drop(person, span, gone)
     return result.fit(shapes)
+
+
+def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
+    """Return the covariance of joints without most of the bias that the shared offsets model.
+
+    Args:
+        covariance: (frames, persons, 17, 3, 3) [m^2], of triangulated joints.
+        common_bias: (17,) per axis [m], included in `covariance`.
+    """
+    modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
+    return covariance - modelled[:, None, None] * np.eye(3)
 
 
 def _monocular_priors(
@@ -412,3 +423,28 @@ def _spread(lengths: Floats) -> float | None:
 def _root_mean_square(values: Floats) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else None
+
+
+def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
+    """Return the joints of bodies with unusually large offsets.
+
+    Shape and offsets together follow the detector: an offset much larger than a detector's common
+    bias means that either the joints or the bodies are wrong.
+
+    Args:
+        offsets: (17, 3) [m], of joints of bodies.
+        common_bias: (17,) per axis [m]; 0 = not known.
+
+    Returns:
+        By joint, left and right as one: length of the offset and its usual maximum [m].
+    """
+    length = np.linalg.norm(offsets, axis=-1)
+    far = (length > MAX_OFFSET * common_bias) & (common_bias > 0.0)
+    return {
+        COCO17[joint].removeprefix("left_"): (
+            float(length[joint]),
+            MAX_OFFSET * float(common_bias[joint]),
+        )
+        for joint in np.flatnonzero(far)
+        if not COCO17[joint].startswith("right")
+    }

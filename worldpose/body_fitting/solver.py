@@ -26,18 +26,19 @@ from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.objective import (
     ACCELERATION_SCALE,
     JOINT_SPREAD,
+    MIRRORED_OFFSETS,
     UNKNOWNS,
     Evidence,
     Ground,
     Pose,
     Track,
     ankle_height,
+    body_axes,
     find_contacts,
     level_feet,
 )
 from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import DegenerateError
 from worldpose.geometry import Rigid
 from worldpose.geometry.optimize.banded import BandedFactor

@@ -6,7 +6,7 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies, report_fit
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import InputError
 
 SETTINGS = BodyFittingSettings()
