@@ -28,14 +28,26 @@ from worldpose.body_fitting.monocular import (
     deviations,
     learn_precision,
 )
-from worldpose.body_fitting.objective import ANKLES, Evidence, Ground, Pose, body_axes
-from worldpose.body_fitting.pose_space import GATHER, SPREAD, load_pose_prior
+from worldpose.body_fitting.objective import (
+    ANKLES,
+    Evidence,
+    Ground,
+    Pose,
+    Track,
+    body_axes,
+)
+from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.solver import Shapes, Solver, fit_shapes
+from worldpose.body_fitting.solver import (
+    Shapes,
+    Solver,
+    fit_shapes,
+    frame_covariance,
+    pose_covariance,
+)
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.geometry.optimize.banded import BandedFactor
 
 MAX_DEVIATION: Final = 0.035
 """Joints are well determined if their median standard deviation per axis is below this [m]: 16
@@ -167,20 +179,22 @@ def fit_bodies(
         known_shapes or {},
         fps,
     )
-    result = FittedArrays.empty(model, frames, persons, bias)
+    result = FittedArrays.empty(model, frames, persons)
     for person, span in spans.items():
-        pose, factor = solver.solve_poses(
+        pose, track = solver.solve_poses(
             by_person[person], shapes.people[person], shapes.offsets, fps
         )
-        result.put(solver, person, span, pose, factor, shapes)
+        spread = _covariance(track, pose, shapes.offsets, bias)
+        result.put(solver, person, span, pose, spread, shapes)
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(
             result, joint_seen, covariance, evidence.monocular_poses, spans, fps
         )
         for person, prior in priors.items():
             shape = shapes.people[person]
-            pose, factor = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
-            result.put(solver, person, spans[person], pose, factor, shapes)
+            pose, track = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
+            spread = _covariance(track, pose, shapes.offsets, bias)
+            result.put(solver, person, spans[person], pose, spread, shapes)
             result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
@@ -198,6 +212,20 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """
     modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
     return covariance - modelled[:, None, None] * np.eye(3)
+
+
+def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) -> Floats:
+    """Return the covariance (frames, 17, 3, 3) [m^2] of a person's keypoints.
+
+    Of the two covariances of its poses the smaller counts, joint by joint. The common bias adds in
+    full: joints of real people's bodies are as far from the labels as triangulated joints.
+    """
+    by_track = pose_covariance(track, pose, offsets)
+    repeated = 1.0 + track.settings.noise_time_s * track.fps
+    by_frame = frame_covariance(track, pose, offsets, repeated)
+    sizes = (np.trace(each, axis1=-2, axis2=-1) for each in (by_frame, by_track))
+    random = np.where(np.less(*sizes)[..., None, None], by_frame, by_track)
+    return random + common_bias[:, None, None] ** 2 * np.eye(3)
 
 
 def _monocular_priors(
@@ -251,12 +279,9 @@ class FittedArrays:
     covariance: Floats
     filled: NDArray[np.bool_]
     guided: NDArray[np.bool_]
-    common_bias: Floats
 
     @classmethod
-    def empty(
-        cls, model: BodyModel, frames: int, persons: int, common_bias: Floats
-    ) -> FittedArrays:
+    def empty(cls, model: BodyModel, frames: int, persons: int) -> FittedArrays:
         """Return arrays without any body."""
 
         def nan(*shape: int) -> Floats:
@@ -272,7 +297,6 @@ class FittedArrays:
             nan(frames, persons, 17, 3, 3),
             np.zeros((frames, persons), dtype=bool),
             np.zeros((frames, persons), dtype=bool),
-            common_bias,
         )
 
     def put(
@@ -281,10 +305,13 @@ class FittedArrays:
         person: int,
         span: slice,
         pose: Pose,
-        factor: BandedFactor,
+        covariance: Floats,
         shapes: Shapes,
     ) -> None:
-        """Write the result of one person."""
+        """Write the result of one person; covariance (frames, 17, 3, 3) [m^2] of the keypoints.
+
+        The covariance of the detector's offsets and of the person's own is added.
+        """
         shape = shapes.people[person]
         body = solver.chained.differentiate(pose.parameters())
         plant_feet = solver.plant_feet(pose)
@@ -294,18 +321,11 @@ class FittedArrays:
         self.body_pose[span, person] = plant_feet.body_pose
         self.transl[span, person] = plant_feet.transl
         self.joints[span, person] = body.keypoints
-        pose_part = body.body_pose @ SPREAD
-        by_frame = np.concatenate(
-            [np.broadcast_to(np.eye(3), (*pose_part.shape[:-1], 3)), body.global_orient, pose_part],
-            axis=-1,
-        )
-        spread = factor.inverse_blocks()[:, None]
         axes = body_axes(body.keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.
         shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
-        own = (solver.settings.own_bias_std_m**2 + self.common_bias**2)[:, None, None] * np.eye(3)
-        turned = by_frame.swapaxes(-1, -2)
-        self.covariance[span, person] = by_frame @ spread @ turned + shared + own
+        own = solver.settings.own_bias_std_m**2 * np.eye(3)
+        self.covariance[span, person] = covariance + shared + own
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""
