@@ -85,6 +85,8 @@ class ClipPeople:
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
+        shared_covariance: (frames, persons, 3, 3) [m^2], the part of it that moves all joints
+            together.
         common_bias: (17,) per axis, systematic error shared by all views [m]; in `covariance`.
     """
 
@@ -93,6 +95,7 @@ class ClipPeople:
     person: NDArray[np.integer]
     joints: Floats
     covariance: Floats
+    shared_covariance: Floats
     common_bias: Floats
 
 
@@ -108,6 +111,7 @@ def open_people(store: Store, work: Work) -> ClipPeople:
         placed["person"].values,
         placed["joints"].values,
         placed["covariance"].values,
+        placed["shared_covariance"].values,
         placed["common_bias"].values,
     )
 
@@ -140,6 +144,7 @@ def fit_people(
             ray_constraints=[alone, *views],
             monocular_poses=monocular_poses,
             common_bias=people.common_bias,
+            shared_covariance=people.shared_covariance,
         ),
         settings,
         ground,

@@ -109,6 +109,7 @@ def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[A
     return {
         "joints": joints.joints,
         "covariance": joints.covariance,
+        "shared_covariance": joints.shared_covariance,
         "views": joints.views,
         "spread": joints.spread,
         "reprojection_error": joints.reprojection_error,

@@ -103,6 +103,9 @@ class ClipEvidence:
             persons; a person without joints is present as long as these last.
         monocular_poses: poses of the same frames and persons, used where few joints are well
             determined (S4).
+        shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
+            joints of a person together: no number of joints reduces it. NaN = unknown in this
+            frame; None = none.
 
     Raises:
         InputError: the shapes do not match.
@@ -114,6 +117,7 @@ class ClipEvidence:
     common_bias: Floats | None = None
     ray_constraints: Sequence[RayConstraints] = ()
     monocular_poses: MonocularPoses | None = None
+    shared_covariance: Floats | None = None
 
     def __post_init__(self) -> None:
         shape = self.joints.shape
@@ -200,6 +204,10 @@ def fit_bodies(
         result.filled[span, person] = ~seen[span, person]
         gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
         result.drop(person, span, gone)
+    if evidence.shared_covariance is not None:
+        for person, span in spans.items():
+            shared = _nearest_known(evidence.shared_covariance[span, person])
+            result.covariance[span, person] += shared[:, None]
     return result.fit(shapes)
 
 
@@ -226,6 +234,16 @@ def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) 
     sizes = (np.trace(each, axis1=-2, axis2=-1) for each in (by_frame, by_track))
     random = np.where(np.less(*sizes)[..., None, None], by_frame, by_track)
     return random + common_bias[:, None, None] ** 2 * np.eye(3)
+
+
+def _nearest_known(matrices: Floats) -> Floats:
+    """Return matrices (frames, 3, 3) with those of the nearest frame where they are NaN."""
+    known = np.flatnonzero(np.isfinite(matrices).all(axis=(-1, -2)))
+    if not len(known):
+        return np.zeros_like(matrices)
+    frames = np.arange(len(matrices))
+    nearest: Floats = matrices[known[np.abs(frames[:, None] - known).argmin(axis=1)]]
+    return nearest
 
 
 def _monocular_priors(

@@ -206,3 +206,19 @@ def test_bodies_are_no_less_certain_than_joints_of_single_frames():
     # What the settings make of 20 mm, and the body's own 6 and 8 mm: ankles gain nothing else.
     most = np.sqrt((1.3 * JOINT_SPREAD * 0.02) ** 2 + 0.006**2 + 0.008**2)
     assert (np.mean(stated, axis=(0, 1, 2)) < 1.1 * most).all()
+
+
+def test_what_moves_all_joints_together_is_no_smaller_for_bodies():
+    rng = np.random.default_rng(4)
+    joints, covariance = seen(walker(20, rng), 0.01, rng)
+    shared = np.tile(np.diag([0.04, 0.01, 0.0]) ** 2, (20, 1, 1, 1))
+    shared[5:8] = np.nan  # no joint there
+    joints[5:8] = np.nan
+    plain = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0))
+    moved = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0, shared_covariance=shared))
+    np.testing.assert_array_equal(moved.joints, plain.joints)
+    np.testing.assert_allclose(
+        moved.covariance - plain.covariance,
+        np.broadcast_to(np.diag([0.04, 0.01, 0.0]) ** 2, moved.covariance.shape),
+        atol=1e-12,
+    )
