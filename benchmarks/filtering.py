@@ -20,6 +20,7 @@ from worldpose.body_fitting import (
     ClipEvidence,
     find_ray_constraints,
     fit_bodies,
+    perceived_joints,
 )
 from worldpose.filtering import (
     FilteringSettings,
@@ -27,7 +28,6 @@ from worldpose.filtering import (
     judge_detections,
     learn_keypoint_spread,
     perceived_covariance,
-    perceived_joints,
     view_bodies,
 )
 from worldpose.geometry import Camera

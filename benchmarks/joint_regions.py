@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from scipy.special import chdtri
 
 from data_contracts.arrays import Flags
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
 from worldpose.evaluation.matching import joint_distances, match_people, select_frames, take_matched
 from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
-
-JOINT_GROUPS: Final = {
-    "head": ("nose", "eye", "ear"),
-    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
-}
-"""Parts of joint names, by group of joints."""
 
 
 def region_counts(

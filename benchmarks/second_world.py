@@ -34,9 +34,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joint_regions import JOINT_GROUPS, region_counts
+from joint_regions import region_counts
 from numpy.typing import NDArray
 
+from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.run import RunRecord
 from flows.match import task_of
 from flows.registering import find_match

@@ -26,8 +26,8 @@ import numpy as np
 from common import run_in_process
 from shelf import load_scorer
 
+from worldpose.body_fitting import perceived_joints
 from worldpose.errors import WorldposeError
-from worldpose.filtering import perceived_joints
 from worldpose.ingest import import_match
 from worldpose.store import Store
 

@@ -74,6 +74,12 @@ COCO17_TORSO = (5, 6, 11, 12)
 COCO17_FLIP = (0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15)
 """The joint that each joint becomes in the mirror image."""
 
+JOINT_GROUPS = {
+    "head": ("nose", "eye", "ear"),
+    **{name: (name,) for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")},
+}
+"""Parts of the names in `COCO17`, by group of joints."""
+
 COCO17_SIGMAS = (
     0.026,
     0.025,

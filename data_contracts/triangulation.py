@@ -39,6 +39,16 @@ TRIANGULATION = GroupLayout(
             chunk_dim="frame",
         ),
         ArrayLayout(
+            name="shared_covariance",
+            dims=("frame", "person", "coordinate", "coordinate_"),
+            dtype="float64",
+            unit="m^2",
+            missing="nan",
+            about="the part of `covariance` that all joints of a person share: calibration moves "
+            "the whole person",
+            chunk_dim="frame",
+        ),
+        ArrayLayout(
             name="common_bias",
             dims=("joint",),
             dtype="float64",

@@ -15,15 +15,19 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Recipe, Work
 from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.triangulation import camera_errors, load_triangulation_settings
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.body import BodyModel, digest_of_body, find_body
 from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
     ClipEvidence,
+    Ground,
     MonocularPoses,
     RayConstraints,
+    SeenClip,
     Shape,
+    compare_held_out,
     far_offsets,
     find_ray_constraints,
     fit_bodies,
@@ -42,8 +46,33 @@ def body_fitting(work: Work) -> str:
     store = Store.open(work.project)
     with store.publish(work) as result:
         people = open_people(store, work)
-        publish_fit(result, BODY_FITTING, people, *fit_people(people, work.recipe))
+        model, fit = fit_people(people, work.recipe)
+        publish_fit(result, BODY_FITTING, people, model, fit)
+        result.figures.update(_compare_with_joints(store, work, people, fit))
     return work.key
+
+
+def _compare_with_joints(
+    store: Store, work: Work, people: ClipPeople, fit: BodyFit
+) -> dict[str, float]:
+    """Return the metrics of fitted against triangulated joints in held-out cameras."""
+    recipe, unit = work.recipe, work.recipe.unit
+    placed = store.manifest(
+        recipe.match_id, "retriangulation", unit, recipe.inputs[f"retriangulation/{unit}"]
+    )
+    clip = people.clip
+    held_out = compare_held_out(
+        *_fitting_basis(people, recipe),
+        SeenClip(
+            clip.cameras,
+            camera_errors(work, clip),
+            people.detections,
+            load_triangulation_settings(store, placed.recipe, unit),
+            clip.fps,
+        ),
+        fit,
+    )
+    return {} if held_out is None else held_out.figures()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +85,8 @@ class ClipPeople:
         person: (persons,) ids.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
         covariance: (frames, persons, 17, 3, 3) [m^2].
+        shared_covariance: (frames, persons, 3, 3) [m^2], the part of it that moves all joints
+            together.
         common_bias: (17,) per axis, systematic error shared by all views [m]; in `covariance`.
     """
 
@@ -64,6 +95,7 @@ class ClipPeople:
     person: NDArray[np.integer]
     joints: Floats
     covariance: Floats
+    shared_covariance: Floats
     common_bias: Floats
 
 
@@ -79,6 +111,7 @@ def open_people(store: Store, work: Work) -> ClipPeople:
         placed["person"].values,
         placed["joints"].values,
         placed["covariance"].values,
+        placed["shared_covariance"].values,
         placed["common_bias"].values,
     )
 
@@ -100,14 +133,7 @@ def fit_people(
         monocular_poses: monocular poses (S4).
         known: shapes from other clips, by person index.
     """
-    sources: dict[str, Any] = recipe.sources
-    pitch = sources["pitch"]
-    ground = None
-    if pitch is not None:
-        template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
-        ground = people.clip.raise_pitch(template).height
-    settings = BodyFittingSettings.model_validate(recipe.settings)
-    model = find_same_body(settings.body_model, sources["body_model_sha256"])
+    model, settings, ground = _fitting_basis(people, recipe)
     alone = find_ray_constraints(people.clip.cameras, people.detections, people.joints)
     fit = fit_bodies(
         model,
@@ -118,12 +144,27 @@ def fit_people(
             ray_constraints=[alone, *views],
             monocular_poses=monocular_poses,
             common_bias=people.common_bias,
+            shared_covariance=people.shared_covariance,
         ),
         settings,
         ground,
         known_shapes=known,
     )
     return model, fit
+
+
+def _fitting_basis(
+    people: ClipPeople, recipe: Recipe
+) -> tuple[BodyModel, BodyFittingSettings, Ground | None]:
+    """Return the body model, the settings and the ground of a recipe."""
+    sources: dict[str, Any] = recipe.sources
+    pitch = sources["pitch"]
+    ground = None
+    if pitch is not None:
+        template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+        ground = people.clip.raise_pitch(template).height
+    settings = BodyFittingSettings.model_validate(recipe.settings)
+    return find_same_body(settings.body_model, sources["body_model_sha256"]), settings, ground
 
 
 def publish_fit(

@@ -128,7 +128,7 @@ def _open_clip(store: Store, work: Work, people: _People, opened: ClipInputs) ->
         detections=opened.detections[:].assign_people(people.detection_index),
         joints=people.joints,
         views=people.views,
-        triangulation=load_triangulation_settings(store, work, next(iter(sources["clips"]))),
+        triangulation=load_triangulation_settings(store, work.recipe, next(iter(sources["clips"]))),
         pitch=template,
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
         names=tuple(opened.camera_ids),

@@ -14,6 +14,7 @@ from tasks.clip_inputs import ClipInputs, load_dropped_boxes, open_clip
 from tasks.spool import open_spool
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
+from worldpose.body_fitting import perceived_joints
 from worldpose.filtering import (
     BodyMotion,
     BodyViews,
@@ -25,7 +26,6 @@ from worldpose.filtering import (
     learn_systematic_errors,
     measure_held_out,
     perceived_covariance,
-    perceived_joints,
     view_bodies,
     watch_motion,
 )
@@ -168,7 +168,7 @@ def _open(store: Store, work: Work) -> _Case:
         covariance=perceived_covariance(bodies["covariance"].values, placed["common_bias"].values),
         placed=placed,
         dropped=load_dropped_boxes(store, work),
-        triangulation=load_triangulation_settings(store, work, unit),
+        triangulation=load_triangulation_settings(store, work.recipe, unit),
     )
 
 

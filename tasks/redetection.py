@@ -20,6 +20,7 @@ from tasks.clip_inputs import ADJUSTED
 from tasks.detection import footage_index, require_weights
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, require_registered, unit_task
+from worldpose.body_fitting import perceived_joints
 from worldpose.detection import DetectionSettings, Place, load_pose, load_score_map
 from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering import (
@@ -30,7 +31,6 @@ from worldpose.filtering import (
     ViewBias,
     learn_keypoint_spread,
     perceived_covariance,
-    perceived_joints,
     view_bodies,
     watch_motion,
 )
@@ -169,7 +169,7 @@ def _open(store: Store, work: Work) -> _Case:
     seen = find_detected_people(index, fits, dropped)
     edits: Any = manifest.recipe.sources.get("edits", [])
     seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
-    noise = load_triangulation_settings(store, work, clip).noise
+    noise = load_triangulation_settings(store, work.recipe, clip).noise
     suspects = TriangulatedDetections(
         KeypointDetections.from_keypoints(
             detected.keypoints[:, None].astype(np.float64),

@@ -14,6 +14,6 @@ def retriangulation(work: Work) -> str:
     """Publish joints with covariance; return the key."""
     store = Store.open(work.project)
     with store.publish(work) as result:
-        settings = load_triangulation_settings(store, work, work.recipe.unit)
+        settings = load_triangulation_settings(store, work.recipe, work.recipe.unit)
         write_joints(store, work, settings, result, RETRIANGULATION)
     return work.key

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.triangulation import TRIANGULATION
-from data_contracts.work import Work
+from data_contracts.work import Recipe, Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.spool import open_spool
 from tasks.unit import figures_of, open_input, unit_task
@@ -37,10 +37,10 @@ def triangulation(work: Work) -> str:
     return work.key
 
 
-def load_triangulation_settings(store: Store, work: Work, clip: str) -> TriangulationSettings:
-    """Return the settings of a clip's first triangulation."""
-    match_id, key = work.recipe.match_id, work.recipe.inputs[f"triangulation/{clip}"]
-    recipe = store.manifest(match_id, "triangulation", clip, key).recipe
+def load_triangulation_settings(store: Store, user: Recipe, clip: str) -> TriangulationSettings:
+    """Return the settings of a clip's first triangulation, an input of the recipe `user`."""
+    key = user.inputs[f"triangulation/{clip}"]
+    recipe = store.manifest(user.match_id, "triangulation", clip, key).recipe
     return TriangulationSettings.model_validate(recipe.settings)
 
 
@@ -109,6 +109,7 @@ def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[A
     return {
         "joints": joints.joints,
         "covariance": joints.covariance,
+        "shared_covariance": joints.shared_covariance,
         "views": joints.views,
         "spread": joints.spread,
         "reprojection_error": joints.reprojection_error,

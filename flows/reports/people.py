@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.results.best_results import (
     ADJUSTED,
     bodies_unit,
@@ -144,11 +146,38 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
         )
         titles = (f">{_BODIES[name][0]}" for name in columns)
         tables.append(Table(clip_title(clip), (">person", *titles), rows))
+        tables += _held_out_tables(clip, run.record.figures.get(f"body_fitting/{clip}", {}))
         without = run[unit].attrs.get("without_body") or {}
         if without:
             heading = f"{clip_title(clip)}: people with a place on the pitch and no body"
             tables.append(Table(heading, (">person", "reason"), tuple(without.items())))
     return tables
+
+
+def _held_out_tables(clip: str, figures: Mapping[str, float]) -> list[Table]:
+    """Tabulate fitted against triangulated joints in held-out cameras, if these were compared."""
+    names = ("fitted", "triangulated", "excess", "excess_error", "certain_excess")
+    rows = []
+    for group in JOINT_GROUPS:
+        values = [figures.get(f"held_out_{name}_m.{group}") for name in names]
+        if None in values:
+            continue
+        fitted, triangulated, excess, error, certain = (1e3 * (value or 0.0) for value in values)
+        rows.append(
+            (
+                group,
+                *(f"{value:.1f}" for value in (fitted, triangulated, excess, error)),
+                f"at least {certain:.0f} mm more error" if certain > 0.0 else "",
+            )
+        )
+    if not rows:
+        return []
+    columns = (
+        *("joints", ">bodies mm", ">triangulated mm"),
+        *(">difference mm", ">standard error mm", "bodies are worse"),
+    )
+    heading = f"{clip_title(clip)}: distance to the keypoints of cameras that were held out"
+    return [Table(heading, columns, tuple(rows))]
 
 
 def _of_body(name: str, value: float | None) -> str:

@@ -14,8 +14,9 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from flows.stage import Match
 from worldpose.body import BodyModel, BodyParameters, find_body
+from worldpose.body_fitting import perceived_joints
 from worldpose.errors import InputError, UsageError, WorldposeError
-from worldpose.filtering import perceived_covariance, perceived_joints
+from worldpose.filtering import perceived_covariance
 from worldpose.formats import JointTracks
 from worldpose.formats.joints_file import fill_gaps
 from worldpose.formats.tables import Positions

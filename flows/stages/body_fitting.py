@@ -6,7 +6,7 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import detection, tracking
-from worldpose.body import OPEN_BODY, digest_of_body
+from worldpose.body import digest_of_body, is_open_body
 from worldpose.body_fitting import BodyFittingSettings
 
 
@@ -35,7 +35,7 @@ def digest_of_model(name: str) -> dict[str, JsonValue]:
 
     It is None for the open body, which is part of the code and so of the code's digest.
     """
-    if name == OPEN_BODY:
+    if is_open_body(name):
         return {"body_model_sha256": None}
     return {"body_model_sha256": digest_of_body(name)}
 

@@ -28,6 +28,9 @@ GOOD_VIDEO = {
 }
 
 
+GOOD_BODIES = {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}
+
+
 @pytest.mark.parametrize(
     ("gate", "figures", "objected"),
     [
@@ -48,6 +51,18 @@ GOOD_VIDEO = {
         (ACCEPTANCE, {"bodies": 100.0, "filled": 4.0, "offset_rms_m": 0.01}, []),
         (ACCEPTANCE, {"bodies": 100.0, "filled": 6.0, "offset_rms_m": 0.01}, ["filled_share"]),
         (ACCEPTANCE, {"bodies": 0.0, "filled": 0.0, "offset_rms_m": 0.01}, []),
+        (ACCEPTANCE, GOOD_BODIES | {"held_out_certain_excess_m.knee": 0.01}, []),
+        (
+            ACCEPTANCE,
+            GOOD_BODIES
+            | {
+                "held_out_certain_excess_m.knee": 0.02,
+                "held_out_certain_excess_m.ankle": 0.03,
+                "held_out_certain_excess_m.head": 0.0,
+                "held_out_excess_m.hip": 0.05,  # not certain
+            },
+            ["held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes"],
+        ),
     ],
 )
 def test_auto_objects_to_figures_beyond_their_limits(gate, figures, objected):

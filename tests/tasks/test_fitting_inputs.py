@@ -39,6 +39,7 @@ def test_legs_that_triangulation_exchanged_are_exchanged_for_bodies_too(monkeypa
             person=[0, 1],
             joints=np.zeros((4, 2, 17, 3)),
             covariance=np.zeros((4, 2, 17, 3, 3)),
+            shared_covariance=np.zeros((4, 2, 3, 3)),
             common_bias=np.zeros(17),
             exchanged=exchanged,
         ),

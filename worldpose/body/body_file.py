@@ -12,6 +12,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +24,12 @@ from worldpose.errors import InputError, UsageError
 
 OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
+NARROW_OPEN_BODY: Final = "open-neutral/3"
+"""The open body with hip joints as far apart as people's; its surface is the same."""
+HIP_WIDTH: Final = 0.175
+"""Distance between the hip joints of the mean narrow body [m], 0.230 in the other. Hip centres lie
+14 % of the distance between the anterior superior iliac spines medial of these (Bell, Brand and
+Pedersen, Human Movement Science 8, 1989), which leaves 0.72 of some 0.24 m."""
 
 KEYS: Final = (
     "v_template",
@@ -44,9 +51,28 @@ _SHAPES: Final = 10
 """Number of betas that are read, as in the released poses (X3)."""
 
 
-def load_open_body() -> BodyModel:
-    """Return the open body: 6890 vertices, 24 joints, 10 betas, free for any use (CC0)."""
-    return load_body(Path(__file__).parent / "open_body.npz")
+def load_open_body(name: str = OPEN_BODY) -> BodyModel:
+    """Return the open body: 6890 vertices, 24 joints, 10 betas, free for any use (CC0).
+
+    Both versions have the same surface; the later one has narrower hip joints.
+    """
+    wide = load_body(Path(__file__).parent / "open_body.npz")
+    return _move_hips(wide) if name == NARROW_OPEN_BODY else wide
+
+
+def _move_hips(wide: BodyModel) -> BodyModel:
+    """Return the open body with the hip joints moved towards each other, for every shape alike."""
+    left, right = wide.joint_template[1:3]
+    share = 0.5 * (1.0 - HIP_WIDTH / float(np.linalg.norm(left - right)))
+    regressor = wide.joint_regressor.copy()
+    moved = (1.0 - share) * regressor[1:3] + share * regressor[2:0:-1]
+    regressor[1:3] = moved.astype(np.float32)  # as in a body's file
+    return replace(wide, name=NARROW_OPEN_BODY, joint_regressor=regressor)
+
+
+def is_open_body(name: str) -> bool:
+    """Return whether a body model is a version of the open body."""
+    return name in (OPEN_BODY, NARROW_OPEN_BODY)
 
 
 def load_body(path: Path) -> BodyModel:
@@ -233,8 +259,8 @@ def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
         UsageError: no body of that name is installed.
         InputError: its file is damaged.
     """
-    if name == OPEN_BODY:
-        return load_open_body()
+    if is_open_body(name):
+        return load_open_body(name)
     return load_body(_find_installed(name, folder))
 
 
@@ -244,7 +270,7 @@ def _find_installed(name: str, folder: Path) -> Path:
         installed = sorted(each.stem for each in folder.expanduser().glob("*.npz"))
         raise UsageError(
             f"body model {name!r}",
-            expected=f"one of {', '.join([OPEN_BODY, *installed])}",
+            expected=f"one of {', '.join([OPEN_BODY, NARROW_OPEN_BODY, *installed])}",
             found="none of that name",
             todo="Install one with worldpose body install FILE, or take the open body.",
         )

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         BodyFit,
         BodyFittingReport,
         ClipEvidence,
+        far_offsets,
         fit_bodies,
         report_fit,
     )
@@ -23,12 +24,14 @@ if TYPE_CHECKING:
         measure_bones,
         pool_shapes,
     )
+    from worldpose.body_fitting.held_out import HeldOutComparison, SeenClip, compare_held_out
     from worldpose.body_fitting.monocular import (
         MonocularEstimates,
         MonocularPoses,
         place_monocular_poses,
         read_monocular,
     )
+    from worldpose.body_fitting.objective import Ground, perceived_joints
     from worldpose.body_fitting.plane_bodies import (
         PlaneBodies,
         PlaneEvidence,
@@ -42,7 +45,6 @@ if TYPE_CHECKING:
         shift_frames,
     )
     from worldpose.body_fitting.settings import BodyFittingSettings
-    from worldpose.body_fitting.shared_bias import far_offsets
 
 __all__ = [
     "BodyFit",
@@ -50,12 +52,16 @@ __all__ = [
     "BodyFittingSettings",
     "BoneLengths",
     "ClipEvidence",
+    "Ground",
+    "HeldOutComparison",
     "MonocularEstimates",
     "MonocularPoses",
     "PlaneBodies",
     "PlaneEvidence",
     "RayConstraints",
+    "SeenClip",
     "Shape",
+    "compare_held_out",
     "constrain_to_rays",
     "far_offsets",
     "find_ray_constraints",
@@ -64,6 +70,7 @@ __all__ = [
     "fit_shape",
     "identify_people",
     "measure_bones",
+    "perceived_joints",
     "place_monocular_poses",
     "pool_shapes",
     "read_monocular",
@@ -78,6 +85,7 @@ __getattr__ = import_on_use(
             "BodyFit",
             "BodyFittingReport",
             "ClipEvidence",
+            "far_offsets",
             "fit_bodies",
             "report_fit",
         ),
@@ -88,12 +96,18 @@ __getattr__ = import_on_use(
             "measure_bones",
             "pool_shapes",
         ),
+        "worldpose.body_fitting.held_out": (
+            "HeldOutComparison",
+            "SeenClip",
+            "compare_held_out",
+        ),
         "worldpose.body_fitting.monocular": (
             "MonocularEstimates",
             "MonocularPoses",
             "place_monocular_poses",
             "read_monocular",
         ),
+        "worldpose.body_fitting.objective": ("Ground", "perceived_joints"),
         "worldpose.body_fitting.plane_bodies": (
             "PlaneBodies",
             "PlaneEvidence",
@@ -107,6 +121,5 @@ __getattr__ = import_on_use(
             "shift_frames",
         ),
         "worldpose.body_fitting.settings": ("BodyFittingSettings",),
-        "worldpose.body_fitting.shared_bias": ("far_offsets",),
     },
 )

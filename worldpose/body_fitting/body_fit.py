@@ -33,16 +33,21 @@ from worldpose.body_fitting.objective import (
     Evidence,
     Ground,
     Pose,
-    differentiate_points,
+    Track,
+    body_axes,
 )
-from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
+from worldpose.body_fitting.pose_space import GATHER, load_pose_prior, nearest_known
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import body_axes
-from worldpose.body_fitting.solver import Shapes, Solver, fit_shapes
+from worldpose.body_fitting.solver import (
+    Shapes,
+    Solver,
+    fit_shapes,
+    frame_covariance,
+    pose_covariance,
+)
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.geometry.optimize.banded import BandedFactor
 
 MAX_DEVIATION: Final = 0.035
 """Joints are well determined if their median standard deviation per axis is below this [m]: 16
@@ -50,6 +55,8 @@ cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 KEPT_BIAS: Final = 0.01
 """Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
 model the rest."""
+MAX_OFFSET: Final = 3.0
+"""Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
 MONOCULAR_TIME: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 
@@ -96,6 +103,9 @@ class ClipEvidence:
             persons; a person without joints is present as long as these last.
         monocular_poses: poses of the same frames and persons, used where few joints are well
             determined (S4).
+        shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
+            joints of a person together: no number of joints reduces it. NaN = unknown in this
+            frame; None = none.
 
     Raises:
         InputError: the shapes do not match.
@@ -107,6 +117,7 @@ class ClipEvidence:
     common_bias: Floats | None = None
     ray_constraints: Sequence[RayConstraints] = ()
     monocular_poses: MonocularPoses | None = None
+    shared_covariance: Floats | None = None
 
     def __post_init__(self) -> None:
         shape = self.joints.shape
@@ -141,8 +152,7 @@ def fit_bodies(
     """
     joints, fps = evidence.joints, evidence.fps
     bias = np.zeros(17) if evidence.common_bias is None else evidence.common_bias
-    modelled = np.maximum(bias**2 - KEPT_BIAS**2, 0.0)
-    covariance = evidence.covariance - modelled[:, None, None] * np.eye(3)
+    covariance = random_covariance(evidence.covariance, bias)
     frames, persons = joints.shape[:2]
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
@@ -173,26 +183,66 @@ def fit_bodies(
         known_shapes or {},
         fps,
     )
-    result = FittedArrays.empty(model, frames, persons, bias)
+    result = FittedArrays.empty(model, frames, persons)
     for person, span in spans.items():
-        pose, factor = solver.solve_poses(
+        pose, track = solver.solve_poses(
             by_person[person], shapes.people[person], shapes.offsets, fps
         )
-        result.put(solver, person, span, pose, factor, shapes)
+        spread = _covariance(track, pose, shapes.offsets, bias)
+        result.put(solver, person, span, pose, spread, shapes)
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(
             result, joint_seen, covariance, evidence.monocular_poses, spans, fps
         )
         for person, prior in priors.items():
             shape = shapes.people[person]
-            pose, factor = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
-            result.put(solver, person, spans[person], pose, factor, shapes)
+            pose, track = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
+            spread = _covariance(track, pose, shapes.offsets, bias)
+            result.put(solver, person, spans[person], pose, spread, shapes)
             result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
         gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
         result.drop(person, span, gone)
+    if evidence.shared_covariance is not None:
+        for person, span in spans.items():
+            shared = _nearest_known(evidence.shared_covariance[span, person])
+            result.covariance[span, person] += shared[:, None]
     return result.fit(shapes)
+
+
+def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
+    """Return the covariance of joints without most of the bias that the shared offsets model.
+
+    Args:
+        covariance: (frames, persons, 17, 3, 3) [m^2], of triangulated joints.
+        common_bias: (17,) per axis [m], included in `covariance`.
+    """
+    modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
+    return covariance - modelled[:, None, None] * np.eye(3)
+
+
+def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) -> Floats:
+    """Return the covariance (frames, 17, 3, 3) [m^2] of a person's keypoints.
+
+    Of the two covariances of its poses the smaller counts, joint by joint. The common bias adds in
+    full: joints of real people's bodies are as far from the labels as triangulated joints.
+    """
+    by_track = pose_covariance(track, pose, offsets)
+    repeated = 1.0 + track.settings.noise_time_s * track.fps
+    by_frame = frame_covariance(track, pose, offsets, repeated)
+    sizes = (np.trace(each, axis1=-2, axis2=-1) for each in (by_frame, by_track))
+    random = np.where(np.less(*sizes)[..., None, None], by_frame, by_track)
+    return random + common_bias[:, None, None] ** 2 * np.eye(3)
+
+
+def _nearest_known(matrices: Floats) -> Floats:
+    """Return matrices (frames, 3, 3) with those of the nearest frame where they are NaN."""
+    known = np.flatnonzero(np.isfinite(matrices).all(axis=(-1, -2)))
+    if not len(known):
+        return np.zeros_like(matrices)
+    nearest: Floats = matrices[nearest_known(known, len(matrices))]
+    return nearest
 
 
 def _monocular_priors(
@@ -246,12 +296,9 @@ class FittedArrays:
     covariance: Floats
     filled: NDArray[np.bool_]
     guided: NDArray[np.bool_]
-    common_bias: Floats
 
     @classmethod
-    def empty(
-        cls, model: BodyModel, frames: int, persons: int, common_bias: Floats
-    ) -> FittedArrays:
+    def empty(cls, model: BodyModel, frames: int, persons: int) -> FittedArrays:
         """Return arrays without any body."""
 
         def nan(*shape: int) -> Floats:
@@ -267,7 +314,6 @@ class FittedArrays:
             nan(frames, persons, 17, 3, 3),
             np.zeros((frames, persons), dtype=bool),
             np.zeros((frames, persons), dtype=bool),
-            common_bias,
         )
 
     def put(
@@ -276,10 +322,13 @@ class FittedArrays:
         person: int,
         span: slice,
         pose: Pose,
-        factor: BandedFactor,
+        covariance: Floats,
         shapes: Shapes,
     ) -> None:
-        """Write the result of one person."""
+        """Write the result of one person; covariance (frames, 17, 3, 3) [m^2] of the keypoints.
+
+        The covariance of the detector's offsets and of the person's own is added.
+        """
         shape = shapes.people[person]
         body = solver.chained.differentiate(pose.parameters())
         plant_feet = solver.plant_feet(pose)
@@ -289,14 +338,11 @@ class FittedArrays:
         self.body_pose[span, person] = plant_feet.body_pose
         self.transl[span, person] = plant_feet.transl
         self.joints[span, person] = body.keypoints
-        by_frame = differentiate_points(body.pose)
-        spread = factor.inverse_blocks()[:, None]
         axes = body_axes(body.keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.
         shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
-        own = (solver.settings.own_bias_std_m**2 + self.common_bias**2)[:, None, None] * np.eye(3)
-        turned = by_frame.swapaxes(-1, -2)
-        self.covariance[span, person] = by_frame @ spread @ turned + shared + own
+        own = solver.settings.own_bias_std_m**2 * np.eye(3)
+        self.covariance[span, person] = covariance + shared + own
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""
@@ -414,3 +460,28 @@ def _spread(lengths: Floats) -> float | None:
 def _root_mean_square(values: Floats) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else None
+
+
+def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
+    """Return the joints of bodies with unusually large offsets.
+
+    Shape and offsets together follow the detector: an offset much larger than a detector's common
+    bias means that either the joints or the bodies are wrong.
+
+    Args:
+        offsets: (17, 3) [m], of joints of bodies.
+        common_bias: (17,) per axis [m]; 0 = not known.
+
+    Returns:
+        By joint, left and right as one: length of the offset and its usual maximum [m].
+    """
+    length = np.linalg.norm(offsets, axis=-1)
+    far = (length > MAX_OFFSET * common_bias) & (common_bias > 0.0)
+    return {
+        COCO17[joint].removeprefix("left_"): (
+            float(length[joint]),
+            MAX_OFFSET * float(common_bias[joint]),
+        )
+        for joint in np.flatnonzero(far)
+        if not COCO17[joint].startswith("right")
+    }

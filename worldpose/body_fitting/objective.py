@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17_SIGMAS
+from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREAD, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 from worldpose.compiled import compile_kernel
 
 JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
@@ -30,6 +29,51 @@ JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
 
 MIN_INFORMATION: Final = 1e-6
 """Added to singular information [1/m^2]: one line leaves a direction undetermined."""
+
+
+def _basis() -> Floats:
+    """Return offsets (17, 3, unknowns) by unknowns: forward, left and up of each joint or pair."""
+    columns = []
+    for joint, name in enumerate(COCO17):
+        if name.startswith("right"):
+            continue
+        mirrored = COCO17.index(name.replace("left", "right"))
+        # A joint that is its own mirror image lies in the middle plane.
+        for axis in (0, 1, 2) if mirrored != joint else (0, 2):
+            column = np.zeros((len(COCO17), 3))
+            column[joint, axis] = 1.0
+            column[mirrored, axis] = -1.0 if axis == 1 else 1.0
+            columns.append(column)
+    return np.stack(columns, axis=-1)
+
+
+MIRRORED_OFFSETS: Final = _basis()
+"""(17, 3, 26)"""
+
+
+def body_axes(joints: Floats) -> Floats:
+    """Return columns forward, left and up (..., 3, 3) of bodies whose joints are (..., 17, 3).
+
+    Left follows hips and shoulders, up follows the trunk.
+    """
+    left = joints[..., 5, :] + joints[..., 11, :] - joints[..., 6, :] - joints[..., 12, :]
+    up = joints[..., 5, :] + joints[..., 6, :] - joints[..., 11, :] - joints[..., 12, :]
+    left = left / np.linalg.norm(left, axis=-1, keepdims=True)
+    front = np.cross(left, up)
+    front /= np.linalg.norm(front, axis=-1, keepdims=True)
+    axes: Floats = np.stack([front, left, np.cross(front, left)], axis=-1)
+    return axes
+
+
+def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
+    """Return the detector's joints (frames, persons, 17, 3) of bodies [m], world.
+
+    Args:
+        joints: (frames, persons, 17, 3) [m], world.
+        offsets: (17, 3) [m] from a body's joint to the detector's: forward, left, up.
+    """
+    moved: Floats = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
+    return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +383,7 @@ class Track:
             bordered: whether the equations have a border for betas and offsets.
         """
         frames, settings = len(pose.transl), self.settings
-        body = self._differentiate(pose)
+        body = self.differentiate(pose)
         by_frame, shapes = body.pose, body.betas.shape[-1]
         rows = by_frame.reshape(frames, 51, UNKNOWNS)
 
@@ -386,7 +430,7 @@ class Track:
             return equations
         return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
 
-    def _differentiate(self, pose: Pose) -> KeypointJacobian:
+    def differentiate(self, pose: Pose) -> KeypointJacobian:
         """Return the keypoints with derivatives by the unknowns (frames, 17, 3, 36) in `pose`.
 
         Some frames at a time, so that the derivatives by all angles stay in the processor's cache.

@@ -48,7 +48,7 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import (
     Piece,
     Solver,
-    factor_information,
+    pose_covariance,
     solve_shapes,
     spread_intervals,
 )
@@ -222,7 +222,7 @@ def fit_bodies_on_plane(
     }
     pieces = [piece for person, own in people.items() for piece in clip.sample_pieces(person, own)]
     shapes = solve_shapes(solver, people, pieces, {})
-    result = FittedArrays.empty(model, frames, persons, np.full(17, DEFINITION))
+    result = FittedArrays.empty(model, frames, persons)
     turned = np.full(placed.shape, np.nan)
     for person, own in people.items():
         span = own.span
@@ -231,8 +231,9 @@ def fit_bodies_on_plane(
         rows = np.arange(span.start, span.stop)
         track = clip.track(person, rows, evidence.fps, for_shape=False)
         pose, solved = solver.search(track, start, shapes.offsets)
-        information = factor_information(solved, pose, shapes.offsets)
-        result.put(solver, person, span, pose, information, shapes)
+        spread = pose_covariance(solved, pose, shapes.offsets)
+        bias = np.full(17, DEFINITION**2)[:, None, None] * np.eye(3)
+        result.put(solver, person, span, pose, spread + bias, shapes)
         result.covariance[span, person] += clip.depth_covariance(
             person, own, result.joints[span, person]
         )

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.body import BodyModel
@@ -136,6 +137,15 @@ def interpolate_gaps(joints: Floats) -> Floats:
     return full
 
 
+def nearest_known(known: NDArray[np.integer], frames: int) -> NDArray[np.integer]:
+    """Return for each of `frames` frames the nearest of the frames `known` (rising, not empty)."""
+    every = np.arange(frames)
+    after = np.searchsorted(known, every).clip(max=len(known) - 1)
+    before = (after - 1).clip(min=0)
+    is_before = np.abs(every - known[before]) <= np.abs(known[after] - every)
+    return known[np.where(is_before, before, after)]
+
+
 def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m] (S2).
 
@@ -156,11 +166,7 @@ def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     turns = u @ vt
     sure = np.flatnonzero(seen.sum(-1) >= 3)
     if len(sure):
-        frames = np.arange(len(torso))
-        after = np.searchsorted(sure, frames).clip(max=len(sure) - 1)
-        before = (after - 1).clip(min=0)
-        is_nearer = np.abs(frames - sure[before]) <= np.abs(sure[after] - frames)
-        turns = turns[sure[np.where(is_nearer, before, after)]]
+        turns = turns[nearest_known(sure, len(torso))]
     else:
         turns = np.broadcast_to(
             Rigid.from_rotvec([np.pi / 2, 0.0, 0.0], np.zeros(3)).rotation, turns.shape

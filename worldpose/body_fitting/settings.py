@@ -16,7 +16,8 @@ class BodyFittingSettings(Record):
     """
 
     body_model: str = OPEN_BODY
-    """Body model to fit: the open body, or one installed with `worldpose body install`."""
+    """Body model to fit: the open body, open-neutral/3 with narrower hip joints, or one installed
+    with `worldpose body install`."""
     noise_scale: float = Field(default=1.3, ge=1e-6, le=1000)
     """Standard deviation of the joints over the stated one [1]: triangulation includes the noise of
     a detector, but no error of occluded joints or wrong views."""

@@ -26,18 +26,19 @@ from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.objective import (
     ACCELERATION_SCALE,
     JOINT_SPREAD,
+    MIRRORED_OFFSETS,
     UNKNOWNS,
     Evidence,
     Ground,
     Pose,
     Track,
     ankle_height,
+    body_axes,
     find_contacts,
     level_feet,
 )
 from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import DegenerateError
 from worldpose.geometry import Rigid
 from worldpose.geometry.optimize.banded import BandedFactor
@@ -45,6 +46,13 @@ from worldpose.geometry.optimize.banded import BandedFactor
 ACCELERATION_WEIGHT: Final = float((1.0 / ACCELERATION_SCALE**2).sum())
 """Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body
 accelerates as one: the search may count them all, the covariance of its poses may not."""
+
+
+DAMPING: Final = 0.01
+"""Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
+direction that uncertain."""
+FREE: Final = 1e9
+"""Acceleration of a body whose frames say nothing of each other [m/s^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +71,8 @@ class Solver:
         offsets: Floats,
         fps: float,
         monocular_prior: MonocularPrior | None = None,
-    ) -> tuple[Pose, BandedFactor]:
-        """Return one person's poses in all frames, and the factor of their information matrix.
+    ) -> tuple[Pose, Track]:
+        """Return one person's poses in all frames, and the track with its standing ankles.
 
         With `monocular_prior` there are two searches. One starts from the monocular poses, and the
         result of lower cost counts: steps from an interpolated start do not reach a body that
@@ -95,8 +103,7 @@ class Solver:
                 track.equations(p, offsets, bordered=False).cost for p, _ in (searched, guided)
             ]
             searched = guided if costs[1] < costs[0] else searched
-        pose, track = searched
-        return pose, factor_information(track, pose, offsets)
+        return searched
 
     def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
         """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
@@ -153,14 +160,60 @@ def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
     )
 
 
-def factor_information(track: Track, pose: Pose, offsets: Floats) -> BandedFactor:
-    """Return the factor of the information matrix of a solved track's poses."""
-    damped = replace(
+def damp_motion(track: Track) -> Track:
+    """Return a solved track for the covariance of its poses: a body accelerates as one."""
+    return replace(
         track,
         acceleration=track.acceleration * ACCELERATION_WEIGHT**0.5,
         contacts=None if track.contacts is None else track.contacts.of(track.evidence.known),
     )
-    return factor(damped.equations(pose, offsets, bordered=False).blocks)
+
+
+def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> Floats:
+    """Return the covariance of a solved track's keypoints from its poses (frames, 17, 3, 3) [m^2].
+
+    Args:
+        track: the track, with its standing ankles.
+        pose: its poses.
+        offsets: (17, 3) [m], the detector's offsets.
+    """
+    blocks = damp_motion(track).equations(pose, offsets, bordered=False).blocks
+    by_pose = track.differentiate(pose).pose
+    return _spread_keypoints(by_pose, factor(blocks).inverse_blocks())
+
+
+def frame_covariance(track: Track, pose: Pose, offsets: Floats, repeated: float) -> Floats:
+    """Return the same for every frame alone, whose errors are those of a single frame.
+
+    A track counts `repeated` frames as one, because their errors are alike, and gives each of them
+    that part of the information. No average over alike errors is better than one frame, but none
+    is worse either.
+
+    Args:
+        track: the track, with its standing ankles.
+        pose: its poses.
+        offsets: (17, 3) [m], the detector's offsets.
+        repeated: frames that count as one.
+    """
+    evidence = track.evidence
+    contacts = None if track.contacts is None else track.contacts.of(evidence.known)
+    if contacts is not None:
+        contacts = replace(contacts, slipping=np.zeros_like(contacts.slipping))
+    alone = replace(
+        track,
+        evidence=replace(evidence, information=repeated * evidence.information),
+        acceleration=FREE,
+        contacts=contacts,
+    )
+    block = alone.equations(pose, offsets, bordered=False).blocks[0]
+    places = np.arange(UNKNOWNS)
+    block[:, places, places] += DAMPING
+    return _spread_keypoints(track.differentiate(pose).pose, np.linalg.inv(block))
+
+
+def _spread_keypoints(by_pose: Floats, covariance: Floats) -> Floats:
+    spread: Floats = by_pose @ covariance[:, None] @ by_pose.swapaxes(-1, -2)
+    return spread
 
 
 def factor(blocks: Floats) -> BandedFactor:
@@ -171,8 +224,7 @@ def factor(blocks: Floats) -> BandedFactor:
     """
     places = np.arange(UNKNOWNS)
     blocks[0][:, places, places] *= 1.0 + 1e-4
-    # 10 m and 10 rad: only a lone joint leaves a direction that uncertain.
-    blocks[0][:, places, places] += 0.01
+    blocks[0][:, places, places] += DAMPING
     solved = BandedFactor.of(blocks, overwrite=True)
     if not solved.determined:
         raise DegenerateError(

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from worldpose.filtering.views import (
         BodyViews,
         perceived_covariance,
-        perceived_joints,
         view_bodies,
     )
 
@@ -48,7 +47,6 @@ __all__ = [
     "learn_systematic_errors",
     "measure_held_out",
     "perceived_covariance",
-    "perceived_joints",
     "view_bodies",
     "watch_motion",
 ]
@@ -76,7 +74,6 @@ __getattr__ = import_on_use(
         "worldpose.filtering.views": (
             "BodyViews",
             "perceived_covariance",
-            "perceived_joints",
             "view_bodies",
         ),
     },

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body_fitting.shared_bias import body_axes
+from worldpose.body_fitting.objective import body_axes
 from worldpose.filtering.judging import (
     TriangulatedDetections,
     body_residuals,

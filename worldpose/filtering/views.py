@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body_fitting.shared_bias import body_axes
 from worldpose.geometry import Camera
 
 Places = NDArray[np.int64]
@@ -55,17 +54,6 @@ class BodyViews:
     """Variance of `image` [px^2], mean over both axes."""
     scale: Floats
     """Image scale there [px/m]."""
-
-
-def perceived_joints(joints: Floats, offsets: Floats) -> Floats:
-    """Return the detector's joints (frames, persons, 17, 3) of bodies [m], world.
-
-    Args:
-        joints: (frames, persons, 17, 3) [m], world.
-        offsets: (17, 3) [m] from a body's joint to the detector's: forward, left, up.
-    """
-    moved: Floats = joints + np.einsum("fpab,jb->fpja", body_axes(joints), offsets)
-    return moved
 
 
 def perceived_covariance(covariance: Floats, common_bias: Floats) -> Floats:

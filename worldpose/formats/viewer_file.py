@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_BONES
-from worldpose.body import OPEN_BODY, BodyModel, BodyParameters
+from worldpose.body import BodyModel, BodyParameters, is_open_body
 from worldpose.body.model import articulate
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
@@ -408,7 +408,7 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
     betas = bodies.betas[rows, columns]
     rest = model.joint_template + np.einsum("jcs,ps->pjc", model.joint_directions, betas)
     arrays: Arrays = {"rest_joints": rest.astype("<f4"), "parents": model.parents.astype("<i2")}
-    if model.name.partition("/")[0] != OPEN_BODY.partition("/")[0]:
+    if not is_open_body(model.name):
         return arrays  # the surface of a licensed body stays on this machine
     surface = model.template + np.einsum("vcs,ps->pvc", model.shape_directions, betas)
     order = np.argsort(-model.weights, axis=1)[:, :INFLUENCES]

@@ -97,6 +97,18 @@ class Triangulation:
     agreement: Agreement
 
     @property
+    def shared_covariance(self) -> Floats:
+        """(frames, persons, 3, 3) [m^2], the part of `covariance` that moves all joints together.
+
+        It is that of calibration, mean over the joints; NaN for a person without any.
+        """
+        found = np.isfinite(self.joints).all(-1)
+        own = self.calibration_covariance - self.common_bias[:, None, None] ** 2 * np.eye(3)
+        count = found.sum(-1)[..., None, None]
+        total = np.where(found[..., None, None], own, 0.0).sum(axis=2)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    @property
     def report(self) -> TriangulationReport:
         """The metrics of these frames."""
         return self.agreement.report(self.noise.factor)

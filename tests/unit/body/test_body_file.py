@@ -110,10 +110,28 @@ def test_bodies_are_found_by_name(tmp_path, open_body):
     assert find_body("mine", tmp_path).name == "mine"
 
 
+def test_the_narrow_open_body_differs_in_the_hip_joints_alone(open_body):
+    narrow = find_body("open-neutral/3")
+    assert narrow.name == "open-neutral/3"
+    np.testing.assert_array_equal(narrow.template, open_body.template)
+    before, after = open_body.joint_template, narrow.joint_template
+    assert np.linalg.norm(before[1] - before[2]) == pytest.approx(0.230, abs=1e-3)
+    assert np.linalg.norm(after[1] - after[2]) == pytest.approx(0.175, abs=1e-6)
+    np.testing.assert_allclose(after[1:3].mean(0), before[1:3].mean(0), atol=1e-9)
+    others = np.delete(np.arange(24), [1, 2])
+    np.testing.assert_array_equal(after[others], before[others])
+    # Every shape has narrower hips by the same share.
+    far = [
+        np.linalg.norm(body.joint_directions[1] - body.joint_directions[2], axis=0)
+        for body in (open_body, narrow)
+    ]
+    np.testing.assert_allclose(far[1] / far[0], 0.175 / 0.2297, rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["yours", "../mine", "", "/mine"])
 def test_a_body_that_is_not_installed_is_refused(tmp_path, open_body, name):
     (tmp_path / "bodies").mkdir()
     save_body(tmp_path / "mine.npz", open_body)
     save_body(tmp_path / "bodies" / "other.npz", open_body)
-    with pytest.raises(UsageError, match="one of open-neutral/2, other"):
+    with pytest.raises(UsageError, match="one of open-neutral/2, open-neutral/3, other"):
         find_body(name, tmp_path / "bodies")

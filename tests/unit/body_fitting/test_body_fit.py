@@ -6,7 +6,7 @@ from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies, report_fit
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.objective import JOINT_SPREAD, MIRRORED_OFFSETS, body_axes
 from worldpose.errors import InputError
 
 SETTINGS = BodyFittingSettings()
@@ -185,3 +185,40 @@ def test_arrays_that_do_not_fit_are_refused():
         fit_bodies(
             MODEL, ClipEvidence(np.zeros((3, 1, 14, 3)), np.zeros((3, 1, 14, 3, 3)), 50.0), SETTINGS
         )
+
+
+def test_bodies_are_no_less_certain_than_joints_of_single_frames():
+    rng = np.random.default_rng(8)
+    inside, stated = [], []
+    for _ in range(4):
+        truth = walker(60, rng)
+        exact = KEYPOINTS(truth)[:, None]
+        noise = rng.standard_normal(exact.shape)
+        for frame in range(1, 60):  # errors last for six frames, as the settings expect
+            noise[frame] = 0.714 * noise[frame - 1] + np.sqrt(1.0 - 0.714**2) * noise[frame]
+        covariance = np.broadcast_to(0.02**2 * np.eye(3), (*exact.shape, 3))
+        fit = fit_bodies(MODEL, ClipEvidence(exact + 0.02 * noise, covariance.copy(), 50.0))
+        error = fit.joints - exact
+        solved = np.linalg.solve(fit.covariance, error[..., None])[..., 0]
+        inside.append((error * solved).sum(-1) < 7.815)
+        stated.append(np.sqrt(np.trace(fit.covariance, axis1=-2, axis2=-1) / 3.0))
+    assert np.mean(inside) > 0.93
+    # What the settings make of 20 mm, and the body's own 6 and 8 mm: ankles gain nothing else.
+    most = np.sqrt((1.3 * JOINT_SPREAD * 0.02) ** 2 + 0.006**2 + 0.008**2)
+    assert (np.mean(stated, axis=(0, 1, 2)) < 1.1 * most).all()
+
+
+def test_what_moves_all_joints_together_is_no_smaller_for_bodies():
+    rng = np.random.default_rng(4)
+    joints, covariance = seen(walker(20, rng), 0.01, rng)
+    shared = np.tile(np.diag([0.04, 0.01, 0.0]) ** 2, (20, 1, 1, 1))
+    shared[5:8] = np.nan  # no joint there
+    joints[5:8] = np.nan
+    plain = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0))
+    moved = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0, shared_covariance=shared))
+    np.testing.assert_array_equal(moved.joints, plain.joints)
+    np.testing.assert_allclose(
+        moved.covariance - plain.covariance,
+        np.broadcast_to(np.diag([0.04, 0.01, 0.0]) ** 2, moved.covariance.shape),
+        atol=1e-12,
+    )

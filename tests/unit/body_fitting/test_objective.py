@@ -5,10 +5,9 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.objective import Contacts, Evidence, Pose, Track
+from worldpose.body_fitting.objective import MIRRORED_OFFSETS, Contacts, Evidence, Pose, Track
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.body_fitting.shared_bias import MIRRORED_OFFSETS
 
 
 @pytest.fixture

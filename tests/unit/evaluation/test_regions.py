@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from joint_regions import JOINT_GROUPS, region_counts
+from joint_regions import region_counts
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
 from worldpose.formats import JointTracks
 

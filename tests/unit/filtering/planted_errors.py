@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldpose.filtering import TriangulatedDetections, perceived_joints, view_bodies
+from worldpose.body_fitting import perceived_joints
+from worldpose.filtering import TriangulatedDetections, view_bodies
 from worldpose.geometry import Camera
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene

@@ -143,6 +143,24 @@ def test_given_camera_covariance_widens_that_of_the_joints(ring):
     assert 0.3 < squared.mean() < 9.0
 
 
+def test_calibration_errors_are_the_part_that_moves_all_joints_together(ring):
+    truth, joints = ring(6), runner(10)
+    arrays = detections(truth, joints, 1.0)
+    given, covariance = misjudged(truth, 6, 2e-3)
+    found = [
+        triangulate_joints(
+            given, KeypointDetections.from_keypoints(*arrays), SETTINGS, scale * covariance
+        )
+        for scale in (0.25, 1.0)
+    ]
+    shared = [each.shared_covariance for each in found]
+    assert shared[0].shape == (*joints.shape[:2], 3, 3)
+    ratio = np.trace(shared[1], axis1=-2, axis2=-1) / np.trace(shared[0], axis1=-2, axis2=-1)
+    assert (ratio > 2.0).all()  # 4, but for what keypoints know of it
+    noise = found[0].covariance - shared[0][:, :, None]
+    assert (np.linalg.eigvalsh(noise) > 0.0).all()
+
+
 def test_nobody_seen_gives_empty_results(ring):
     keypoints, confidence, index = detections(ring(4), runner(5), 0.0)
     index[:] = -1
@@ -150,4 +168,5 @@ def test_nobody_seen_gives_empty_results(ring):
         ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
     )
     assert np.isnan(result.joints).all()
+    assert np.isnan(result.shared_covariance).all()
     assert result.report.misplacement_m == (None,) * 4

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import BaselineSettings
-from worldpose.body import OPEN_BODY, BodyModel, BodyParameters, fold_keypoints
+from worldpose.body import BodyModel, BodyParameters, fold_keypoints, is_open_body
 from worldpose.errors import InputError
 from worldpose.formats import JointTracks
 from worldpose.formats.archives import write_archive
@@ -161,7 +161,7 @@ def pose_track(
     pose = np.zeros((count, BODY_ANGLES))
     pose[:, : track.body_pose.shape[-1]] = track.body_pose
     betas = np.zeros((count, model.shapes))
-    used = shape == ("open" if model.name == OPEN_BODY else "smpl") and track.betas is not None
+    used = shape == ("open" if is_open_body(model.name) else "smpl") and track.betas is not None
     if used and track.betas is not None:
         known = min(model.shapes, track.betas.shape[-1])
         betas[:, :known] = track.betas[..., :known]

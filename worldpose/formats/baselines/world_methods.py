@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.body import OPEN_BODY, BodyModel
+from worldpose.body import BodyModel, is_open_body
 from worldpose.formats.baselines.fields import (
     floats,
     format_error,
@@ -293,7 +293,7 @@ def read_smpl(path: Path, model: BodyModel, _: tuple[int, int]) -> MethodResult:
     """
     poses, named = read_poses(path)
     people, used = [], ""
-    own = named is not None and named == model.name == OPEN_BODY
+    own = named == model.name and is_open_body(model.name)
     for person in range(poses.batch_shape[0]):
         there = np.isfinite(poses.transl[person]).all(-1)
         if not there.any():

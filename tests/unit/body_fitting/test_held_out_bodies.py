@@ -1,0 +1,126 @@
+"""Fitted against triangulated joints in held-out cameras, with known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from walking_bodies import KEYPOINTS, MODEL, walker
+
+from data_contracts.conventions import JOINT_GROUPS
+from data_contracts.keypoints import KeypointDetections
+from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, SeenClip, fit_bodies
+from worldpose.body_fitting.held_out import _clustered_variance, compare_held_out
+from worldpose.geometry import Camera, Rigid
+from worldpose.simulation.scene import look_at
+from worldpose.triangulation import TriangulationSettings, triangulate_joints
+
+SETTINGS = BodyFittingSettings()
+GROUPS = list(JOINT_GROUPS)
+
+
+def ring(count):
+    """Cameras around the origin, 40 m away."""
+    poses = [
+        look_at(
+            np.array([40.0 * np.cos(angle), 40.0 * np.sin(angle), 12.0]),
+            np.array([0.0, 0.0, 1.0]),
+            0.0,
+        )
+        for angle in np.linspace(0.0, 5.5, count)
+    ]
+    return Camera(
+        focal=np.full((count, 2), 3000.0),
+        principal_point=np.tile([959.5, 539.5], (count, 1)),
+        distortion=np.zeros((count, 5)),
+        cam_from_world=Rigid(
+            np.stack([pose.rotation for pose in poses]),
+            np.stack([pose.translation for pose in poses]),
+        ),
+        image_size=np.tile([1920, 1080], (count, 1)),
+    )
+
+
+def filmed(cameras, noise_px, seed, people=3, frames=60):
+    """People who walk past each other, seen by all cameras with noise."""
+    rng = np.random.default_rng(seed)
+    joints = []
+    for person in range(people):
+        body = walker(frames, rng)
+        place = body.transl + [-0.9, 1.5 * (person - 1), 0.0]
+        joints.append(KEYPOINTS(replace(body, transl=place)))
+    truth = np.stack(joints, axis=1)
+    count = len(cameras.focal)
+    image = cameras.project(truth.reshape(frames, 1, -1, 3)).reshape(frames, count, people, 17, 2)
+    image = image + noise_px * rng.standard_normal(image.shape)
+    index = np.tile(np.arange(people, dtype=np.int16), (frames, count, 1))
+    return KeypointDetections.from_keypoints(image, np.full(image.shape[:-1], 0.8), index)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    cameras = ring(6)
+    detections = filmed(cameras, 1.5, 7)
+    return SeenClip(cameras, None, detections, TriangulationSettings(), 50.0)
+
+
+@pytest.fixture(scope="module")
+def fit(clip):
+    placed = triangulate_joints(clip.cameras, clip.detections, clip.settings)
+    evidence = ClipEvidence(
+        placed.joints, placed.covariance, clip.fps, common_bias=placed.common_bias
+    )
+    return fit_bodies(MODEL, evidence, SETTINGS)
+
+
+def test_bodies_of_the_right_shape_are_nearer_and_none_is_named(clip, fit):
+    found = compare_held_out(MODEL, SETTINGS, None, clip, fit)
+    assert found.keypoints.sum() > 10_000
+    # Keypoints are 1.5 px off per axis, and 3000 px at 41 m are 73 px per metre.
+    np.testing.assert_allclose(found.fitted, np.sqrt(2.0) * 1.5 / 73.0, rtol=0.2)
+    assert (found.excess < 0.0).all()
+    assert (found.certain_excess == 0.0).all()
+    assert found.figures()["held_out_excess_m.knee"] == found.excess[GROUPS.index("knee")]
+
+
+def test_a_body_whose_shanks_are_wrong_is_named_at_knees_or_ankles(clip, fit):
+    spans = np.zeros((17, 3))
+    spans[15:17, 2] = -0.08  # the detector's ankles 8 cm below the body's: shanks of 8 cm more
+    wrong = compare_held_out(MODEL, SETTINGS, None, clip, replace(fit, offsets=spans))
+    named = {group for group, value in zip(GROUPS, wrong.certain_excess, strict=True) if value > 0}
+    assert "ankle" in named
+    assert not named & {"head", "shoulder", "elbow", "wrist"}
+    # Half of the 8 cm goes into the pose, at most, and image planes show two axes of three.
+    assert 0.01 < wrong.certain_excess[GROUPS.index("ankle")] < 0.08
+
+
+def test_where_a_group_is_seen_too_little_nothing_is_said_of_it(clip, fit):
+    keypoints = clip.detections.keypoints.copy()
+    keypoints[..., 9:11, :] = np.nan
+    blind = KeypointDetections.from_keypoints(
+        keypoints,
+        np.where(np.isfinite(keypoints[..., 0]), 0.8, np.nan),
+        clip.detections.detection_index,
+    )
+    found = compare_held_out(MODEL, SETTINGS, None, replace(clip, detections=blind), fit)
+    unknown = np.isnan(found.fitted)
+    assert [GROUPS[group] for group in np.flatnonzero(unknown)] == ["wrist"]
+    assert "held_out_fitted_m.wrist" not in found.figures()
+
+
+def test_two_cameras_leave_none_to_hold_out(fit, clip):
+    two = KeypointDetections.from_keypoints(
+        clip.detections.keypoints[:, :2],
+        clip.detections.confidence[:, :2],
+        clip.detections.detection_index[:, :2],
+    )
+    pair = replace(clip, cameras=clip.cameras[:2], detections=two)
+    assert compare_held_out(MODEL, SETTINGS, None, pair, fit) is None
+
+
+def test_values_that_all_belong_together_count_once():
+    rng = np.random.default_rng(2)
+    people = rng.standard_normal(40)
+    values = np.repeat(people, 50)
+    together, camera = np.repeat(np.arange(40), 50), np.tile(np.arange(50), 40)
+    variance = _clustered_variance(values, together, camera)
+    assert variance == pytest.approx(people.var(ddof=1) / 40, rel=0.05)
