@@ -11,9 +11,10 @@ import pytest
 import yaml
 from command_line import TINY, succeed, worldpose
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, JOINT_GROUPS
 from flows.registering import open_match
 from flows.reports import viewer
+from flows.reports.people import body_tables
 from worldpose import open_run
 from worldpose.body import fold_keypoints, load_open_body
 from worldpose.formats import read_camera, read_joints
@@ -56,6 +57,18 @@ def test_exported_joints_are_the_run_s_own(tiny_run, tmp_path):
     np.testing.assert_array_equal(tracks.joints, result.joints.values)
     np.testing.assert_array_equal(tracks.frames, np.arange(30))
     assert tracks.covariance.shape == (30, len(tracks.person_ids), 17, 3, 3)
+
+
+def test_a_report_compares_bodies_with_joints_in_held_out_cameras(tiny_run):
+    run = open_run(tiny_run, TINY)
+    figures = run.record.figures["body_fitting/clip"]
+    (table,) = (each for each in body_tables(run, ("clip",)) if "held out" in each.heading)
+    assert [row[0] for row in table.rows] == list(JOINT_GROUPS)
+    for row in table.rows:
+        shown = figures[f"held_out_fitted_m.{row[0]}"], figures[f"held_out_triangulated_m.{row[0]}"]
+        assert row[1:3] == tuple(f"{1e3 * value:.1f}" for value in shown)
+        certain = figures[f"held_out_certain_excess_m.{row[0]}"]
+        assert (row[-1] != "") == (certain > 0.0)
 
 
 def test_joints_of_bodies_are_exported_where_the_detector_sees_them_on_request(tiny_run, tmp_path):
