@@ -102,7 +102,7 @@ class Triangulation:
 
         It is that of calibration, mean over the joints; NaN for a person without any.
         """
-        found = np.isfinite(self.joints).all(-1)
+        found = np.asarray(np.isfinite(self.joints).all(-1))
         own = self.calibration_covariance - self.common_bias[:, None, None] ** 2 * np.eye(3)
         count = found.sum(-1)[..., None, None]
         total = np.where(found[..., None, None], own, 0.0).sum(axis=2)
