@@ -231,8 +231,8 @@ def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) 
     by_track = pose_covariance(track, pose, offsets)
     repeated = 1.0 + track.settings.noise_time_s * track.fps
     by_frame = frame_covariance(track, pose, offsets, repeated)
-    frame_size, track_size = (np.einsum("...ii", each) for each in (by_frame, by_track))
-    random = np.where((frame_size < track_size)[..., None, None], by_frame, by_track)
+    smaller = np.trace(by_frame - by_track, axis1=-2, axis2=-1) < 0.0
+    random = np.where(smaller[..., None, None], by_frame, by_track)
     return random + common_bias[:, None, None] ** 2 * np.eye(3)
 
 

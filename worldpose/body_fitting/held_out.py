@@ -56,7 +56,7 @@ _GROUP_OF: Final = np.array(
 
 @dataclass(frozen=True, eq=False)
 class SeenClip:
-    """What static cameras see of a clip, and how its joints were triangulated.
+    """Detections of static cameras in a clip, and how its joints were triangulated.
 
     Attributes:
         cameras: batch (cameras,).
