@@ -8,7 +8,14 @@ import numpy as np
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.release import DataSetStatistics
-from data_contracts.review import Correction, ReviewDecision, ReviewRequest, Withdrawal
+from data_contracts.review import (
+    Correction,
+    MovedPoint,
+    RedrawnMarking,
+    ReviewDecision,
+    ReviewRequest,
+    Withdrawal,
+)
 from data_contracts.run import RunRecord
 from flows.reports.broadcast import (
     broadcast_pictures,
@@ -23,7 +30,7 @@ from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
 from flows.results.evaluation import load_reference, score
-from flows.review.descriptions import in_words, when
+from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError
@@ -227,8 +234,12 @@ MOST = 200
 
 
 def review_table(match: Match) -> list[Table]:
-    """Tabulate verdicts, corrections and withdrawals, first to last; empty without any."""
+    """Tabulate verdicts, corrections and withdrawals, first to last; empty without any.
+
+    The first clicks of a person in a camera are one row: they correct nothing.
+    """
     units: dict[str, str] = {}
+    clicked: dict[tuple[str, str], tuple[int, set[str]]] = {}
     corrections: dict[str, str] = {}
     rows: list[tuple[str, str, str, str, str]] = []
     for said in match.journal.records:
@@ -240,6 +251,16 @@ def review_table(match: Match) -> list[Table]:
             rows.append((when(said.decided_at), said.who, verdict, what, said.why or ""))
         elif isinstance(said, Correction):
             corrections[said.id] = in_words(said)
+            if is_first_click(said):
+                assert isinstance(said.edit, MovedPoint | RedrawnMarking)  # only these are clicks
+                key = said.who, said.edit.camera
+                row, names = clicked.setdefault(key, (len(rows), set()))
+                names.add(said.edit.marking)
+                count = "1 marking" if len(names) == 1 else f"{len(names)} markings"
+                what = f"{count} in {said.edit.camera}"
+                begun = rows[row][0] if row < len(rows) else when(said.made_at)
+                rows[row : row + 1] = [(begun, said.who, "clicked", what, "")]
+                continue
             rows.append(
                 (when(said.made_at), said.who, "corrected", in_words(said), str(said.note or ""))
             )

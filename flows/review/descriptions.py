@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from typing import Any
+from typing import Any, Final
 
 from data_contracts.review import (
     AddedDetection,
@@ -15,6 +15,8 @@ from data_contracts.review import (
     RedrawnMarking,
 )
 from flows.review.verdicts import Review
+
+CALIBRATIONS: Final = ("static_calibration/", "broadcast_calibration/")
 
 
 def review_json(shown: Review) -> dict[str, Any]:
@@ -57,3 +59,9 @@ def in_words(correction: Correction) -> str:
 def when(moment: datetime) -> str:
     """Format a date and time for people."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"
+
+
+def is_first_click(correction: Correction) -> bool:
+    """Return whether a click was made before a run calibrated its camera: it corrects nothing."""
+    is_click = isinstance(correction.edit, MovedPoint | RedrawnMarking)
+    return is_click and not any(name.startswith(CALIBRATIONS) for name in correction.based_on)

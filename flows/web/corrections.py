@@ -11,9 +11,9 @@ from fastapi import APIRouter, HTTPException, Query
 from pydantic import Field
 
 from data_contracts.records import Count, Name, Record
-from data_contracts.review import Correction, MovedPoint, RedrawnMarking
+from data_contracts.review import Correction
 from flows.review.corrections import keep_edits
-from flows.review.descriptions import correction_json, in_words
+from flows.review.descriptions import correction_json, in_words, is_first_click
 from flows.review.verdicts import withdraw
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
@@ -23,7 +23,6 @@ SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
 LISTED: Final = 200
 """Corrections of a group in one response, the last ones first."""
-CALIBRATIONS: Final = ("static_calibration/", "broadcast_calibration/")
 
 
 class Withdrawing(Record):
@@ -65,12 +64,6 @@ class Group:
     def id(self) -> str:
         """The id of its first correction."""
         return self.corrections[0][0].id
-
-
-def is_first_click(correction: Correction) -> bool:
-    """Return whether a click was made before a run calibrated its camera: it corrects nothing."""
-    is_click = isinstance(correction.edit, MovedPoint | RedrawnMarking)
-    return is_click and not any(name.startswith(CALIBRATIONS) for name in correction.based_on)
 
 
 def count_corrections(match: Match) -> tuple[int, int]:
