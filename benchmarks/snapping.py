@@ -141,7 +141,7 @@ def real_pair(data: Path) -> None:
     shifts: list[float] = []
     for side in static_pair.SIDES:
         with open_video(folder / f"{side}_camera.mp4") as video:
-            numbers = np.linspace(8, 149, 25).astype(int).tolist()
+            numbers = (static_pair.SIDES[side] + np.linspace(8, 47, 25)).astype(int).tolist()
             images = (image for n in numbers for _, image in video.frames(n, n + 1))
             still = median_picture(images, len(numbers))
         found = calibrate_without_clicks(pitch, still, side="near")
