@@ -164,7 +164,7 @@ def test_ingesting_twice_says_so_and_changes_nothing(tiny, project_copy):
         (["--set", "triangulation.min_views=" + "[" * 3000], "integer"),
         (["--set", "min_views"], "stage.name=value"),
         (["--from", "triangulation", "--until", "tracking"], "Swap the two stages"),
-        (["--until", "body"], "one of ingest, static_calibration, detection, redetection"),
+        (["--until", "body"], "one of ingest, proposal, static_calibration, detection"),
     ],
 )
 def test_a_setting_or_stage_that_does_not_exist_is_a_usage_error(

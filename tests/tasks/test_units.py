@@ -196,7 +196,7 @@ def test_a_broken_still_is_refused_before_anything_runs(clicked, tmp_path):
     path = tmp_path / "match" / "stills" / "cam01.png"
     path.parent.mkdir()
     path.write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"cam01\.png.*PNG image"):
+    with pytest.raises(InputError, match=r"cam01\.png.*PNG or JPEG image"):
         register(store, tmp_path / "match")
 
 
