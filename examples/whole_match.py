@@ -56,13 +56,9 @@ def main() -> None:
 
     unswapped = wp.undo_swaps(people, joints.exchanged)
     rays = wp.find_ray_constraints(cameras, unswapped, joints.joints)
+    alike = joints.shared_covariance
     evidence = wp.ClipEvidence(
-        joints.joints,
-        joints.covariance,
-        fps,
-        common_bias=joints.common_bias,
-        ray_constraints=[rays],
-        shared_covariance=joints.shared_covariance,
+        joints.joints, joints.covariance, fps, joints.common_bias, [rays], shared_covariance=alike
     )
     bodies = wp.fit_bodies(wp.find_body(), evidence, ground=pitch.height)
     tracked = wp.JointTracks(seen.frame, tracks.person, bodies.joints, bodies.covariance)
