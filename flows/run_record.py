@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 
 import psutil
 
+from data_contracts.match import CameraSpec, ClipSpec
 from data_contracts.run import GatePolicy, Reservation, RunRecord, RunState, UnitFailure
 from flows.gates import GATES, Gatekeeper
 from flows.left_out import left_out_cameras, left_out_warnings
@@ -117,41 +118,56 @@ def expected_work(
 
     Args:
         store: the project.
-        match: the match, whose sizes tell how long a first run takes.
+        match: the match; its sizes tell the time of a first run.
         missing: planned units without results.
-        latest: the match's latest run, whose units tell how long one takes.
+        latest: the match's latest run; its units tell the time of one.
     """
-    known = {} if latest is None else {name.partition("/")[0]: name for name in latest.results}
+    spec = match.folder.spec
+    cameras = {each.id: each for each in spec.cameras}
+    clips = {each.id: each for each in spec.clips}
+    before = _latest_seconds(store, latest)
     work: dict[str, float] = {}
     for stage, unit in (planned.name.split("/", 1) for planned in missing):
-        seconds = None
-        if latest is not None and stage in known:
-            before = known[stage].partition("/")[2]
-            key = latest.results[known[stage]]
-            if store.has(latest.match_id, stage, before, key):
-                seconds = store.manifest(latest.match_id, stage, before, key).seconds
+        seconds = before.get(stage)
         if seconds is None:
-            seconds = first_seconds(match.folder, stage, unit)
+            parts = unit.split(".")
+            camera = next((cameras[name] for name in parts if name in cameras), None)
+            clip = next((clips[name] for name in parts if name in clips), None)
+            seconds = first_seconds(match.folder, stage, camera, clip)
         work[stage] = work.get(stage, 0.0) + max(seconds, 1e-3)
     return work
 
 
-def first_seconds(folder: MatchFolder, stage: str, unit: str) -> float:
+def _latest_seconds(store: Store, latest: RunRecord | None) -> dict[str, float]:
+    """Return the computation time of one unit of each stage of a run [s]."""
+    if latest is None:
+        return {}
+    found = {}
+    for stage, unit in dict(name.split("/", 1) for name in latest.results).items():
+        key = latest.results[f"{stage}/{unit}"]
+        if store.has(latest.match_id, stage, unit, key):
+            found[stage] = store.manifest(latest.match_id, stage, unit, key).seconds
+    return found
+
+
+def first_seconds(
+    folder: MatchFolder, stage: str, camera: CameraSpec | None, clip: ClipSpec | None
+) -> float:
     """Return the expected computation time of a unit that has never been computed [s].
 
     Args:
         folder: the match, with its sizes and files.
         stage: the stage.
-        unit: a camera, a clip, or both as `camera.clip`.
+        camera: camera of the unit, if it is of one.
+        clip: clip of the unit, if it is of one.
     """
-    spec, parts = folder.spec, unit.split(".")
-    camera = next((each for each in spec.cameras if each.id in parts), None)
-    clip = next((each for each in spec.clips if each.id in parts), None)
+    spec = folder.spec
     if stage in ("detection", "redetection") and camera is not None and clip is not None:
         pixels = camera.width * camera.height / _FULL_HD
         return DETECTION_SECONDS * pixels * clip.frame_count * (camera.fps or spec.fps) / spec.fps
-    if stage == "static_calibration" and (unit in folder.stills or unit in folder.videos):
-        return PAINT_SECONDS
+    if stage in ("proposal", "static_calibration") and camera is not None:
+        has_image = camera.id in folder.stills or camera.id in folder.videos
+        return PAINT_SECONDS if has_image else UNIT_SECONDS["static_calibration"]
     seconds = UNIT_SECONDS.get(stage, 1.0)
     if clip is None or stage == "ingest":
         return seconds

@@ -155,14 +155,17 @@ def test_a_first_run_is_expected_to_take_as_long_as_its_footage_asks(tmp_path):
     cameras.append({"id": "tv", "kind": "broadcast", "width": 1920, "height": 1080})
     spec = MatchSpec(match_id="match", fps=50.0, cameras=cameras, clips=[clip])
     folder = MatchFolder(tmp_path, spec, {}, {}, None, {"left": tmp_path / "left.mp4"}, {}, {}, {})
+    left, right, broadcast = spec.cameras
+    (clip,) = spec.clips
     seconds = functools.partial(first_seconds, folder)
-    assert seconds("detection", "left.clip") == pytest.approx(150 * 4 * DETECTION_SECONDS)
-    assert seconds("detection", "tv.clip") == pytest.approx(150 * DETECTION_SECONDS)
-    assert seconds("static_calibration", "left") == PAINT_SECONDS
-    assert seconds("static_calibration", "right") == UNIT_SECONDS["static_calibration"]
-    assert seconds("tracking", "clip") == pytest.approx(2.8 * 3.0 / 20.0 * 2.0 / 16.0)
-    assert seconds("broadcast_calibration", "clip") == pytest.approx(40.0 * 3.0 / 20.0)
-    assert seconds("ingest", "clip") == UNIT_SECONDS["ingest"]
+    assert seconds("detection", left, clip) == pytest.approx(150 * 4 * DETECTION_SECONDS)
+    assert seconds("detection", broadcast, clip) == pytest.approx(150 * DETECTION_SECONDS)
+    assert seconds("static_calibration", left, None) == PAINT_SECONDS
+    assert seconds("proposal", left, None) == PAINT_SECONDS
+    assert seconds("static_calibration", right, None) == UNIT_SECONDS["static_calibration"]
+    assert seconds("tracking", None, clip) == pytest.approx(2.8 * 3.0 / 20.0 * 2.0 / 16.0)
+    assert seconds("broadcast_calibration", None, clip) == pytest.approx(40.0 * 3.0 / 20.0)
+    assert seconds("ingest", None, clip) == UNIT_SECONDS["ingest"]
 
 
 def test_a_second_run_of_a_match_at_work_is_refused_at_once(project_copy):
