@@ -34,7 +34,9 @@ from worldpose.store import Store
 @pytest.fixture(scope="module")
 def plan(server, tmp_path_factory):
     """A plan whose deployments are installed."""
-    folder = tmp_path_factory.mktemp("served")
+    # One folder, however often a process comes back to these tests: the server serves one project.
+    folder = tmp_path_factory.getbasetemp() / "of-deployments"
+    folder.mkdir(exist_ok=True)
     plan = ServePlan(
         project=str(folder),
         inbox=folder,
