@@ -43,7 +43,6 @@ from worldpose.body_fitting.solver import (
     Shapes,
     Solver,
     fit_shapes,
-    frame_covariance,
     pose_covariance,
 )
 from worldpose.errors import InputError
@@ -225,14 +224,10 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
 def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) -> Floats:
     """Return the covariance (frames, 17, 3, 3) [m^2] of a person's keypoints.
 
-    Of the two covariances of its poses the smaller counts, joint by joint. The common bias adds in
-    full: joints of real people's bodies are as far from the labels as triangulated joints.
+    The common bias adds in full: joints of real people's bodies are as far from the labels as
+    triangulated joints.
     """
-    by_track = pose_covariance(track, pose, offsets)
-    repeated = 1.0 + track.settings.noise_time_s * track.fps
-    by_frame = frame_covariance(track, pose, offsets, repeated)
-    smaller = np.trace(by_frame - by_track, axis1=-2, axis2=-1) < 0.0
-    random = np.where(smaller[..., None, None], by_frame, by_track)
+    random = pose_covariance(track, pose, offsets)
     return random + common_bias[:, None, None] ** 2 * np.eye(3)
 
 

@@ -179,40 +179,7 @@ def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> Floats:
     """
     blocks = damp_motion(track).equations(pose, offsets, bordered=False).blocks
     by_pose = track.differentiate(pose).pose
-    return _spread_keypoints(by_pose, factor(blocks).inverse_blocks())
-
-
-def frame_covariance(track: Track, pose: Pose, offsets: Floats, repeated: float) -> Floats:
-    """Return the same for every frame alone, whose errors are those of a single frame.
-
-    A track counts `repeated` frames as one, because their errors are alike, and gives each of them
-    that part of the information. No average over alike errors is better than one frame, but none
-    is worse either.
-
-    Args:
-        track: the track, with its standing ankles.
-        pose: its poses.
-        offsets: (17, 3) [m], the detector's offsets.
-        repeated: frames that count as one.
-    """
-    evidence = track.evidence
-    contacts = None if track.contacts is None else track.contacts.of(evidence.known)
-    if contacts is not None:
-        contacts = replace(contacts, slipping=np.zeros_like(contacts.slipping))
-    alone = replace(
-        track,
-        evidence=replace(evidence, information=repeated * evidence.information),
-        acceleration=FREE,
-        contacts=contacts,
-    )
-    block = alone.equations(pose, offsets, bordered=False).blocks[0]
-    places = np.arange(UNKNOWNS)
-    block[:, places, places] += DAMPING
-    return _spread_keypoints(track.differentiate(pose).pose, np.linalg.inv(block))
-
-
-def _spread_keypoints(by_pose: Floats, covariance: Floats) -> Floats:
-    spread: Floats = by_pose @ covariance[:, None] @ by_pose.swapaxes(-1, -2)
+    spread: Floats = by_pose @ factor(blocks).inverse_blocks()[:, None] @ by_pose.swapaxes(-1, -2)
     return spread
 
 
