@@ -3,9 +3,11 @@
     python benchmarks/detection.py [--people 25] [--frames 8]
 
 A crowd of `--people` in images of 1920 x 1080 is rendered, encoded and decoded; the embedded
-detector finds people, and the embedded estimator finds the pose of each. One thread; times are
-processor time, so other work on the machine does not count. The last lines extrapolate the
-reconstruction's share, without rendering, to 90 minutes at 50 frames per second of 16 cameras.
+detector finds people in the images of a calibrated camera, and the embedded estimator finds the
+pose of each. The same nets in floating point, and without a calibrated camera, stand beside them.
+One thread; times are processor time, so other work on the machine does not count. The last lines
+extrapolate the reconstruction's share, without rendering, to 90 minutes at 50 frames per second of
+16 cameras.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,8 +24,11 @@ import numpy as np
 import torch
 
 from data_contracts.arrays import Image
-from worldpose.detection import People
-from worldpose.detection.models import load_bundled_detector, load_bundled_pose
+from data_contracts.keypoints import KeypointDetections
+from worldpose.detection import DetectionSettings, People, PoseEstimator
+from worldpose.detection.enlargement import SeesParts, plan_passes
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS
 from worldpose.simulation.cast import assign_roles, dress_people
@@ -48,44 +54,56 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    rendering, pictures = render_crowd(asked.people, asked.frames)
+    rendering, pictures, camera, pitch = render_crowd(asked.people, asked.frames)
     decoding = time_decoding(pictures)
-    detector, estimator = load_bundled_detector(), load_bundled_pose()
-    detector.detect(pictures[:1])
-    looking, found = time_work(lambda: detector.detect(pictures))
-    people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
-    estimator.estimate(pictures[0], people[0].boxes)
-    posing, _ = time_work(
-        lambda: [
-            estimator.estimate(picture, each.boxes)
-            for picture, each in zip(pictures, people, strict=True)
+    passes = plan_passes(camera, pitch, DetectionSettings().pitch_margin_m)
+    rows = [("rendering", rendering), ("decoding", decoding)]
+    people: list[People] = []
+    for kind, weights in ((", float", BUNDLED_WEIGHTS), ("", (None, None))):
+        detector = load_bundled_detector(weights[0])
+        assert isinstance(detector, SeesParts) and passes is not None
+        alone, _ = time_work(partial(detector.detect, pictures))
+        looking, found = time_work(partial(detector.detect_parts, pictures, passes))
+        people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
+        estimator = load_bundled_pose(weights[1])
+        posing, _ = time_work(partial(find_poses, estimator, pictures, people))
+        rows += [
+            (f"boxes, no camera{kind}", alone),
+            (f"boxes{kind}", looking),
+            (f"poses{kind}", posing),
         ]
-    )
     count = len(pictures)
     persons = sum(len(each.scores) for each in people)
-    print(f"{'':10}{'ms a picture':>14}{'pictures/s':>12}{'players/s':>12}")
-    rows = (
-        ("rendering", rendering),
-        ("decoding", decoding),
-        ("boxes", looking),
-        ("poses", posing),
-    )
+    print(f"{'':24}{'ms per image':>14}{'images/s':>12}{'players/s':>12}")
     for name, seconds in rows:
         print(
-            f"{name:10}{1e3 * seconds / count:14.1f}"
+            f"{name:24}{1e3 * seconds / count:14.1f}"
             f"{count / seconds:12.1f}{persons / seconds:12.0f}"
         )
+    each = dict(rows)
+    before = each["boxes, no camera, float"] + each["poses, float"]
+    print(f"floating point, no camera / default: {before / (looking + posing):.2f}")
     for stride in (1, 2, 5):
-        each = (decoding + looking / stride + posing) / count
-        hours = each * MATCH_FRAMES / 3600.0
+        cost = (decoding + looking / stride + posing) / count
+        hours = cost * MATCH_FRAMES / 3600.0
         print(
             f"match, stride {stride}: {hours:.0f} core hours, {hours / 2:.0f} h on 2 cores, "
             f"{hours / 16:.1f} h on 16, at {persons / count:.1f} people per image"
         )
 
 
-def render_crowd(people: int, frames: int) -> tuple[float, list[Image]]:
-    """Return the images of a moving crowd from one camera, after the seconds that they took."""
+def find_poses(
+    estimator: PoseEstimator, pictures: list[Image], people: list[People]
+) -> list[KeypointDetections]:
+    """Return the poses in each image."""
+    return [
+        estimator.estimate(picture, each.boxes)
+        for picture, each in zip(pictures, people, strict=True)
+    ]
+
+
+def render_crowd(people: int, frames: int) -> tuple[float, list[Image], Camera, PitchTemplate]:
+    """Return seconds of rendering, images of a moving crowd, and their camera and pitch."""
     scenario = SCENARIOS["match"]
     pitch = PitchTemplate.from_spec(scenario.pitch)
     crowd = gather(
@@ -109,7 +127,7 @@ def render_crowd(people: int, frames: int) -> tuple[float, list[Image]]:
         return render_frame(view, cast, *moment, frame=frame).image
 
     film(0)
-    return time_work(lambda: [film(frame) for frame in range(frames)])
+    return *time_work(lambda: [film(frame) for frame in range(frames)]), camera, pitch
 
 
 def time_decoding(pictures: list[Image]) -> float:

@@ -76,7 +76,7 @@ def label_pair(data: Path, movenet: Path, folder: Path) -> Iterator[str]:
             labels.parent.mkdir(parents=True, exist_ok=True)
             video = data / "static_pair" / f"{side}_camera.mp4"
             pictures, size = [], (0, 0)
-            for number, image in _read_frames(video):
+            for number, image in read_frames(video):
                 path = labels.parent / f"{number:03d}.png"
                 cv2.imwrite(str(path), image[..., ::-1])
                 given = [teacher.detect([image])[0] for teacher in teachers]
@@ -91,7 +91,7 @@ def label_pair(data: Path, movenet: Path, folder: Path) -> Iterator[str]:
         yield f"{folder.name}: {side} video"
 
 
-def _read_frames(video: Path) -> Iterator[tuple[int, Image]]:
+def read_frames(video: Path) -> Iterator[tuple[int, Image]]:
     """Yield number and RGB image of the labelled frames."""
     reader = cv2.VideoCapture(str(video))
     for number in range(FRAMES.stop):

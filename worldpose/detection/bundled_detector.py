@@ -16,15 +16,15 @@ from data_contracts.arrays import Image
 from worldpose.detection.bundled_nets import (
     COARSEST,
     PeopleNet,
+    QuantizedNet,
     decode_boxes,
-    normalize,
-    place_net,
-    precision,
+    placed_net,
 )
 from worldpose.detection.enlargement import (
     SIZING_ZOOM,
     STEPS,
     Part,
+    Passes,
     choose_reduction,
     find_groups,
     find_small,
@@ -49,8 +49,10 @@ class BundledDetector:
     of people who occlude one another.
     """
 
-    def __init__(self, net: PeopleNet, device: str = "cpu", half: bool = False) -> None:
-        self._net, self._device, self._half = place_net(net, device), device, half
+    def __init__(
+        self, net: PeopleNet | QuantizedNet, device: str = "cpu", half: bool = False
+    ) -> None:
+        self._net = placed_net(net, device, half)
 
     @property
     def view_size(self) -> None:
@@ -61,27 +63,28 @@ class BundledDetector:
         """Return the people in each frame, computed one by one."""
         return [self._people(image, None) for image in images]
 
-    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
-        """Return the people in each frame; the caller knows where their size is unusual."""
-        return [self._people(image, parts) for image in images]
+    def detect_parts(self, images: Sequence[Image], passes: Passes) -> list[People]:
+        """Return the people in each frame; the caller knows where they are, and in what size."""
+        return [self._people(image, passes) for image in images]
 
-    def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
-        if parts is None:
+    def _people(self, image: Image, passes: Passes | None) -> People:
+        if passes is None:
             size = (image.shape[1], image.shape[0])
             sized = self._detect(resize(image, SIZING_ZOOM))
             zoom = choose_reduction(restore_size(sized, size, SIZING_ZOOM))
             if zoom < 1.0:
                 return restore_size(self._find_all(resize(image, zoom), None), size, zoom)
-        return self._find_all(image, parts)
+        return self._find_all(image, passes)
 
-    def _find_all(self, image: Image, parts: Sequence[Part] | None) -> People:
+    def _find_all(self, image: Image, passes: Passes | None) -> People:
         """Return the people in an image, with passes over its parts."""
-        found = self._detect(image)
-        if parts is None:
+        if passes is None:
+            found = self._detect(image)
             for step in STEPS:
                 found = self._look_at(image, found, find_small(found, image.shape, step))
         else:
-            found = self._look_at(image, found, parts)
+            found = passes.whole.to_frame(self._detect(passes.whole.crop(image)))
+            found = self._look_at(image, found, passes.others)
         found = self._look_at(image, found, find_groups(found, image.shape))
         return suppress(found, NMS_IOU)
 
@@ -97,9 +100,8 @@ class BundledDetector:
         tall, wide = (-(-side // COARSEST) * COARSEST for side in (height, width))
         padded = np.full((1, tall, wide, 3), 115, dtype=np.uint8)
         padded[0, :height, :width] = image
-        with torch.inference_mode(), precision(self._device, self._half):
-            given = normalize(torch.from_numpy(padded).to(self._device))
-            logits, sides = self._net(given)
+        with torch.inference_mode():
+            logits, sides = self._net(padded)
             boxes, scores = decode_boxes(logits[0], sides[0], MIN_SCORE, MAX_PEOPLE)
         found = boxes.double().cpu().numpy()
         found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)

@@ -2,7 +2,8 @@
 
 Needs torch; the rest of the package imports this module only on demand. Both nets are plain
 residual pyramids of 3 x 3 convolutions, which CPUs compute fastest; they differ in their heads.
-Their weights are safetensors files: names, shapes and numbers, no code.
+Their weights are safetensors files: names, shapes and numbers, no code. On a CPU the shipped nets
+compute in 8-bit integers, from ONNX files that infra/embedded_detector/quantize.py writes.
 """
 
 from __future__ import annotations
@@ -11,16 +12,20 @@ import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from data_contracts.arrays import Image
 from worldpose.detection.bundled_crops import MAP_COUNT
+from worldpose.detection.onnx_nets import open_session
 from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -38,8 +43,13 @@ EDGE_CELL: Final = 4
 APART: Final = 3
 """Cells to either side of a position in which no other position is chosen."""
 JOINTS: Final = 17
+GREY_MEAN: Final = 115.0
+GREY_SPREAD: Final = 58.0
+"""Mean and standard deviation of grey levels, by which images are normalized [of 255]."""
 FORMAT: Final = "worldpose-net"
 """Key of a file's metadata that names the class of the net."""
+WEIGHTS_DIGEST: Final = "weights_sha256"
+"""Key of the metadata of a net in integers: SHA-256 of the weights that it was made from."""
 _SCALE: Final = 16.0
 """Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px."""
 
@@ -139,12 +149,24 @@ class Seen(NamedTuple):
         doubt: logit of each joint from the crop as a whole (batch, 17).
         boxes: x0, y0, x1, y1 of the person (batch, 4) [px of the crop].
         fit: logits of the intersection over union of these and the true boxes (batch,).
+        trust: weight of the mass of each joint's peak in its confidence (17,).
     """
 
     maps: Tensor
     doubt: Tensor
     boxes: Tensor
     fit: Tensor
+    trust: Tensor
+
+    def sureness(self, mass: Tensor) -> Tensor:
+        """Return logits that joints are correct, from the crop and the mass of their peaks.
+
+        Args:
+            mass: (batch, 17) or, for several positions each, (batch, 17, places).
+        """
+        places = (1,) * (mass.ndim - 2)
+        trusted = self.trust.view((-1, *places)) * torch.logit(mass, eps=1e-4)
+        return self.doubt.view((*self.doubt.shape, *places)) + trusted
 
 
 class KeypointNet(nn.Module):
@@ -175,23 +197,12 @@ class KeypointNet(nn.Module):
         whole = coarsest.float().mean(dim=(2, 3))
         boxes, spread = edges(self.outline(features).float())
         fit = self.fit(torch.cat([whole, spread], dim=1))[:, 0]
-        return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit)
-
-    def sureness(self, doubt: Tensor, mass: Tensor) -> Tensor:
-        """Return logits that joints are correct, from `doubt` and the mass of their peaks.
-
-        Args:
-            doubt: (batch, 17)
-            mass: (batch, 17) or, for several positions each, (batch, 17, places).
-        """
-        places = (1,) * (mass.ndim - 2)
-        trusted = self.trust.view((-1, *places)) * torch.logit(mass, eps=1e-4)
-        return doubt.view((*doubt.shape, *places)) + trusted
+        return Seen(maps.float(), self.doubt(whole.detach()), boxes, fit, self.trust)
 
 
 def normalize(images: Tensor) -> Tensor:
     """Return images (batch, height, width, 3) of bytes as the nets take them (batch, 3, ...)."""
-    return images.permute(0, 3, 1, 2).float().sub_(115.0).div_(58.0)
+    return images.permute(0, 3, 1, 2).float().sub_(GREY_MEAN).div_(GREY_SPREAD)
 
 
 def peaks(maps: Tensor) -> tuple[Tensor, Tensor]:
@@ -394,6 +405,63 @@ def place_net(net: Net, device: str) -> Net:
     return placed
 
 
-def precision(device: str, half: bool) -> torch.autocast:
-    """Return the context in which a net computes, in half precision if `half`."""
-    return torch.autocast(device, torch.float16, enabled=half)
+class FloatNet:
+    """A net in floating point on a device, for images of bytes."""
+
+    def __init__(self, net: nn.Module, device: str = "cpu", half: bool = False) -> None:
+        """Place a net.
+
+        Args:
+            net: one of the bundled nets, changed in place.
+            device: `cpu` or `cuda`.
+            half: compute in half precision, on a GPU only.
+        """
+        self._net, self._device, self._half = place_net(net, device), device, half
+
+    def __call__(self, images: Image, *maps: NDArray[np.float32]) -> tuple[Tensor, ...]:
+        """Return the outputs of the net, on its device.
+
+        Args:
+            images: (batch, height, width, 3).
+            maps: further inputs.
+        """
+        with (
+            torch.inference_mode(),
+            torch.autocast(self._device, torch.float16, enabled=self._half),
+        ):
+            given = (torch.from_numpy(each).to(self._device) for each in (images, *maps))
+            found: tuple[Tensor, ...] = self._net(normalize(next(given)), *given)
+        return found
+
+
+class QuantizedNet:
+    """A net in 8-bit integers, for images of bytes.
+
+    Integers give equal bytes for an image whatever images are beside it.
+
+    Attributes:
+        weights_sha256: SHA-256 of the file of float weights that it was made from.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Open a file that infra/embedded_detector/quantize.py has written.
+
+        Raises:
+            InputError: onnxruntime is not installed.
+        """
+        self._session = open_session(file, "cpu")
+        self._names = [each.name for each in self._session.get_inputs()]
+        self.weights_sha256 = self._session.get_modelmeta().custom_metadata_map[WEIGHTS_DIGEST]
+
+    def __call__(self, images: Image, *maps: NDArray[np.float32]) -> tuple[Tensor, ...]:
+        """Return the outputs of the net; arguments as of `FloatNet`."""
+        given = (np.ascontiguousarray(images.transpose(0, 3, 1, 2)), *maps)
+        found: list[NDArray[Any]] = self._session.run(
+            None, dict(zip(self._names, given, strict=True))
+        )
+        return tuple(torch.from_numpy(each) for each in found)
+
+
+def placed_net(net: nn.Module | QuantizedNet, device: str, half: bool) -> FloatNet | QuantizedNet:
+    """Return a net that takes images of bytes; integers only compute on a CPU, as they are."""
+    return net if isinstance(net, QuantizedNet) else FloatNet(net, device, half)

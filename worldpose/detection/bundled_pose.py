@@ -32,10 +32,10 @@ from worldpose.detection.bundled_nets import (
     CROP,
     JOINTS,
     KeypointNet,
+    QuantizedNet,
+    Seen,
     decode_candidates,
-    normalize,
-    place_net,
-    precision,
+    placed_net,
 )
 from worldpose.detection.interfaces import People
 from worldpose.detection.suppression import nms_indices, suppress, surest_confidence
@@ -89,8 +89,10 @@ UNSEEN_SCORE: Final = 0.3
 class BundledPoseEstimator:
     """A net that estimates the joints of the person in a crop."""
 
-    def __init__(self, net: KeypointNet, device: str = "cpu", half: bool = False) -> None:
-        self._net, self._device, self._half = place_net(net, device), device, half
+    def __init__(
+        self, net: KeypointNet | QuantizedNet, device: str = "cpu", half: bool = False
+    ) -> None:
+        self._net = placed_net(net, device, half)
 
     def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
         """Return the pose in each box; confidence is the probability that a keypoint is correct.
@@ -156,11 +158,10 @@ class BundledPoseEstimator:
                 crops[index] = cut_crop(image, mapping, CROP)
                 who = start + index
                 around[index] = surroundings(boxes[who], others[who], mapping, CROP)
-            with torch.inference_mode(), precision(self._device, self._half):
-                given = normalize(torch.from_numpy(crops).to(self._device))
-                seen = self._net(given, torch.from_numpy(around).to(self._device))
+            with torch.inference_mode():
+                seen = Seen(*self._net(crops, around))
                 at, mass = decode_candidates(seen.maps, CANDIDATES)
-                sure = torch.sigmoid(self._net.sureness(seen.doubt, mass))
+                sure = torch.sigmoid(seen.sureness(mass))
             pixels, corners = at.double().cpu().numpy(), seen.boxes.double().cpu().numpy()
             for index, mapping in enumerate(part):
                 scale, corner = mapping[:, :2], mapping[:, 2]

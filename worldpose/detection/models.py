@@ -18,7 +18,7 @@ from worldpose.ingest.registration import digest_of_files
 from worldpose.ingest.validation import validate_record
 
 LIBRARIES: Final = {
-    "embedded": ("torch",),
+    "embedded": ("torch", "onnxruntime"),
     "transformers": ("torch", "transformers"),
     "onnx": ("onnxruntime",),
 }
@@ -30,6 +30,9 @@ BUNDLED_WEIGHTS: Final = (
     Path(__file__).with_name("embedded_keypoints.safetensors"),
 )
 """Shipped weights of the bundled detector and of the bundled pose estimator."""
+
+QUANTIZED_WEIGHTS: Final = tuple(file.with_suffix(".onnx") for file in BUNDLED_WEIGHTS)
+"""The same in 8-bit integers, for CPUs (infra/embedded_detector/quantize.py)."""
 
 SHIPPED_SCORE_MAP: Final = ScoreMap(slope=4.0, offset=-0.42)
 """Map of stored scores of the shipped pair of nets (infra/embedded_detector/score_map.py)."""
@@ -120,6 +123,8 @@ def load_bundled_detector(
 ) -> Detector:
     """Return the bundled detector.
 
+    On a CPU the shipped version computes in integers, a fine-tuned one in floating point.
+
     Args:
         weights: a file of a fine-tuned version; the shipped one if None.
         device: `cpu` or `cuda`.
@@ -131,6 +136,8 @@ def load_bundled_detector(
     nets = _bundled_nets()
     from worldpose.detection.bundled_detector import BundledDetector
 
+    if weights is None and device == "cpu":
+        return BundledDetector(nets.QuantizedNet(QUANTIZED_WEIGHTS[0]))
     net = nets.load_weights(weights or BUNDLED_WEIGHTS[0], nets.PeopleNet())
     return BundledDetector(net, device, half)
 
@@ -142,6 +149,8 @@ def load_bundled_pose(
     nets = _bundled_nets()
     from worldpose.detection.bundled_pose import BundledPoseEstimator
 
+    if weights is None and device == "cpu":
+        return BundledPoseEstimator(nets.QuantizedNet(QUANTIZED_WEIGHTS[1]))
     net = nets.load_weights(weights or BUNDLED_WEIGHTS[1], nets.KeypointNet())
     return BundledPoseEstimator(net, device, half)
 

@@ -61,30 +61,7 @@ class OnnxNet:
             InputError: onnxruntime or a GPU for it is missing, or the file is no such net.
         """
         self.where = str(file)
-        runtime = _import_runtime(self.where)
-        provider = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
-        if provider not in runtime.get_available_providers():
-            raise InputError(
-                self.where,
-                expected="onnxruntime with a GPU",
-                found=", ".join(runtime.get_available_providers()),
-                todo="Install onnxruntime-gpu, or set detection.device=cpu.",
-            )
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = 1
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            self._session = runtime.InferenceSession(str(file), options, providers=[provider])
-        except MemoryError:
-            raise
-        except Exception as error:  # onnxruntime's errors have no common class
-            raise InputError(
-                self.where,
-                expected="a net in an ONNX file",
-                found=str(error).splitlines()[0][:200],
-                todo="Export the net again.",
-            ) from error
+        self._session = open_session(file, device)
         inputs = self._session.get_inputs()
         shape = [side if isinstance(side, int) else None for side in inputs[0].shape]
         sizes = inputs[1:] and inputs[1].name in SIZE_INPUTS
@@ -119,6 +96,43 @@ class OnnxNet:
             inputs = dict(zip(self._names, (batch, np.array([self.size])), strict=False))
             each.append(self._session.run(None, inputs))
         return [np.concatenate(parts) for parts in zip(*each, strict=True)]
+
+
+def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
+    """Return an onnxruntime session of one thread.
+
+    Args:
+        file: the net.
+        device: `cpu` or `cuda`.
+
+    Raises:
+        InputError: onnxruntime or a GPU for it is missing, or the file is no net.
+    """
+    where = str(file)
+    runtime = _import_runtime(where)
+    provider = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
+    if provider not in runtime.get_available_providers():
+        raise InputError(
+            where,
+            expected="onnxruntime with a GPU",
+            found=", ".join(runtime.get_available_providers()),
+            todo="Install onnxruntime-gpu, or set detection.device=cpu.",
+        )
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        return runtime.InferenceSession(str(file), options, providers=[provider])
+    except MemoryError:
+        raise
+    except Exception as error:  # onnxruntime's errors have no common class
+        raise InputError(
+            where,
+            expected="a net in an ONNX file",
+            found=str(error).splitlines()[0][:200],
+            todo="Export the net again.",
+        ) from error
 
 
 def unknown_outputs(net: OnnxNet, expected: str) -> InputError:

@@ -24,7 +24,7 @@ from worldpose.detection.bundled_crops import (
     frame_from_crop,
     surroundings,
 )
-from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, normalize, peaks
+from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, Seen, normalize, peaks
 from worldpose.geometry.boxes import box_iou
 from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.labels import LabelledPicture, PictureCache
@@ -264,7 +264,8 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
         for each in (batch.keypoints, batch.visible, batch.tolerance)
     )
     around = torch.from_numpy(batch.surroundings).to(device)
-    maps, doubt, box, fit = net(normalize(torch.from_numpy(batch.crops).to(device)), around)
+    seen: Seen = net(normalize(torch.from_numpy(batch.crops).to(device)), around)
+    maps = seen.maps
     rows, columns = maps.shape[-2:]
     labelled = (visible > 0) & torch.isfinite(keypoints).all(dim=-1)
     at = torch.where(labelled[..., None], keypoints, 0.0)
@@ -285,10 +286,10 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
         said, near = peaks(maps)
         right = (torch.linalg.norm(said - at, dim=-1) <= tolerance[:, None]) & inside
     sure = functional.binary_cross_entropy_with_logits(
-        net.sureness(doubt, near), right.float(), reduction="none"
+        seen.sureness(near), right.float(), reduction="none"
     )
     doubt_loss: Tensor = (sure * labelled).sum() / labelled.sum().clamp(min=1)
-    return place + doubt_loss + box_loss(batch, box, fit)
+    return place + doubt_loss + box_loss(batch, seen.boxes, seen.fit)
 
 
 def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from worldpose.detection.bundled_nets import (
     FORMAT,
     KeypointNet,
     PeopleNet,
+    QuantizedNet,
     decode_boxes,
     edges,
     load_weights,
@@ -17,7 +18,17 @@ from worldpose.detection.bundled_nets import (
     save_weights,
 )
 from worldpose.detection.bundled_pose import BundledPoseEstimator, CropEstimates
+from worldpose.detection.models import (
+    BUNDLED_WEIGHTS,
+    QUANTIZED_WEIGHTS,
+    load_bundled_detector,
+    load_bundled_pose,
+)
 from worldpose.errors import InputError
+from worldpose.geometry.boxes import box_iou
+from worldpose.ingest.registration import digest_of_files
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.training import read_picture
 
 
 def shaken(net):
@@ -116,6 +127,33 @@ def test_people_and_poses_do_not_depend_on_the_batch():
     assert len(both[0].boxes) > 0
     inside = (both[0].boxes >= -0.5) & (both[0].boxes <= np.array([130, 90, 130, 90]) - 0.5)
     assert inside.all()
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_nets_in_integers_are_of_the_shipped_weights(which):
+    net = QuantizedNet(QUANTIZED_WEIGHTS[which])
+    assert net.weights_sha256 == digest_of_files(BUNDLED_WEIGHTS[which])
+
+
+def test_nets_in_integers_see_what_they_see_in_floating_point(tmp_path):
+    options = MatchOptions(duration=0.04, cameras=2, video=False)
+    simulate_match(SCENARIOS["tiny"], 5, tmp_path / "tiny", options)
+    image = read_picture(sorted((tmp_path / "tiny" / "stills").iterdir())[0])
+    exact = load_bundled_detector(BUNDLED_WEIGHTS[0]).detect([image])[0]
+    found = load_bundled_detector().detect([image])[0]
+    sure = [people.boxes[people.scores >= 0.4] for people in (exact, found)]
+    assert len(sure[0]) == len(sure[1]) >= 4
+    overlap = box_iou(*sure)
+    assert overlap.max(axis=1).min() > 0.9 and overlap.max(axis=0).min() > 0.9
+    poses = [
+        load_bundled_pose(weights).estimate(image, sure[0])
+        for weights in (BUNDLED_WEIGHTS[1], None)
+    ]
+    known = poses[0].confidence > 0.5
+    moved = np.linalg.norm(poses[1].keypoints - poses[0].keypoints, axis=-1)[known]
+    tall = sure[0][:, 3] - sure[0][:, 1]
+    assert known.sum() > 30 and np.median(moved) < 0.005 * np.median(tall)
+    assert np.abs(poses[1].confidence - poses[0].confidence)[known].mean() < 0.03
 
 
 def looks(monkeypatch, seen_of):
