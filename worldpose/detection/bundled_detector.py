@@ -24,7 +24,6 @@ from worldpose.detection.enlargement import (
     SIZING_ZOOM,
     STEPS,
     Part,
-    Passes,
     choose_reduction,
     find_groups,
     find_small,
@@ -63,28 +62,27 @@ class BundledDetector:
         """Return the people in each frame, computed one by one."""
         return [self._people(image, None) for image in images]
 
-    def detect_parts(self, images: Sequence[Image], passes: Passes) -> list[People]:
-        """Return the people in each frame; the caller knows where they are, and in what size."""
-        return [self._people(image, passes) for image in images]
+    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
+        """Return the people in each frame; the caller knows where their size is unusual."""
+        return [self._people(image, parts) for image in images]
 
-    def _people(self, image: Image, passes: Passes | None) -> People:
-        if passes is None:
+    def _people(self, image: Image, parts: Sequence[Part] | None) -> People:
+        if parts is None:
             size = (image.shape[1], image.shape[0])
             sized = self._detect(resize(image, SIZING_ZOOM))
             zoom = choose_reduction(restore_size(sized, size, SIZING_ZOOM))
             if zoom < 1.0:
                 return restore_size(self._find_all(resize(image, zoom), None), size, zoom)
-        return self._find_all(image, passes)
+        return self._find_all(image, parts)
 
-    def _find_all(self, image: Image, passes: Passes | None) -> People:
+    def _find_all(self, image: Image, parts: Sequence[Part] | None) -> People:
         """Return the people in an image, with passes over its parts."""
-        if passes is None:
-            found = self._detect(image)
+        found = self._detect(image)
+        if parts is None:
             for step in STEPS:
                 found = self._look_at(image, found, find_small(found, image.shape, step))
         else:
-            found = passes.whole.to_frame(self._detect(passes.whole.crop(image)))
-            found = self._look_at(image, found, passes.others)
+            found = self._look_at(image, found, parts)
         found = self._look_at(image, found, find_groups(found, image.shape))
         return suppress(found, NMS_IOU)
 

@@ -35,9 +35,6 @@ TILE: Final = 1024
 """Longest side of an enlarged tile without its margin [px]: bounds memory."""
 BLEND: Final = 1.25
 """Factor by which heights of both passes overlap [1]: no person at the limit is lost."""
-SURROUNDINGS: Final = 48.0
-"""Margin around the people whom a calibrated camera shows [px]: it holds their surroundings, which
-the net uses, and the error of the calibration."""
 STANDING: Final = 1.8
 """Height of an upright person [m]."""
 GRID: Final = 2.0
@@ -108,29 +105,17 @@ class Part:
         return np.asarray(np.all((middles >= self.inner[:2]) & (middles < self.inner[2:]), axis=1))
 
 
-@dataclass(frozen=True)
-class Passes:
-    """Passes over the frames of a calibrated camera.
-
-    Attributes:
-        whole: the part of the frame that shows people on the pitch, in its own size.
-        others: the parts in which they are too small or large.
-    """
-
-    whole: Part
-    others: tuple[Part, ...]
-
-
 @runtime_checkable
 class SeesParts(Detector, Protocol):
     """A detector that looks at parts of frames at another size, where people need it."""
 
-    def detect_parts(self, images: Sequence[Image], passes: Passes) -> list[People]:
+    def detect_parts(self, images: Sequence[Image], parts: Sequence[Part]) -> list[People]:
         """Return the people in each image, as `detect`.
 
         Args:
             images: images of one size.
-            passes: where people are expected, and in what size, from the camera.
+            parts: where people are expected small or large, from the camera; empty where they are
+                not.
         """
 
 
@@ -190,8 +175,8 @@ def find_small(people: People, shape: tuple[int, ...], step: tuple[float, float]
     return _tile(each.boxes[tall < 2.0 * step[0]], shape, step)
 
 
-def plan_passes(camera: Camera, pitch: PitchTemplate, margin: float) -> Passes | None:
-    """Return where a calibrated camera shows people on the pitch; None = nowhere.
+def expect_parts(camera: Camera, pitch: PitchTemplate, margin: float) -> list[Part]:
+    """Return the parts in which a calibrated camera shows people on the pitch too small or large.
 
     Where they are too large, the part is the whole frame: a pass over it costs a quarter of the
     first.
@@ -214,22 +199,6 @@ def plan_passes(camera: Camera, pitch: PitchTemplate, margin: float) -> Passes |
     width, height = (int(side) for side in camera.image_size)
     with np.errstate(invalid="ignore"):
         shown = np.all((middle >= 0.0) & (middle <= [width, height]), axis=1)
-    side = 0.5 * tall[:, None] + SURROUNDINGS
-    with np.errstate(invalid="ignore"):
-        partly = np.all((middle + side >= 0.0) & (middle - side <= [width, height]), axis=1)
-    if not partly.any():
-        return None
-    boxes = np.concatenate([middle - side, middle + side], axis=1)[partly]
-    corner = np.maximum(np.floor(boxes[:, :2].min(axis=0)), 0).astype(int)
-    end = np.minimum(np.ceil(boxes[:, 2:].max(axis=0)), [width, height]).astype(int)
-    inner = np.array([-0.5, -0.5, width - 0.5, height - 0.5])
-    whole = Part(
-        corner=(int(corner[0]), int(corner[1])),
-        end=(int(end[0]), int(end[1])),
-        zoom=1.0,
-        inner=inner,
-        heights=(0.0, float("inf")),
-    )
     bounds = [limit for limit, _ in STEPS[1:]] + [0.0]
     parts = []
     for step, least in zip(STEPS, bounds, strict=True):
@@ -237,12 +206,13 @@ def plan_passes(camera: Camera, pitch: PitchTemplate, margin: float) -> Passes |
         side = 0.5 * tall[asked, None]
         boxes = np.concatenate([middle[asked] - side, middle[asked] + side], axis=1)
         parts += _tile(boxes, (height, width), step)
+    inner = np.array([-0.5, -0.5, width - 0.5, height - 0.5])
     for limit, zoom in reversed(REDUCTIONS):
         if np.any(shown & (tall > limit)):
             taller = (limit / BLEND, float("inf"))
             replaced = (limit * BLEND, float("inf"))
             parts.append(Part((0, 0), (width, height), zoom, inner, taller, replaced))
-    return Passes(whole, tuple(parts))
+    return parts
 
 
 def _tile(boxes: Floats, shape: tuple[int, ...], step: tuple[float, float]) -> list[Part]:

@@ -11,7 +11,7 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
-from worldpose.detection.enlargement import Passes, SeesParts, plan_passes
+from worldpose.detection.enlargement import Part, SeesParts, expect_parts
 from worldpose.detection.interfaces import (
     Detector,
     FindsOccludedPeople,
@@ -178,7 +178,7 @@ class PeopleFinder:
             for detector in detectors
         ]
         self._estimator, self._settings, self._score_map = estimator, settings, score_map
-        self._passes: Passes | None = None
+        self._parts: list[Part] | None = None
         self.report = DetectionReport()
 
     def find(
@@ -192,10 +192,10 @@ class PeopleFinder:
         """
         self.report = DetectionReport()
         cleaner = BoxCleaner(self._settings)
-        self._passes = None
+        self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
             margin = self._settings.pitch_margin_m
-            self._passes = plan_passes(place.camera, place.pitch, margin)
+            self._parts = expect_parts(place.camera, place.pitch, margin)
         detected_frames = detect_strided(
             frames,
             lambda images: self._people(images, place),
@@ -224,8 +224,8 @@ class PeopleFinder:
         settings = self._settings
         found = [
             detector.detect(images)
-            if self._passes is None or not isinstance(detector, SeesParts)
-            else detector.detect_parts(images, self._passes)
+            if self._parts is None or not isinstance(detector, SeesParts)
+            else detector.detect_parts(images, self._parts)
             for detector in self._detectors
         ]
         everybody = []

@@ -1,15 +1,13 @@
 """The detector finds small people and people close together in enlarged parts of a frame."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.enlargement import (
     choose_reduction,
+    expect_parts,
     find_groups,
     find_small,
-    plan_passes,
     resize,
     restore_size,
 )
@@ -109,13 +107,11 @@ def looking(focal):
 
 def test_a_calibrated_camera_tells_where_people_are_small():
     pitch = PitchTemplate.standard()
-    assert {part.zoom for part in plan_passes(looking(3200.0), pitch, 2.5).others} == {
-        0.5
-    }  # 136 px
-    assert {part.zoom for part in plan_passes(looking(12000.0), pitch, 2.5).others} == {0.5, 0.25}
-    assert {tile.zoom for tile in plan_passes(looking(1000.0), pitch, 2.5).others} == {2.0, 3.0}
+    assert {part.zoom for part in expect_parts(looking(3200.0), pitch, 2.5)} == {0.5}  # 136 px
+    assert {part.zoom for part in expect_parts(looking(12000.0), pitch, 2.5)} == {0.5, 0.25}
+    assert {tile.zoom for tile in expect_parts(looking(1000.0), pitch, 2.5)} == {2.0, 3.0}
     camera = looking(1250.0)
-    tiles = plan_passes(camera, pitch, 2.5).others
+    tiles = expect_parts(camera, pitch, 2.5)
     assert {tile.zoom for tile in tiles} == {2.0}
     for y, wanted in ((33.0, True), (-33.0, False)):  # 20 and 48 px
         (feet, head) = camera.project(np.array([[5.0, y, 0.0], [5.0, y, 1.8]]))
@@ -125,26 +121,9 @@ def test_a_calibrated_camera_tells_where_people_are_small():
         assert found == wanted
 
 
-def test_the_first_pass_sees_the_part_that_shows_the_pitch():
-    pitch, camera = PitchTemplate.standard(), looking(1250.0)
-    passes = plan_passes(camera, pitch, 2.5)
-    (left, top), (right, bottom) = passes.whole.corner, passes.whole.end
-    # Above are the stands, below the near seats.
-    assert (left, right) == (0, 1920) and 200 < top < 500 and 850 < bottom < 950
-    for x in (-30.0, 0.0, 30.0):
-        low, high = camera.project(np.array([[x, 36.0, 0.0], [x, 36.0, 1.8]]))
-        assert top + 30 < high[1] < low[1] < bottom
-    far = people((900.0, 400.0, 910.0, 430.0))
-    np.testing.assert_allclose(
-        passes.whole.to_frame(seen(passes.whole, *far.boxes)).boxes, far.boxes, atol=1e-9
-    )
-    away = replace(camera, cam_from_world=Rigid(np.eye(3), np.array([0.0, 0.0, -500.0])))
-    assert plan_passes(away, pitch, 2.5) is None
-
-
 def test_a_reduced_view_replaces_large_people_and_keeps_others():
     near = looking(3200.0)
-    (view,) = plan_passes(near, PitchTemplate.standard(), 2.5).others
+    (view,) = expect_parts(near, PitchTemplate.standard(), 2.5)
     small, large = (300.0, 300.0, 320.0, 360.0), (500.0, 300.0, 560.0, 480.0)
     half = (500.0, 300.0, 560.0, 390.0)  # the upper body of the large person
     whole = (501.0, 301.0, 561.0, 481.0)
@@ -196,7 +175,5 @@ def test_the_detector_looks_at_the_size_that_suits_the_people():
         np.testing.assert_allclose(found.boxes, [[500.0, 300.0, 560.0, 300.0 + height]], atol=2.0)
     # A calibrated camera tells the sizes: there is no second look.
     detector = SizesSeen(150.0)
-    passes = plan_passes(looking(3200.0), PitchTemplate.standard(), 2.5)
-    detector.detect_parts([image], replace(passes, others=()))
-    (left, top), (right, bottom) = passes.whole.corner, passes.whole.end
-    assert detector.shapes == [(bottom - top, right - left)]
+    detector.detect_parts([image], [])
+    assert detector.shapes == [(1080, 1920)]
