@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Image, Singles
 from worldpose.detection.bundled_crops import MAP_COUNT
 from worldpose.detection.onnx_nets import open_session
 from worldpose.errors import InputError
@@ -418,19 +418,20 @@ class FloatNet:
         """
         self._net, self._device, self._half = place_net(net, device), device, half
 
-    def __call__(self, images: Image, *maps: NDArray[np.float32]) -> tuple[Tensor, ...]:
+    def __call__(self, images: Image, surroundings: Singles | None = None) -> tuple[Tensor, ...]:
         """Return the outputs of the net, on its device.
 
         Args:
             images: (batch, height, width, 3).
-            maps: further inputs.
+            surroundings: second input of the keypoint net.
         """
-        with (
-            torch.inference_mode(),
-            torch.autocast(self._device, torch.float16, enabled=self._half),
-        ):
-            given = (torch.from_numpy(each).to(self._device) for each in (images, *maps))
-            found: tuple[Tensor, ...] = self._net(normalize(next(given)), *given)
+        half = torch.autocast(self._device, torch.float16, enabled=self._half)
+        with torch.inference_mode(), half:
+            given = normalize(torch.from_numpy(images).to(self._device))
+            if surroundings is None:
+                found: tuple[Tensor, ...] = self._net(given)
+            else:
+                found = self._net(given, torch.from_numpy(surroundings).to(self._device))
         return found
 
 
@@ -453,11 +454,11 @@ class QuantizedNet:
         self._names = [each.name for each in self._session.get_inputs()]
         self.weights_sha256 = self._session.get_modelmeta().custom_metadata_map[WEIGHTS_DIGEST]
 
-    def __call__(self, images: Image, *maps: NDArray[np.float32]) -> tuple[Tensor, ...]:
+    def __call__(self, images: Image, surroundings: Singles | None = None) -> tuple[Tensor, ...]:
         """Return the outputs of the net; arguments as of `FloatNet`."""
-        given = (np.ascontiguousarray(images.transpose(0, 3, 1, 2)), *maps)
+        inputs = (np.ascontiguousarray(images.transpose(0, 3, 1, 2)), surroundings)
         found: list[NDArray[Any]] = self._session.run(
-            None, dict(zip(self._names, given, strict=True))
+            None, dict(zip(self._names, inputs, strict=False))
         )
         return tuple(torch.from_numpy(each) for each in found)
 
