@@ -46,6 +46,7 @@ from worldpose.body_fitting.solver import (
     frame_covariance,
     pose_covariance,
 )
+from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 
@@ -184,12 +185,16 @@ def fit_bodies(
         fps,
     )
     result = FittedArrays.empty(model, frames, persons)
-    for person, span in spans.items():
+
+    def fit_person(person: int) -> None:
         pose, track = solver.solve_poses(
             by_person[person], shapes.people[person], shapes.offsets, fps
         )
         spread = _covariance(track, pose, shapes.offsets, bias)
-        result.put(solver, person, span, pose, spread, shapes)
+        result.put(solver, person, spans[person], pose, spread, shapes)
+
+    for _ in map_in_threads(fit_person, spans):
+        pass
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(
             result, joint_seen, covariance, evidence.monocular_poses, spans, fps
