@@ -58,6 +58,9 @@ KEPT_BIAS: Final = 0.01
 model the rest."""
 MAX_OFFSET: Final = 3.0
 """Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
+THREAD_FRAMES: Final = 10_000
+"""Frames of a clip up to which two people are solved at the same time: the equations of a track
+take 60 KB per frame."""
 MONOCULAR_TIME: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 
@@ -193,7 +196,8 @@ def fit_bodies(
         spread = _covariance(track, pose, shapes.offsets, bias)
         result.put(solver, person, spans[person], pose, spread, shapes)
 
-    for _ in map_in_threads(fit_person, spans):
+    # Tracks of many minutes need gigabytes each: one at a time.
+    for _ in (map_in_threads if frames <= THREAD_FRAMES else map)(fit_person, spans):
         pass
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(
