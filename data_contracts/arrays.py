@@ -37,6 +37,8 @@ Missing = Literal["nan", "-1", "0", "none"]
 
 CHUNK_BYTES = 1 << 20
 """Minimum size of a full chunk before compression [byte]: smaller chunks halve the throughput."""
+SHARD_CHUNKS = 64
+"""Maximum number of chunks per file: a writer holds all chunks of a file in memory."""
 
 
 class ArrayLayout(Record):
@@ -63,6 +65,17 @@ class ArrayLayout(Record):
         row_bytes = np.dtype(self.dtype).itemsize * int(np.prod(whole)) // whole[axis]
         rows = -(-CHUNK_BYTES // max(1, row_bytes))
         return (*whole[:axis], min(whole[axis], rows), *whole[axis + 1 :])
+
+    def shards(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Shape of one file's part of an array of `shape`: as few whole chunks as files allow."""
+        chunks = self.chunks(shape)
+        if self.chunk_dim is None:
+            return chunks
+        axis = self.dims.index(self.chunk_dim)
+        number = max(1, -(-shape[axis] // chunks[axis]))
+        files = -(-number // SHARD_CHUNKS)
+        length = -(-number // files) * chunks[axis]
+        return (*chunks[:axis], length, *chunks[axis + 1 :])
 
     def attributes(self) -> dict[str, Any]:
         """Attributes stored with the array."""

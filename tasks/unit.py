@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import logging
 import platform
@@ -45,6 +46,14 @@ RECONNECTIONS: Final = 3
 """Attempts to connect again for each event; events that fail wait for the next attempt, after 30 s.
 Prefect's 10, with a second in between, keep the events of an ended server for minutes."""
 
+MMAP_BYTES: Final = 32 << 20
+"""Arrays from this size on get pages of their own and return them when freed [byte]."""
+TRIM_BYTES: Final = 64 << 20
+"""Freed memory that a process keeps for its next arrays [byte]."""
+_MMAP_THRESHOLD: Final = -3
+_TRIM_THRESHOLD: Final = -1
+"""M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of glibc's mallopt."""
+
 _senders: OrderedDict[str, tuple[APILogWorker, EventsWorker]] = OrderedDict()
 """Senders of this process's log lines and events, by server, the least recently used first."""
 
@@ -57,6 +66,7 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
         send_to_own_server()
+        keep_freed_memory()
         require_same_code(work)
         with kill_on_timeout(work):
             try:
@@ -77,6 +87,22 @@ def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
         retry_condition_fn=_may_be_retried,
         persist_result=False,
     )(run_checked)
+
+
+@functools.cache
+def keep_freed_memory() -> None:
+    """Let this process use freed memory again for its next arrays.
+
+    Dask starts its workers with a trim threshold of 64 KiB, with which every array of more than 128
+    KiB is mapped, zeroed page by page, and unmapped: a third of the CPU time of some stages. This
+    is what glibc does by default after its first large arrays.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):  # not glibc
+        return
+    mallopt(_MMAP_THRESHOLD, MMAP_BYTES)
+    mallopt(_TRIM_THRESHOLD, TRIM_BYTES)
 
 
 def require_same_code(work: Work) -> None:

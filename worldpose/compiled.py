@@ -1,4 +1,4 @@
-"""Decorator that compiles numerical kernels to machine code (Numba)."""
+"""Machine code for numerical kernels (Numba), and threads that run them at the same time."""
 
 from __future__ import annotations
 
@@ -6,14 +6,23 @@ import functools
 import hashlib
 import os
 import re
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Final, TypeVar, cast
 
 from numba import njit
 from numba.core import config
 
 Function = TypeVar("Function", bound=Callable[..., object])
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+THREADS: Final = 2
+"""Threads of one unit: the only clip of a match uses two cores, and the units of many clips on a
+large machine do not hinder each other."""
 
 _PACKAGE = Path(__file__).resolve().parent
 _IMPORT = re.compile(
@@ -34,6 +43,23 @@ def compile_kernel(function: Function) -> Function:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
     finally:
         config.CACHE_DIR = given  # type: ignore[attr-defined]
+
+
+def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield the result for each item, in order; `THREADS` of them are computed at the same time.
+
+    Kernels and large numpy operations release the interpreter lock. Results are those of a loop:
+    each item is computed by itself. At most `THREADS` results wait, so memory stays flat.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as threads:
+        for item in items:
+            # With the caller's settings of numpy's warnings.
+            waiting.append(threads.submit(copy_context().run, function, item))
+            if len(waiting) > THREADS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def _part_of(function: Function) -> str:

@@ -45,6 +45,7 @@ from worldpose.body_fitting.solver import (
     fit_shapes,
     pose_covariance,
 )
+from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 
@@ -56,6 +57,9 @@ KEPT_BIAS: Final = 0.01
 model the rest."""
 MAX_OFFSET: Final = 3.0
 """Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
+THREAD_FRAMES: Final = 10_000
+"""Frames of a clip up to which two people are solved at the same time: the equations of a track
+take 60 KB per frame."""
 MONOCULAR_TIME: Final = 0.5
 """Correlation time of monocular pose errors [s]: images hardly change."""
 
@@ -183,12 +187,17 @@ def fit_bodies(
         fps,
     )
     result = FittedArrays.empty(model, frames, persons)
-    for person, span in spans.items():
+
+    def fit_person(person: int) -> None:
         pose, track = solver.solve_poses(
             by_person[person], shapes.people[person], shapes.offsets, fps
         )
         spread = _covariance(track, pose, shapes.offsets, bias)
-        result.put(solver, person, span, pose, spread, shapes)
+        result.put(solver, person, spans[person], pose, spread, shapes)
+
+    # Tracks of many minutes need gigabytes each: one at a time.
+    for _ in (map_in_threads if frames <= THREAD_FRAMES else map)(fit_person, spans):
+        pass
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(
             result, joint_seen, covariance, evidence.monocular_poses, spans, fps

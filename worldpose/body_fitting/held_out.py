@@ -29,6 +29,7 @@ from worldpose.body_fitting.pose_space import load_pose_prior
 from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_constraints
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import Solver
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.triangulation import Triangulation, TriangulationSettings, triangulate_joints
 from worldpose.triangulation.passes import learn_detector
@@ -179,7 +180,8 @@ def _fit_poses(
     """Return the detector's joints of bodies with known shapes (frames, persons, 17, 3) [m]."""
     covariance = random_covariance(placed.covariance, placed.common_bias)
     bodies = np.full(placed.joints.shape, np.nan)
-    for person in np.flatnonzero(np.isfinite(fit.betas).all(-1)):
+
+    def fit_person(person: int) -> None:
         shape = Shape(fit.betas[person], fit.betas_covariance[person])
         for first in range(0, len(bodies), length):
             part = slice(first, first + length)
@@ -191,6 +193,9 @@ def _fit_poses(
             )
             pose, _ = solver.solve_poses(evidence, shape, fit.offsets, fps)
             bodies[part, person] = solver.chained.differentiate(pose.parameters()).keypoints
+
+    for _ in map_in_threads(fit_person, np.flatnonzero(np.isfinite(fit.betas).all(-1)).tolist()):
+        pass
     return perceived_joints(bodies, fit.offsets)
 
 

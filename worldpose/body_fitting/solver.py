@@ -30,6 +30,7 @@ from worldpose.body_fitting.objective import (
     UNKNOWNS,
     Evidence,
     Ground,
+    NormalEquations,
     Pose,
     Track,
     ankle_height,
@@ -39,6 +40,7 @@ from worldpose.body_fitting.objective import (
 )
 from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.compiled import map_in_threads
 from worldpose.errors import DegenerateError
 from worldpose.geometry import Rigid
 from worldpose.geometry.optimize.banded import BandedFactor
@@ -241,11 +243,11 @@ def fit_shapes(
         known: shapes of some persons from other clips; the others start from the prior.
         fps: [1/s].
     """
-    pieces = [
-        piece
-        for person, (joints, covariance) in people.items()
-        for piece in _sample_pieces(solver, person, joints, covariance, fps)
-    ]
+
+    def sample(person: int) -> list[Piece]:
+        return _sample_pieces(solver, person, *people[person], fps)
+
+    pieces = [piece for some in map_in_threads(sample, people) for piece in some]
     return solve_shapes(solver, people, pieces, known)
 
 
@@ -285,10 +287,16 @@ def solve_shapes(
             gradients[person] = np.zeros(count + len(unknowns))
             betas = next((p.pose.betas for p in pieces if p.person == person), shape.betas)
             gradients[person][:count] = own @ (betas - shape.betas)
-        for piece in pieces:
+
+        def eliminate(piece: Piece, offsets: Floats = offsets) -> tuple[NormalEquations, Floats]:
             equations = piece.track.equations(piece.pose, offsets, bordered=True)
             sides = np.concatenate([equations.border, equations.gradient[..., None]], axis=-1)
-            inner.append(factor(equations.blocks).solve(sides))
+            return equations, factor(equations.blocks).solve(sides)
+
+        for piece, (equations, solution) in zip(
+            pieces, map_in_threads(eliminate, pieces), strict=True
+        ):
+            inner.append(solution)
             flat = equations.border.reshape(-1, len(equations.corner)).T
             reduced = flat @ inner[-1].reshape(flat.shape[1], -1)
             corners[piece.person] += equations.corner - reduced[:, :-1]

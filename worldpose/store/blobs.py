@@ -5,12 +5,15 @@ The implementation for object storage is `worldpose.store.objects`.
 
 from __future__ import annotations
 
+import bisect
 import ctypes
 import errno
+import hashlib
+import itertools
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -83,6 +86,15 @@ class Blobs(Protocol):
     def read(self, path: str) -> bytes | None:
         """Return the content at `path`, None if there is none."""
 
+    def read_range(self, path: str, start: int, stop: int) -> bytes | None:
+        """Return the bytes from `start` to before `stop`, fewer if the content ends before them.
+
+        None if there is nothing at `path`.
+        """
+
+    def digest(self, path: str) -> tuple[int, str] | None:
+        """Return size [byte] and SHA-256 of the content at `path`, None if there is none."""
+
     def exists(self, path: str) -> bool:
         """Return whether `path` exists."""
 
@@ -147,15 +159,72 @@ def read_published(blobs: Blobs, result: ResultId, file: StoredFile) -> bytes:
     """
     path = f"{result.path}/{file.path}"
     data = blobs.read(path)
+    there = None if data is None else (len(data), digest(data))
+    _require_published(blobs, path, file, there)
+    assert data is not None
+    return data
+
+
+def _require_published(
+    blobs: Blobs, path: str, file: StoredFile, there: tuple[int, str] | None
+) -> None:
+    """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
+    if there is None:
+        raise _changed(blobs, path, "the file is missing")
+    size, sha256 = there
+    if size != file.size:
+        raise _changed(blobs, path, f"the file has {size} bytes, not {file.size}")
+    if sha256 != file.sha256:
+        raise _changed(blobs, path, "its SHA-256 differs from the one in the manifest")
+
+
+def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
+    """Verify that the bytes of one file are the published ones, without holding them in memory.
+
+    Raises:
+        CorruptionError: as `read_published`.
+    """
+    path = f"{result.path}/{file.path}"
+    _require_published(blobs, path, file, blobs.digest(path))
+
+
+def read_published_range(
+    blobs: Blobs, result: ResultId, file: StoredFile, start: int, stop: int
+) -> bytes:
+    """Return the bytes of one file from `start` to before `stop`, verified part by part.
+
+    Raises:
+        CorruptionError: the file is missing or these parts have changed.
+    """
+    if not file.parts:
+        return read_published(blobs, result, file)[start:stop]
+    ends = list(itertools.accumulate(size for size, _ in file.parts))
+    first, last = bisect.bisect_right(ends, start), bisect.bisect_left(ends, stop) + 1
+    before = ends[first] - file.parts[first][0]
+    path = f"{result.path}/{file.path}"
+    data = blobs.read_range(path, before, ends[min(last, len(ends)) - 1])
     if data is None:
         found = "the file is missing"
-    elif len(data) != file.size:
-        found = f"the file has {len(data)} bytes, not {file.size}"
-    elif digest(data) != file.sha256:
-        found = "its SHA-256 differs from the one in the manifest"
+    elif digest_parts(data, [size for size, _ in file.parts[first:last]]) != file.parts[first:last]:
+        found = f"the SHA-256 of its part at byte {before} differs from the one in the manifest"
     else:
-        return data
-    raise CorruptionError(
+        return data[start - before : stop - before]
+    raise _changed(blobs, path, found)
+
+
+def digest_parts(data: bytes, sizes: Sequence[int]) -> tuple[tuple[int, str], ...]:
+    """Return size and SHA-256 of the consecutive parts of `data`; a cut part has another size."""
+    parts, start = [], 0
+    with memoryview(data) as view:
+        for size in sizes:
+            part = view[start : start + size]
+            parts.append((len(part), digest(part)))
+            start += size
+    return tuple(parts)
+
+
+def _changed(blobs: Blobs, path: str, found: str) -> CorruptionError:
+    return CorruptionError(
         f"{blobs.url}/{path} has changed since its publication: {found}. Run "
         "`worldpose verify --repair` to find and repair all damage."
     )
@@ -186,6 +255,28 @@ class LocalBlobs:
         with storage_errors(str(target)):
             try:
                 return target.read_bytes()
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+
+    def read_range(self, path: str, start: int, stop: int) -> bytes | None:
+        """See `Blobs`."""
+        target = self._at(path)
+        with storage_errors(str(target)):
+            try:
+                with target.open("rb", buffering=0) as file:
+                    file.seek(start)
+                    return file.read(stop - start)
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+
+    def digest(self, path: str) -> tuple[int, str] | None:
+        """See `Blobs`."""
+        target = self._at(path)
+        with storage_errors(str(target)):
+            try:
+                with target.open("rb", buffering=0) as file:
+                    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+                    return file.tell(), sha256
             except (FileNotFoundError, NotADirectoryError):
                 return None
 

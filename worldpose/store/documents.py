@@ -60,7 +60,7 @@ def _refuse_other_keys(value: object) -> None:
         containers += [each for each in inner if isinstance(each, _CONTAINERS)]
 
 
-def digest(data: bytes) -> str:
+def digest(data: bytes | memoryview) -> str:
     """Return the SHA-256 of `data` in lower-case hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 

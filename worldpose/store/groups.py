@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import warnings
 from collections.abc import AsyncIterator, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import google_crc32c
 import numpy as np
 import xarray as xr
 import zarr
+from numcodecs.blosc import Blosc
 from numpy.typing import NDArray
 from zarr.abc.store import (
     ByteRequest,
@@ -26,18 +30,20 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.errors import ZarrUserWarning
 from zarr.storage import LocalStore
 
-from data_contracts.arrays import ArrayLayout, GroupLayout
+from data_contracts.arrays import CHUNK_BYTES, ArrayLayout, GroupLayout
 from data_contracts.conventions import CONVENTIONS
-from data_contracts.run import ResultManifest
+from data_contracts.run import ResultManifest, StoredFile
 from worldpose.errors import InputError, InternalError
-from worldpose.store.blobs import Blobs, read_published
+from worldpose.store.blobs import Blobs, LocalBlobs, read_published, read_published_range
 from worldpose.store.documents import canonical_json
 from worldpose.store.paths import ResultId
 
 Arrays = Mapping[str, NDArray[Any]]
 
-PART_CHUNKS = 16
-"""Number of chunks of an array in memory at once: enough for every core to compress one."""
+CODEC: Final[dict[str, Any]] = {"cname": "lz4", "clevel": 5}
+"""Compression of chunks by Blosc."""
+NO_CHUNK: Final = (1 << 64) - 1
+"""Place and size of a chunk beyond the end of an array in the index of a file."""
 
 
 def checked_arrays(
@@ -74,7 +80,7 @@ def checked_arrays(
 
 
 def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
-    """Return the slices of consecutive parts of an array of `shape`: a few whole chunks each.
+    """Return the slices of consecutive parts of an array of `shape`: one file each.
 
     An array can be longer than memory, so it is processed one part at a time.
     """
@@ -84,7 +90,7 @@ def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice,
     if array.chunk_dim is None:
         return [whole]
     axis = array.dims.index(array.chunk_dim)
-    size, length = shape[axis], PART_CHUNKS * array.chunks(shape)[axis]
+    size, length = shape[axis], array.shards(shape)[axis]
     return [
         (*whole[:axis], slice(first, min(first + length, size)), *whole[axis + 1 :])
         for first in range(0, size, length)
@@ -189,7 +195,10 @@ def _wrong_values(array: ArrayLayout, values: NDArray[Any]) -> NDArray[np.bool_]
 
 
 class PublishedFiles(Store):
-    """Read-only Zarr store that raises an error for a lost or changed file, never a fill value."""
+    """Read-only Zarr store that raises an error for a lost or changed file, never a fill value.
+
+    A read of some chunks of a file reads and verifies these chunks alone.
+    """
 
     supports_writes = False
     supports_deletes = False
@@ -199,6 +208,8 @@ class PublishedFiles(Store):
         super().__init__(read_only=True)
         self._blobs, self._result = blobs, result
         self._files = {file.path: file for file in manifest.files}
+        self._ends: dict[tuple[str, int], bytes] = {}
+        """Ends of files that were read, by path and length: the index of their chunks."""
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -217,15 +228,30 @@ class PublishedFiles(Store):
         file = self._files.get(key)
         if file is None:
             return None
-        data = await asyncio.to_thread(read_published, self._blobs, self._result, file)
+        size = file.size
         match byte_range:
-            case RangeByteRequest():
-                data = data[byte_range.start : byte_range.end]
-            case OffsetByteRequest():
-                data = data[byte_range.offset :]
-            case SuffixByteRequest():
-                data = data[max(0, len(data) - byte_range.suffix) :]
+            case RangeByteRequest(start, stop):
+                pass
+            case OffsetByteRequest(start):
+                stop = size
+            case SuffixByteRequest(suffix):
+                start, stop = max(0, size - suffix), size
+                if (key, suffix) not in self._ends:
+                    self._ends[key, suffix] = await asyncio.to_thread(self._read, file, start, stop)
+                return prototype.buffer.from_bytes(self._ends[key, suffix])
+            case _:
+                start, stop = 0, size
+        # A thread for each chunk of a local file would take longer than its few reads save.
+        if isinstance(self._blobs, LocalBlobs) and stop - start <= 2 * CHUNK_BYTES:
+            data = self._read(file, start, stop)
+        else:
+            data = await asyncio.to_thread(self._read, file, start, stop)
         return prototype.buffer.from_bytes(data)
+
+    def _read(self, file: StoredFile, start: int, stop: int) -> bytes:
+        if start == 0 and stop >= file.size:
+            return read_published(self._blobs, self._result, file)
+        return read_published_range(self._blobs, self._result, file, start, stop)
 
     async def get_partial_values(
         self,
@@ -281,11 +307,12 @@ def write_group(
     arrays: Arrays,
     coordinates: Arrays,
     attributes: Mapping[str, Any],
-) -> int:
+) -> dict[str, tuple[int, ...]]:
     """Write the group to `folder`; equal arrays and attributes give equal files.
 
     Chunks are lz4 with a CRC-32C of the compressed bytes, so that any Zarr reader refuses a changed
-    chunk. Empty chunks are written, too: a lost chunk never becomes a fill value.
+    chunk. Empty chunks are written, too: a lost chunk never becomes a fill value. A file holds up
+    to `SHARD_CHUNKS` chunks of an array (Zarr's sharding), and is written whole.
 
     Args:
         folder: an empty folder.
@@ -295,7 +322,7 @@ def write_group(
         attributes: the attributes that `layout.attributes` requires.
 
     Returns:
-        The number of files.
+        All files by path, with the sizes of their parts: chunks and index [byte].
 
     Raises:
         InternalError: the arrays or attributes do not match the layout.
@@ -314,23 +341,33 @@ def write_group(
             "attributes": given,
         },
     )
-    files = 1
+    files: dict[str, tuple[int, ...]] = {"zarr.json": ()}
     for name, values in checked.items():
         array = layout.layout(name)
+        chunks, shards = array.chunks(values.shape), array.shards(values.shape)
         stored = group.create_array(
             name,
             shape=values.shape,
-            chunks=array.chunks(values.shape),
+            chunks=chunks,
+            shards=shards if shards != chunks else None,
             dtype=values.dtype,
             fill_value=_fill_value(array),
             dimension_names=array.dims,
-            compressors=[BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()],
+            compressors=[BloscCodec(**CODEC, shuffle="shuffle"), Crc32cCodec()],
             attributes=array.attributes(),
             config={"write_empty_chunks": True},
         )
-        for part in array_parts(array, values.shape):
-            stored[part] = normalize_nans(values[part])
-        files += 1 + stored.nchunks
+        files[f"{name}/zarr.json"] = ()
+        for number, part in enumerate(array_parts(array, values.shape)):
+            place = ["0"] * values.ndim
+            if array.chunk_dim is not None:
+                place[array.dims.index(array.chunk_dim)] = str(number)
+            path = "/".join([name, "c", *place])
+            if shards == chunks:
+                stored[part] = normalize_nans(values[part])
+                files[path] = ()
+            else:
+                files[path] = _write_shard(folder / path, array, values[part], values.shape)
     # If another process has removed files meanwhile, their number reveals it.
     with suppress(FileNotFoundError), warnings.catch_warnings():
         # Zarr warns that other readers may ignore it, as the format allows.
@@ -338,6 +375,48 @@ def write_group(
         # For readers that open the folder themselves: they list it otherwise, and warn.
         zarr.consolidate_metadata(group.store)
     return files
+
+
+def _write_shard(
+    file: Path, array: ArrayLayout, values: NDArray[Any], shape: tuple[int, ...]
+) -> tuple[int, ...]:
+    """Write one file of an array in the format of Zarr's sharding; return the sizes of its parts.
+
+    Zarr itself would hold a file's chunks three times in memory, at twice the time. The file has
+    the chunks in order, each with its CRC-32C, then the index of their places with its CRC-32C.
+
+    Args:
+        file: the file; neither it nor its folder exists.
+        array: layout of the array.
+        values: this file's part of the array.
+        shape: shape of the array.
+    """
+    assert array.chunk_dim is not None
+    axis = array.dims.index(array.chunk_dim)
+    length = array.chunks(shape)[axis]
+    codec = Blosc(**CODEC, shuffle=Blosc.SHUFFLE)
+
+    def encode(first: int) -> bytes:
+        part = (*(slice(None),) * axis, slice(first, first + length))
+        chunk = normalize_nans(values[part])
+        missing = length - chunk.shape[axis]
+        if missing:
+            widths = [(0, missing if dim == axis else 0) for dim in range(values.ndim)]
+            chunk = np.pad(chunk, widths, constant_values=_fill_value(array))
+        coded = bytes(codec.encode(np.ascontiguousarray(chunk)))
+        return coded + int(google_crc32c.value(coded)).to_bytes(4, "little")
+
+    index = np.full((array.shards(shape)[axis] // length, 2), NO_CHUNK, dtype="<u8")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Not in the main thread: there Blosc uses threads of its own, which change the bytes.
+    with file.open("xb") as out, ThreadPoolExecutor(os.cpu_count()) as threads:
+        for number, chunk in enumerate(threads.map(encode, range(0, values.shape[axis], length))):
+            index[number] = out.tell(), len(chunk)
+            out.write(chunk)
+        coded = index.tobytes()
+        out.write(coded + google_crc32c.value(coded).to_bytes(4, "little"))
+    there = index[:, 1][index[:, 0] != NO_CHUNK]
+    return (*there.tolist(), len(coded) + 4)
 
 
 def read_group(files: Store) -> xr.Dataset:

@@ -10,7 +10,7 @@ from data_contracts.pin import Pin
 from data_contracts.review import JournalEntry
 from data_contracts.run import Project, Reservation, RunRecord
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store.blobs import Entry, read_published
+from worldpose.store.blobs import Entry, verify_published
 from worldpose.store.documents import read_checksum, unseal
 from worldpose.store.paths import DAMAGED, MANIFEST, PROJECT, ResultId, damaged_path, is_name
 from worldpose.store.runs import is_run_file
@@ -131,7 +131,7 @@ def _check_result(
         )
     for file in manifest.files:
         try:
-            read_published(store.blobs, result, file)
+            verify_published(store.blobs, result, file)
         except StoreError as error:
             yield Finding(f"{result.path}/{file.path}", str(error), result)
     known = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -70,6 +71,32 @@ class ObjectBlobs:
                 return bytes(obstore.get(self._s3, checked_path(path)).bytes())
             except FileNotFoundError:
                 return None
+
+    def read_range(self, path: str, start: int, stop: int) -> bytes | None:
+        """See `Blobs`."""
+        with self._errors(path):
+            try:
+                return bytes(obstore.get_range(self._s3, checked_path(path), start=start, end=stop))
+            except FileNotFoundError:
+                return None
+            except BaseError:
+                # The service refuses a range beyond the end of an object, which was cut then.
+                if obstore.head(self._s3, checked_path(path))["size"] >= stop:
+                    raise
+                return (self.read(path) or b"")[start:stop]
+
+    def digest(self, path: str) -> tuple[int, str] | None:
+        """See `Blobs`."""
+        size, sha256 = 0, hashlib.sha256()
+        with self._errors(path):
+            try:
+                content = obstore.get(self._s3, checked_path(path))
+            except FileNotFoundError:
+                return None
+            for piece in content.stream():
+                size += len(piece)
+                sha256.update(piece)
+        return size, sha256.hexdigest()
 
     def exists(self, path: str) -> bool:
         """See `Blobs`."""

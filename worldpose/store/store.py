@@ -27,7 +27,7 @@ from worldpose.errors import (
     StoreError,
     UsageError,
 )
-from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, read_published
+from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, verify_published
 from worldpose.store.documents import seal, unseal, unseal_repairable
 from worldpose.store.paths import MANIFEST, PROJECT, ResultId, is_name, registration_path
 from worldpose.store.recipes import STORE_FORMAT, recipe_key
@@ -235,7 +235,7 @@ class Store:
         manifest = self.manifest(match_id, stage, unit, key)
         if verify:
             for file in manifest.files:
-                read_published(self.blobs, result, file)
+                verify_published(self.blobs, result, file)
         data = read_group(PublishedFiles(self.blobs, result, manifest))
         data.attrs.update(match=match_id, unit=unit, key=key)
         return data

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from data_contracts.arrays import GroupLayout
@@ -14,7 +15,7 @@ from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest, StoredFile
 from data_contracts.work import Work
 from worldpose.errors import InternalError, StoreError
-from worldpose.store.blobs import pass_commit_point, storage_errors
+from worldpose.store.blobs import digest_parts, pass_commit_point, storage_errors
 from worldpose.store.documents import canonical_json, digest, record_checksum
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class ResultWriter:
         self.manifest: ResultManifest | None = None
         self._work, self._folder = work, folder
         self._started = time.monotonic()
-        self._files = 0
+        self._files: dict[str, tuple[int, ...]] = {}
 
     def write(
         self,
@@ -97,11 +98,12 @@ class ResultWriter:
                     f"metric {metric} of {name}", f"expected a finite number, found {value}"
                 )
         with storage_errors(str(self._folder)):
-            files = stored_files(self._folder)
-        if len(files) != self._files:
+            files = stored_files(self._folder, self._files)
+        if len(files) != len(self._files):
             raise StoreError(
-                f"{self._folder}: {name} has {self._files} files, but only {len(files)} of them "
-                "exist, so nothing was published. Another program removed the others. Run again."
+                f"{self._folder}: {name} has {len(self._files)} files, but only {len(files)} of "
+                "them exist, so nothing was published. Another program removed the others. Run "
+                "again."
             )
         manifest = ResultManifest(
             contract=CONTRACT_VERSION,
@@ -120,17 +122,28 @@ class ResultWriter:
         return manifest.model_copy(update={"checksum": record_checksum(manifest)})
 
 
-def stored_files(folder: Path) -> tuple[StoredFile, ...]:
-    """Return size and checksum of every file below `folder`, sorted by path."""
+def stored_files(
+    folder: Path, sizes: Mapping[str, Sequence[int]] = MappingProxyType({})
+) -> tuple[StoredFile, ...]:
+    """Return size and checksum of every file below `folder`, sorted by path.
+
+    Args:
+        folder: the folder.
+        sizes: sizes of the parts of files that consist of some [byte], by path.
+    """
     found = []
     for path in folder.rglob("*"):
         if path.is_file():
             data = path.read_bytes()
             name = path.relative_to(folder).as_posix()
-            found.append(StoredFile(path=name, size=len(data), sha256=digest(data)))
+            parts = digest_parts(data, sizes.get(name, ()))
+            found.append(StoredFile(path=name, size=len(data), sha256=digest(data), parts=parts))
     return tuple(sorted(found, key=lambda file: file.path))
 
 
 def content_digest(files: tuple[StoredFile, ...]) -> str:
     """Return a digest that is equal for all valid computations of one key."""
-    return digest(canonical_json([file.model_dump(mode="json") for file in files]))
+    # Without defaults: files of earlier versions have no parts.
+    return digest(
+        canonical_json([file.model_dump(mode="json", exclude_defaults=True) for file in files])
+    )

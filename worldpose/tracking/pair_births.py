@@ -185,14 +185,20 @@ class CameraGates:
         self.usual = np.full(cameras, np.inf)
         self.usual_pair = np.inf
         self._pairs: deque[float] = deque(maxlen=MAX_HISTORY)
-        self._known: list[deque[float]] = [deque(maxlen=MAX_HISTORY) for _ in range(cameras)]
+        self._known = np.full((cameras, MAX_HISTORY), np.nan)
+        self._count = np.zeros(cameras, dtype=np.int64)
 
     def learn(self, distance: Floats) -> None:
         """Add the ray distances (cameras, persons) [m] of a frame's matches; NaN = none."""
         for camera, known in enumerate(self._known):
-            known.extend(distance[camera][np.isfinite(distance[camera])].tolist())
-            if len(known) >= MIN_HISTORY:
-                self.usual[camera] = np.median(known)
+            new = distance[camera][np.isfinite(distance[camera])][-MAX_HISTORY:]
+            known[(self._count[camera] + np.arange(len(new))) % MAX_HISTORY] = new
+            self._count[camera] += len(new)
+        is_full = self._count >= MAX_HISTORY
+        if is_full.any():
+            self.usual[is_full] = np.median(self._known[is_full], axis=1)
+        for camera in np.flatnonzero((self._count >= MIN_HISTORY) & ~is_full).tolist():
+            self.usual[camera] = np.median(self._known[camera, : self._count[camera]])
 
     def learn_pairs(self, distance: Floats) -> None:
         """Add ray distances (pairs,) [m] of detections that are each other's nearest."""

@@ -136,7 +136,8 @@ class Person:
         """Update with the sighting in `frame`; undetermined joints follow the others."""
         self.sightings[frame] = sighting
         gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
-        self.misfit += gain * (float(np.nanmean(sighting.ray_distance)) - self.misfit)
+        known_distances = sighting.ray_distance[~np.isnan(sighting.ray_distance)]
+        self.misfit += gain * (float(known_distances.mean()) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
         pose, shift, known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
         if not known:

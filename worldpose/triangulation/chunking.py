@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Flags, Floats
 from data_contracts.keypoints import KeypointDetections
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, read_frames
@@ -24,6 +25,7 @@ from worldpose.triangulation.passes import (
     DetectorModel,
     Triangulation,
     check_shapes,
+    concatenate_frames,
     learn_detector,
     sample_frames,
     triangulate_joints,
@@ -151,16 +153,22 @@ def reconstruct_chunks(
     parts = [
         slice(first, min(first + length, frames)) for first in range(0, max(1, frames), length)
     ]
-    triangulated = (
-        triangulate_joints(
-            cameras,
-            read_frames(detections, part, model.corrected),
-            settings,
-            camera_covariance,
-            model.detector,
-        )
+    # Halves of chunks, which two threads triangulate.
+    half = LANES * -(-length // (2 * LANES))
+    halves = [
+        slice(first, min(first + half, part.stop))
         for part in parts
-    )
+        for first in range(part.start, max(part.stop, part.start + 1), half)
+    ]
+
+    def read_halves() -> Iterator[KeypointDetections]:
+        for some in halves:
+            yield read_frames(detections, some, model.corrected)
+
+    def triangulate(some: KeypointDetections) -> Triangulation:
+        return triangulate_joints(cameras, some, settings, camera_covariance, model.detector)
+
+    triangulated = _join_halves(parts, halves, map_in_threads(triangulate, read_halves()))
     before, here = None, next(triangulated)
     for part in parts:
         after = next(triangulated, None)
@@ -177,6 +185,21 @@ def reconstruct_chunks(
         yield Chunk(part, here, smooth)
         if after is not None:
             before, here = here, after
+
+
+def _join_halves(
+    parts: list[slice], halves: list[slice], found: Iterator[Triangulation]
+) -> Iterator[Triangulation]:
+    """Yield the triangulation of each chunk from those of its parts of frames.
+
+    Args:
+        parts: frames of each chunk.
+        halves: frames of each part of chunks, in order.
+        found: its triangulation.
+    """
+    for part in parts:
+        own = [next(found) for half in halves if part.start <= half.start < max(part.stop, 1)]
+        yield own[0] if len(own) == 1 else concatenate_frames(own)
 
 
 def _add_margins(

@@ -277,10 +277,11 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
         Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index.
     """
     frames, _, persons = detections.detection_index.shape
-    at = np.maximum(detections.detection_index, 0).astype(np.int64)[..., None]
+    row, camera_row, _ = np.ogrid[:frames, : detections.detection_index.shape[1], :persons]
+    place = row, camera_row, np.maximum(detections.detection_index, 0)
     there = (detections.detection_index >= 0)[..., None]
-    pixels = np.take_along_axis(detections.keypoints, at[..., None], axis=2).astype(np.float64)
-    weights = np.take_along_axis(detections.confidence, at, axis=2).astype(np.float64)
+    pixels = detections.keypoints[place].astype(np.float64, copy=False)
+    weights = detections.confidence[place].astype(np.float64, copy=False)
     weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
     for camera in np.flatnonzero(np.nan_to_num(late)):
         time = np.arange(frames) - late[camera]

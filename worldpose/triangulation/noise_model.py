@@ -205,21 +205,17 @@ def _precision(
     last = len(knots) - 1
     for row in range(len(confidence)):
         for joint in range(len(weight)):
+            # Without branches, which processors predict badly here.
             given = float(confidence[row, joint])
-            if not 0.0 < given < np.inf:
-                out[row, joint] = 0.0
-                continue
             k = 1
-            while k < last and given > knots[k]:
-                k += 1
-            if last == 0:
-                out[row, joint] = values[0] * weight[joint]
-                continue
-            width = knots[k] - knots[k - 1]
+            for knot in range(1, last):
+                k += given > knots[knot]
+            width = knots[k] - knots[k - 1] if last else 0.0
             share = (given - knots[k - 1]) / width if width > 0.0 else 1.0
             share = min(1.0, max(0.0, share))
-            value = values[k - 1] + share * (values[k] - values[k - 1])
-            out[row, joint] = value * weight[joint]
+            value = values[k - 1] + share * (values[min(k, last)] - values[k - 1])
+            there = (given > 0.0) & (given < np.inf)
+            out[row, joint] = value * weight[joint] if there else 0.0
 
 
 BY_JOINT: Final = np.array(

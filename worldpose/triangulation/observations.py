@@ -147,10 +147,11 @@ def observe_person(
         frames: frames to include.
     """
     index = detections.detection_index[frames, :, person]
-    at = np.maximum(index, 0).astype(np.int64)[:, :, None, None]
-    pixels = np.take_along_axis(detections.keypoints[frames], at[..., None], axis=2)[:, :, 0]
-    weights = np.take_along_axis(precision[frames], at, axis=2)[:, :, 0]
-    pixels = pixels - offsets[frames, :, person, None]
+    # Whole rows of joints: `take_along_axis` would index every number, at ten times the time.
+    row, camera = np.ogrid[: index.shape[0], : index.shape[1]]
+    place = row, camera, np.maximum(index, 0)
+    pixels = detections.keypoints[frames][place] - offsets[frames, :, person, None]
+    weights = precision[frames][place]
     weights = np.where((index >= 0)[..., None], weights, np.nan)
     return PersonTrack(
         pixels=np.ascontiguousarray(pixels.transpose(2, 1, 0, 3)),

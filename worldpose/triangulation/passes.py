@@ -6,8 +6,11 @@ calibration's share, offsets of people. The next pass uses it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import reduce
+from operator import add
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +115,28 @@ class Triangulation:
     def report(self) -> TriangulationReport:
         """The metrics of these frames."""
         return self.agreement.report(self.noise.factor)
+
+
+BY_FRAME: Final = (
+    "joints",
+    "covariance",
+    "views",
+    "spread",
+    "reprojection_error",
+    "inliers",
+    "exchanged",
+    "offsets",
+    "calibration_covariance",
+)
+"""Attributes of `Triangulation` with a dimension of frames."""
+
+
+def concatenate_frames(parts: Sequence[Triangulation]) -> Triangulation:
+    """Return the triangulation of consecutive parts of a clip, which have one model."""
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in BY_FRAME
+    }
+    return replace(parts[0], **arrays, agreement=reduce(add, (part.agreement for part in parts)))
 
 
 def triangulate_joints(

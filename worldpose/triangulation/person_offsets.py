@@ -107,7 +107,7 @@ def stated_errors(
         by_focal = (seen.d_intrinsics[..., :2] * cameras.focal[camera]).sum(-1, keepdims=True)
         steps = (seen.d_pose, by_focal, seen.d_intrinsics[..., 2:], seen.d_distortion[..., RADIAL])
         jacobian = np.concatenate(steps, axis=-1)
-        spread = np.einsum("nap,pq,naq->n", jacobian, camera_covariance[camera], jacobian) / 2.0
+        spread = ((jacobian @ camera_covariance[camera]) * jacobian).sum(axis=(-2, -1)) / 2.0
         variance[:, camera][before] = np.where(np.isfinite(spread), spread, 0.0)
     return StatedErrors(variance, scale)
 
@@ -287,7 +287,8 @@ def _body_offsets(
             for c in range(count):
                 if slot[c] >= 0:
                     h[slot[c], slot[c]] = h[slot[c] + 1, slot[c] + 1] = 1.0 / prior[t, c, n]
-            w, moves = np.zeros((size, 3)), np.zeros((joint_count, size, 3))
+            # Rows of `moves` follow each other in memory, so that inner loops are vector code.
+            w, moves = np.zeros((3, size)), np.zeros((joint_count, 3, size))
             for j in range(joint_count):
                 if not math.isfinite(joints[t, n, j, 0]):
                     continue
@@ -309,9 +310,9 @@ def _body_offsets(
                         o = (A if axis == 0 else B) + j
                         a, b, d = tile[o], tile[o + LANES], tile[o + 2 * LANES]
                         e = (a * x + b * y + d * z + tile[o + 3 * LANES]) * inverse
-                        w[at + axis, 0] = weight * (a - e * p[0]) * inverse
-                        w[at + axis, 1] = weight * (b - e * p[1]) * inverse
-                        w[at + axis, 2] = weight * (d - e * p[2]) * inverse
+                        w[0, at + axis] = weight * (a - e * p[0]) * inverse
+                        w[1, at + axis] = weight * (b - e * p[1]) * inverse
+                        w[2, at + axis] = weight * (d - e * p[2]) * inverse
                         h[at + axis, at + axis] += weight
                         # The errors are projection less observation: the offset's sign flips.
                         right[at + axis] -= weight * e
@@ -324,17 +325,16 @@ def _body_offsets(
                 zz = state[MATRIX + 5 * LANES + j]
                 both = moves[j]
                 for i in range(size):
-                    u, v, q = w[i, 0], w[i, 1], w[i, 2]
-                    both[i, 0] = u * xx + v * xy + q * xz
-                    both[i, 1] = u * xy + v * yy + q * yz
-                    both[i, 2] = u * xz + v * yz + q * zz
+                    u, v, q = w[0, i], w[1, i], w[2, i]
+                    both[0, i] = u * xx + v * xy + q * xz
+                    both[1, i] = u * xy + v * yy + q * yz
+                    both[2, i] = u * xz + v * yz + q * zz
                     for k in range(3):
-                        right[i] -= both[i, k] * state[RIGHT + k * LANES + j]
+                        right[i] -= both[k, i] * state[RIGHT + k * LANES + j]
                 for i in range(size):
+                    u, v, q = both[0, i], both[1, i], both[2, i]
                     for k in range(size):
-                        h[i, k] -= (
-                            both[i, 0] * w[k, 0] + both[i, 1] * w[k, 1] + both[i, 2] * w[k, 2]
-                        )
+                        h[i, k] -= u * w[0, k] + v * w[1, k] + q * w[2, k]
             covariance = np.linalg.inv(h)
             for c in range(count):
                 at = slot[c]
@@ -346,5 +346,11 @@ def _body_offsets(
                         total += covariance[at + axis, k] * right[k]
                     offsets[t, c, n, axis] = total
                 variance[t, c, n] = 0.5 * (covariance[at, at] + covariance[at + 1, at + 1])
-            for j in range(joint_count if len(further) else 0):
-                further[t, n, j] = moves[j].T @ (covariance @ moves[j])
+            if len(further):
+                rows = moves.reshape(3 * joint_count, size)
+                spread = rows @ covariance
+                for j in range(joint_count):
+                    for i in range(3):
+                        for k in range(i + 1):
+                            total = (rows[3 * j + i] * spread[3 * j + k]).sum()
+                            further[t, n, j, i, k] = further[t, n, j, k, i] = total

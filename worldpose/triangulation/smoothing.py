@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
-from worldpose.compiled import compile_kernel
+from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.geometry import Camera, projection
 from worldpose.triangulation.batched_gauss_newton import (
     LANES,
@@ -461,9 +461,11 @@ def smooth_joints(
     penalty = (fps**2 / motion.acceleration) ** 2
     gap = round(settings.max_filled_gap_s * fps)
     limit = settings.max_deviation**2
-    for person in range(raw.joints.shape[1]):
+    repeated = motion.repeated
+
+    def smooth_person(person: int) -> None:
         track = observe_person(detections, precision, raw.offsets, raw.joints, person)
-        weights = track.precision / motion.repeated
+        weights = track.precision / repeated
         for joint in range(raw.joints.shape[2]):
             given = raw.joints[:, person, joint]
             costs = TrackCosts(settings.noise, limit, float(penalty[joint]))
@@ -478,6 +480,9 @@ def smooth_joints(
                     if good
                     else raw.covariance[part, person, joint]
                 )
+
+    for _ in map_in_threads(smooth_person, range(raw.joints.shape[1])):
+        pass
     joints, covariance, given = joints[core], covariance[core], raw.joints[core]
     there, triangulated = np.isfinite(joints[..., 0]), np.isfinite(given[..., 0])
     filled = there & ~triangulated

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from store_samples import SMALL_CHUNK
+from store_samples import SMALL_CHUNK, SMALL_SHARD
 
 import data_contracts.arrays
 from worldpose.store import Store
@@ -35,6 +35,7 @@ def folder_store(tmp_path: Path) -> Store:
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setattr(data_contracts.arrays, "CHUNK_BYTES", SMALL_CHUNK)
+    monkeypatch.setattr(data_contracts.arrays, "SHARD_CHUNKS", SMALL_SHARD)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     yield
     install_fault_hook(None)

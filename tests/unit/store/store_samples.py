@@ -20,8 +20,9 @@ from worldpose.store import ResultWriter, Store, recipe_key
 from worldpose.store.blobs import install_fault_hook
 
 FRAMES, PERSONS = 40, 3
-SMALL_CHUNK = 1024
-"""[byte] Cuts the sample's joints into several chunks; real chunks are 1 MiB and more."""
+SMALL_CHUNK, SMALL_SHARD = 512, 2
+"""[byte] and chunks per file: cuts the sample's joints into several chunks and files; real chunks
+are 1 MiB and more."""
 
 LAYOUT = GroupLayout(
     stage="tracking",
@@ -223,6 +224,7 @@ def _with_environment(
     os.environ.update(environment)
     tempfile.tempdir = temporary
     data_contracts.arrays.CHUNK_BYTES = SMALL_CHUNK
+    data_contracts.arrays.SHARD_CHUNKS = SMALL_SHARD
     target(*arguments)
 
 

@@ -14,6 +14,8 @@ import pytest
 from store_comparison import compare_stores
 from store_samples import (
     FRAMES,
+    SMALL_CHUNK,
+    SMALL_SHARD,
     place,
     publish,
     run_and_die,
@@ -33,7 +35,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """The project that an undisturbed run leaves."""
     with pytest.MonkeyPatch.context() as patch:
         # A module's fixture is made before a test's: the chunks must be the same small ones.
-        patch.setattr("data_contracts.arrays.CHUNK_BYTES", 1024)
+        patch.setattr("data_contracts.arrays.CHUNK_BYTES", SMALL_CHUNK)
+        patch.setattr("data_contracts.arrays.SHARD_CHUNKS", SMALL_SHARD)
         store = Store.create(tmp_path_factory.mktemp("undisturbed"))
         run_once(store)
         yield store

@@ -87,14 +87,20 @@ def test_array_says_what_it_is_without_the_library(tmp_path: Path) -> None:
     assert np.isnan(joints.fill_value)
     assert group["detection_index"].fill_value == -1  # type: ignore[union-attr]
     assert group.attrs["labels"] == {"coordinate": ["x", "y", "z"]}
-    codecs = [codec["name"] for codec in joints.metadata.to_dict()["codecs"]]  # type: ignore[index,union-attr,call-overload]
+    (sharding,) = joints.metadata.to_dict()["codecs"]  # type: ignore[misc]
+    assert sharding["name"] == "sharding_indexed"  # type: ignore[index,call-overload]
+    of_file = sharding["configuration"]  # type: ignore[index,call-overload]
+    assert [codec["name"] for codec in of_file["codecs"]] == ["bytes", "blosc", "crc32c"]  # type: ignore[index,call-overload,union-attr]
+    assert [codec["name"] for codec in of_file["index_codecs"]] == ["bytes", "crc32c"]  # type: ignore[index,call-overload,union-attr]
+    codecs = [codec["name"] for codec in group["detection_index"].metadata.to_dict()["codecs"]]  # type: ignore[index,union-attr,call-overload]
     assert codecs == ["bytes", "blosc", "crc32c"]
 
 
 @pytest.fixture
 def long_layout(monkeypatch: pytest.MonkeyPatch) -> GroupLayout:
-    """One float array, cut along its second dimension: 100 rows are 50 chunks and four parts."""
+    """One float array, cut along its second dimension: 100 rows are 50 chunks and four files."""
     monkeypatch.setattr("data_contracts.arrays.CHUNK_BYTES", 2 * 3 * 8)
+    monkeypatch.setattr("data_contracts.arrays.SHARD_CHUNKS", 16)
     array = ArrayLayout(
         name="x",
         dims=("a", "b"),
@@ -107,17 +113,36 @@ def long_layout(monkeypatch: pytest.MonkeyPatch) -> GroupLayout:
     return GroupLayout(stage="any", about="any", arrays=(array,))
 
 
-def test_array_of_many_parts_is_stored_as_in_one_piece(
-    tmp_path: Path, long_layout: GroupLayout, monkeypatch: pytest.MonkeyPatch
+def test_array_of_many_files_reads_as_one_that_zarr_wrote(
+    tmp_path: Path, long_layout: GroupLayout
 ) -> None:
-    values = np.random.default_rng(0).normal(size=(3, 100))
+    values = np.random.default_rng(0).normal(size=(3, 101))
     values[1, ::7] = np.nan
-    write_group(tmp_path / "parts", long_layout, {"x": values}, {}, {})
-    monkeypatch.setattr("worldpose.store.groups.PART_CHUNKS", 100)
-    write_group(tmp_path / "whole", long_layout, {"x": values}, {}, {})
-    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
-    stored = zarr.open_group(tmp_path / "parts", mode="r")["x"]
-    np.testing.assert_array_equal(stored[...], values)  # type: ignore[index]
+    files = write_group(tmp_path / "ours", long_layout, {"x": values}, {}, {})
+    group = zarr.open_group(tmp_path / "ours", mode="r")
+    stored = group["x"]
+    assert isinstance(stored, zarr.Array)
+    assert (stored.chunks, stored.shards) == ((3, 2), (3, 26))
+    assert sorted(files) == ["x/c/0/0", "x/c/0/1", "x/c/0/2", "x/c/0/3", "x/zarr.json", "zarr.json"]
+    assert sorted(files) == sorted(contents(tmp_path / "ours"))
+    np.testing.assert_array_equal(stored[...], values)
+    for first, last in ((0, 1), (25, 27), (51, 80), (100, 101)):
+        np.testing.assert_array_equal(stored[:, first:last], values[:, first:last])  # type: ignore[index]
+    theirs = zarr.create_array(
+        tmp_path / "theirs",
+        shape=values.shape,
+        chunks=(3, 2),
+        shards=(3, 26),
+        dtype="f8",
+        fill_value=np.nan,
+        compressors=stored.compressors,
+    )
+    theirs[...] = values
+    for number in range(4):
+        ours = (tmp_path / "ours" / "x" / "c" / "0" / str(number)).read_bytes()
+        # Zarr also writes the chunks of the last file that lie beyond the array.
+        if number < 3:
+            assert ours == (tmp_path / "theirs" / "c" / "0" / str(number)).read_bytes()
 
 
 def test_wrong_values_of_all_parts_are_counted_and_nothing_is_written(

@@ -40,6 +40,7 @@ from worldpose.errors import (
 from worldpose.store import ResultId, Store, verify
 from worldpose.store.documents import canonical_json, digest
 from worldpose.store.paths import MANIFEST, PROJECT
+from worldpose.store.writer import content_digest
 
 
 def test_result_comes_back_with_labels_units_and_conventions(store: Store) -> None:
@@ -70,8 +71,13 @@ def test_result_is_cut_into_chunks_that_are_all_there(store: Store) -> None:
     manifest = publish(store).manifest
     assert manifest is not None
     chunks = [file.path for file in manifest.files if file.path.startswith("joints/c/")]
-    # 40 frames of 72 bytes in chunks of at least 1024 bytes: 15 frames each.
+    # 40 frames of 72 bytes in chunks of at least 512 bytes: 8 frames each, two chunks in a file.
     assert chunks == ["joints/c/0/0/0", "joints/c/1/0/0", "joints/c/2/0/0"]
+    files = {file.path: file for file in manifest.files}
+    # The chunks, and the index of two chunks with its checksum; the last file has one chunk.
+    assert [len(files[name].parts) for name in chunks] == [3, 3, 2]
+    assert all(files[name].parts[-1][0] == 2 * 16 + 4 for name in chunks)
+    assert all(sum(size for size, _ in files[name].parts) == files[name].size for name in chunks)
     # All zero, and written nevertheless.
     assert "views/c/0" in {file.path for file in manifest.files}
 
@@ -194,6 +200,44 @@ def test_lost_chunk_is_corruption_and_never_a_fill_value(store: Store) -> None:
         data.joints[15:20].load()
     with pytest.raises(CorruptionError, match="joints/c/1/0/0"):
         store.open_result(*place(), verify=True)
+
+
+def test_change_of_one_chunk_of_a_file_is_found_when_that_chunk_is_read(store: Store) -> None:
+    manifest = publish(store).manifest
+    assert manifest is not None
+    (file,) = (file for file in manifest.files if file.path == "joints/c/1/0/0")
+    path = f"{ResultId(*place()).path}/{file.path}"
+    data = store.blobs.read(path)
+    assert data is not None
+    second = file.parts[0][0]  # frames 24 to 31
+    changed = data[:second] + bytes([data[second] ^ 1]) + data[second + 1 :]
+    cut = data[: second + 5] + data[-file.parts[-1][0] :]
+    for now in (changed, data[:-1], data[:second], cut, b""):
+        store.blobs.put(path, now)
+        with pytest.raises(CorruptionError, match=rf"{path} has changed since its publication"):
+            store.open_result(*place()).joints[24:32].load()
+        with pytest.raises(CorruptionError, match=rf"{path} has changed since its publication"):
+            store.open_result(*place(), verify=True)
+    store.blobs.put(path, changed)
+    np.testing.assert_array_equal(
+        store.open_result(*place()).joints[16:24], sample_arrays()["joints"][16:24]
+    )
+
+
+def test_manifest_of_an_earlier_version_names_no_parts_and_reads_the_same(store: Store) -> None:
+    manifest = publish(store).manifest
+    assert manifest is not None
+    files = tuple(file.model_copy(update={"parts": ()}) for file in manifest.files)
+    earlier = manifest.model_copy(update={"files": files, "content": content_digest(files)})
+    fields = earlier.model_dump(mode="json", exclude_defaults=True, exclude={"checksum"})
+    checksum = digest(canonical_json(fields))
+    document = canonical_json({**fields, "checksum": checksum}) + b"\n"
+    assert b"parts" not in document
+    store.blobs.put(ResultId(*place()).manifest_path, document)
+    assert verify(store) == ()
+    np.testing.assert_array_equal(
+        store.open_result(*place()).joints[20:30], sample_arrays()["joints"][20:30]
+    )
 
 
 def test_flipped_bit_is_named_when_it_is_read(store: Store) -> None:
