@@ -251,8 +251,9 @@ def _fit_to_video(
     # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
     middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
     notes.append(
-        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are "
-        "{} x {}: ".format(*camera.image_size)
+        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
+            *camera.image_size
+        )
         + f"the calibration is scaled by {scale:.5f}"
         + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
     )

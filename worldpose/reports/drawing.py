@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
-from typing import Final
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,8 +17,15 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
+from worldpose.errors import UsageError
+from worldpose.formats.files import whole_file
 from worldpose.pitch import PitchTemplate
 
+if TYPE_CHECKING:
+    from worldpose.triangulation.synchronization import Synchronization
+
+PLOTS: Final = (".svg", ".pdf", ".png")
+"""Forms of a plot."""
 PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
 """One colour per person, after Okabe and Ito: distinguishable with any colour vision."""
 
@@ -102,3 +111,43 @@ def png(figure: Figure) -> bytes:
         picture, metadata={"Software": None}, pil_kwargs={"compress_level": 1}
     )
     return picture.getvalue()
+
+
+def draw_synchronization(found: Synchronization, names: Sequence[str], path: Path) -> None:
+    """Write a plot of each camera's matches by its clock offset, as SVG, PDF or PNG.
+
+    Args:
+        found: the offsets.
+        names: of the cameras.
+        path: file to write; its suffix is the form.
+
+    Raises:
+        UsageError: another suffix.
+    """
+    if path.suffix.lower() not in PLOTS:
+        raise UsageError(
+            str(path),
+            expected=f"a file name that ends with {', '.join(PLOTS)}",
+            found=repr(path.suffix),
+            todo="Rename it.",
+        )
+    figure = Figure(figsize=(7.0, 1.3 * len(names) + 0.8), layout="constrained")
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, name, matches, late, std, reason in zip(
+        panels, names, found.matches, found.late, found.std, found.reasons, strict=True
+    ):
+        panel.set_ylabel(name)
+        panel.grid(color=LINE, linewidth=0.5)
+        panel.plot(found.shifts, matches, color=PALETTE[0], linewidth=1.2)
+        if np.isfinite(late):
+            panel.axvline(late, color=PALETTE[1], linewidth=1.2)
+            panel.axvspan(late - 2.0 * std, late + 2.0 * std, color=PALETTE[1], alpha=0.25)
+            panel.set_title(f"{late:+.2f} frames, standard deviation {std:.2f}", fontsize=8)
+        else:
+            panel.set_title(reason, fontsize=8)
+    panels[-1].set_xlabel("later than the median camera [frames]")
+    figure.supylabel(
+        "people who meet those of other cameras, above usual [1 per frame]", fontsize=8
+    )
+    with whole_file(path) as draft:
+        figure.savefig(draft, format=path.suffix[1:].lower())
