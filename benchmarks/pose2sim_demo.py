@@ -21,6 +21,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,12 @@ from numpy.typing import NDArray
 
 import worldpose
 from data_contracts.conventions import COCO17
+from flows.results.best_results import static_cameras
 from worldpose.formats import read_joints
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.geometry import Camera
+from worldpose.ingest import read_match
 
 LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
 """Upper arms, forearms, thighs and shanks in COCO-17."""
@@ -175,6 +178,14 @@ def score(
     )
 
 
+def distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return the median distance of two people's joints [m]; infinite if never seen together."""
+    frames = min(len(one), len(other))
+    off = np.linalg.norm(one[:frames] - other[:frames], axis=-1)
+    off = off[np.isfinite(off)]
+    return float(np.median(off)) if len(off) else np.inf
+
+
 def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
     """Print the table of one demo."""
     demo, several = tool / "Pose2Sim" / f"Demo_{name}", name == "MultiPerson"
@@ -220,14 +231,15 @@ def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
         cameras = asked
         if stage != "triangulation":
             run = worldpose.open_run(str(project), match.name)
-            adjusted = run["bundle_adjustment/cameras"]
-            cameras = worldpose.geometry.cameras.camera_from_arrays(adjusted.data_vars)
+            # A camera that contradicts the others is left out, and scored as given.
+            best = static_cameras(run, read_match(match).spec)
+            cameras = Camera.stack([best.get(name, given[name]) for name in given])
         methods[label] = (list(np.moveaxis(whole, 1, 0)), cameras)
     print(f"\n{name}: median and 90 % distance to 2D poses [px], missing joints [%], limbs [mm]")
+    first = next(iter(methods.values()))[0]
     for label, (people, cameras) in methods.items():
-        long = sorted(people, key=lambda one: -np.isfinite(one).sum())[: 2 if several else None]
-        main = long if several else long[:1]
-        for number, one in enumerate(main):
+        for number, other in enumerate(first):
+            one = min(people, key=partial(distance, other))
             median, high, missing, limbs = score(one, cameras, seen)
             print(
                 f"{label:38s} person {number} of {len(people)} "

@@ -33,6 +33,9 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run, Store
 
+FRACTION = 0.1
+"""Remaining offset that is worth a correction [frame]."""
+
 
 class Proposal(NamedTuple):
     """The clock offset of a camera, as stated and as found."""
@@ -80,25 +83,28 @@ def synchronize(
 
     Example: worldpose synchronize matches/lab --plot clocks.svg --apply
     """
+    from worldpose.reports.drawing import draw_synchronization, require_plot
     from worldpose.triangulation.synchronization import synchronize as estimate
 
+    if plot is not None:
+        require_plot(plot)
     store = Store.open_or_new(project)
     with progress(verbose=False):
         opened = find_match(store, match)
+        spec = opened.folder.spec
+        chosen = clip or max(spec.clips, key=lambda each: each.frame_count).id
+        if chosen not in {each.id for each in spec.clips}:
+            raise UsageError(
+                f"--clip {chosen}",
+                expected=f"a clip of the match: {', '.join(each.id for each in spec.clips)}",
+                found=repr(chosen),
+                todo="Correct the name.",
+            )
         require_no_other_run(store, opened.match_id)
         latest = latest_run(store, opened.match_id)
         settings = {} if latest is None else _until_detection(latest)
         request = RunRequest(settings, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
-    spec = opened.folder.spec
-    chosen = clip or max(spec.clips, key=lambda each: each.frame_count).id
-    if chosen not in {each.id for each in spec.clips}:
-        raise UsageError(
-            f"--clip {chosen}",
-            expected=f"a clip of the match: {', '.join(each.id for each in spec.clips)}",
-            found=repr(chosen),
-            todo="Correct the name.",
-        )
     cameras, names, detections = _load_clip(Run(store, record), opened, chosen)
     pitch = opened.folder.pitch
     found = estimate(
@@ -122,8 +128,6 @@ def synchronize(
         for c, name in enumerate(names)
     ]
     if plot is not None:
-        from worldpose.reports.drawing import draw_synchronization
-
         draw_synchronization(found, names, plot)
     changed = {row.camera: row.proposed for row in rows if row.proposed != row.stated}
     if apply and changed:
@@ -205,8 +209,12 @@ def _print(
         line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
     else:
         line("Add --apply to write the proposed offsets into match.yaml.")
-    rest = [row for row in rows if row.found is not None and row.std is not None]
-    if any(abs(row.found - row.proposed) > 3.0 * row.std for row in rest if row.found and row.std):
+    if any(
+        row.found is not None
+        and row.std is not None
+        and abs(row.found - row.proposed) > max(FRACTION, 3.0 * row.std)
+        for row in rows
+    ):
         line(
             "The fraction of a frame remains; worldpose run --set "
             "triangulation.correct_clocks=true corrects it."

@@ -61,11 +61,13 @@ LIKELY: Final = 2.0
 """A shift is excluded if it is worse than the best by this many standard errors."""
 MIN_CONTRAST: Final = 3.0
 """Least peak of a camera's matches above the median shift, in standard errors [1]."""
-MAX_SPAN: Final = 15
+MAX_SPAN: Final = 30
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
-MAX_ERROR: Final = 0.5
+MAX_ERROR: Final = 0.2
 """Largest standard error of a determined offset [frame]."""
+MAX_PLACE_ERROR: Final = 0.5
+"""The same by places on the pitch, which are less accurate [frame]."""
 ROUNDS: Final = 6
 """Most rounds of whole and remaining offsets."""
 RUNNING_M_S: Final = 1.0
@@ -154,7 +156,7 @@ def synchronize(
             cameras[chosen], detections, fps, chosen, whole[chosen], pitch
         )
         known &= std <= MAX_ERROR
-        known &= np.abs(late - whole) <= span + 1.0
+        known &= np.abs(late - whole) <= MAX_SPAN
     for camera in np.flatnonzero(~known & np.isfinite(span)):
         reasons[camera] = "its people move too little"
     std[~known] = np.inf
@@ -195,7 +197,7 @@ def _compare_places(
         seen = np.isfinite(velocity[..., 0]).any(axis=0)
         speed = np.sqrt(np.nanmean((velocity[:, seen] ** 2).sum(axis=-1), axis=0))
         runs[camera] = (speed > RUNNING_M_S).sum() >= MIN_RUNNERS
-    known = runs & (clocks.std * fps <= MAX_ERROR)
+    known = runs & (clocks.std * fps <= MAX_PLACE_ERROR)
     if np.count_nonzero(known) < 2:
         known[:] = False
     return clocks.seconds * fps, np.where(known, clocks.std * fps, np.inf)
