@@ -105,7 +105,7 @@ def synchronize(
         settings = {} if latest is None else _until_detection(latest)
         request = RunRequest(settings, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
-    cameras, names, detections = _load_clip(Run(store, record), opened, chosen)
+    cameras, names, detections = load_clip(Run(store, record), opened, chosen)
     pitch = opened.folder.pitch
     found = estimate(
         cameras,
@@ -153,7 +153,7 @@ def _until_detection(latest: RunRecord) -> Overrides:
     return {name: given for name, given in latest.overrides.items() if name in stages}
 
 
-def _load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:
+def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:
     """Return the calibrated cameras, their names, and their detections in a clip.
 
     Raises:

@@ -19,12 +19,14 @@ MIN_CORNERS: Final = 8
 MAX_BEND: Final = 0.25
 """Largest mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
 that were counted wrongly are off by whole squares."""
-OUTLIER: Final = 4.0
-"""An image whose residual is larger than the median image's by this factor is left out [1]."""
+OUTLIER: Final = 2.0
+"""The worst image is left out if the residual is larger with it by this factor [1]."""
 MIN_RESIDUAL_PX: Final = 0.3
 """Residual up to which no image is left out [px]."""
 SAME_VIEW: Final = 0.02
 """Views of a video whose corners moved by less than this share of the image width are one [1]."""
+SUBPIXEL_WINDOW: Final = 5
+"""Half the side of the window in which a corner of a ChArUco board is refined [px]."""
 MAX_FOCAL_STD: Final = 0.05
 """Largest relative deviation of the focal length [1]; boards that all face the camera do not tell
 it."""
@@ -52,7 +54,9 @@ class Board:
         """Return the corners of the board in an image (height, width[, 3]); None without one."""
         import cv2  # late: it takes 0.2 s, and few commands need it
 
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(
+            image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8
+        )
         if self.dictionary is not None:
             return self._find_charuco(grey)
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -70,6 +74,10 @@ class Board:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
             return None
+        # The detector interpolates corners between markers.
+        window = (SUBPIXEL_WINDOW, SUBPIXEL_WINDOW)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
+        corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
         places = np.asarray(board.getChessboardCorners())[ids.ravel(), :2]
         return BoardView(places.astype(np.float64), corners.reshape(-1, 2).astype(np.float64))
 
@@ -154,7 +162,7 @@ class LensFit:
     @property
     def rms_px(self) -> float:
         """Root mean square distance of a corner from its projection [px]."""
-        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+        return _rms(self.residuals)
 
 
 def calibrate_lens(
@@ -190,9 +198,12 @@ def calibrate_lens(
             )
         kept = [view for view in (views[n] for n in chosen) if view is not None]
         numbers, residuals = _solve(kept, size)
-        error = np.array([np.sqrt((each**2).sum(axis=1).mean()) for each in residuals])
+        error = np.array([_rms(each) for each in residuals])
         worst = int(error.argmax())
-        if error[worst] <= max(MIN_RESIDUAL_PX, OUTLIER * float(np.median(error))):
+        if error[worst] <= MIN_RESIDUAL_PX or len(kept) == MIN_VIEWS:
+            break
+        others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
+        if _rms(np.concatenate(residuals)) <= OUTLIER * _rms(np.concatenate(others)):
             break
         reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
     left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
@@ -236,6 +247,11 @@ LEAST_STD_PX: Final = 0.1
 """Least stated deviation of focal length and principal point [px]."""
 LEAST_DISTORTION_STD: Final = 1e-4
 """The same of the corner's displacement [1]."""
+
+
+def _rms(residuals: Floats) -> float:
+    """Return the root mean square length of residuals (n, 2) [px]."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def _solve(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[Floats, list[Floats]]:

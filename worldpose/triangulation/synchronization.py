@@ -64,8 +64,8 @@ MIN_CONTRAST: Final = 3.0
 MAX_SPAN: Final = 30
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
-MAX_ERROR: Final = 0.2
-"""Largest standard error of a determined offset [frame]."""
+MAX_ERROR: Final = 0.25
+"""Largest standard error of a determined offset [frame]: twice of it is half a frame."""
 MAX_PLACE_ERROR: Final = 0.5
 """The same by places on the pitch, which are less accurate [frame]."""
 ROUNDS: Final = 6
