@@ -27,6 +27,8 @@ GROUPS: Final = {
         "import": "matches:import_command",
         "clips": "programme:clips",
         "ingest": "matches:ingest",
+        "calibrate": "calibrate:calibrate",
+        "synchronize": "synchronize:synchronize",
     },
     "Process matches": {
         "run": "run:run",

@@ -121,6 +121,7 @@ class Comparison:
         keypoints: Floats,
         ground: bool,
         settings: ConsistencySettings,
+        joint_noise: float = JOINT_NOISES[-1],
     ) -> None:
         """Sample frames and convert their detections to rays.
 
@@ -130,6 +131,7 @@ class Comparison:
             keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
             ground: whether people stand on z = 0.
             settings: frames and noise.
+            joint_noise: standard deviation of a detector's joint on the body [m].
         """
         self.cameras = cameras
         self.count = int(cameras.batch_shape[0])
@@ -142,7 +144,7 @@ class Comparison:
         self._everywhere = places
         self._ground = ground
         self._heights = HEIGHTS if ground else (-math.inf, math.inf)
-        self._joint_noise = JOINT_NOISES[-1]
+        self._joint_noise = joint_noise
         self._pixel_noise = pixel_noise
         self._keypoints = [_pack(keypoints[:, c]) for c in range(self.count)]
         self.views = [self.view(c, STATED) for c in range(self.count)]

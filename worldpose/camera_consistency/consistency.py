@@ -63,7 +63,7 @@ def check_consistency(
             todo="Give arrays of the same clip and cameras.",
         )
     count = int(cameras.batch_shape[0])
-    part = _select_busiest_frames(confidence, settings.max_chunk_frames)
+    part = select_busiest_frames(confidence, settings.max_chunk_frames)
     points = np.array(keypoints[part], dtype=np.float64)
     points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
     if count < 2 or not len(points):
@@ -83,7 +83,7 @@ def check_consistency(
     return Diagnosis(comparison, fps, given, tilt, focal_error).run()
 
 
-def _select_busiest_frames(confidence: ClipArray, longest: int) -> slice:
+def select_busiest_frames(confidence: ClipArray, longest: int) -> slice:
     """Return the chunk of frames, of at most `longest`, with the most detections."""
     frames = confidence.shape[0]
     if frames <= longest:

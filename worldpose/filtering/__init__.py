@@ -10,6 +10,7 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.filtering.judging import (
+        BodyViews,
         HeldOut,
         Judgement,
         Spread,
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
         judge_detections,
         learn_keypoint_spread,
         measure_held_out,
+        perceived_covariance,
+        view_bodies,
     )
     from worldpose.filtering.settings import FilteringSettings
     from worldpose.filtering.systematic_errors import (
@@ -25,11 +28,6 @@ if TYPE_CHECKING:
         ViewBias,
         learn_systematic_errors,
         watch_motion,
-    )
-    from worldpose.filtering.views import (
-        BodyViews,
-        perceived_covariance,
-        view_bodies,
     )
 
 __all__ = [
@@ -55,6 +53,9 @@ __getattr__ = import_on_use(
     __name__,
     {
         "worldpose.filtering.judging": (
+            "BodyViews",
+            "perceived_covariance",
+            "view_bodies",
             "HeldOut",
             "measure_held_out",
             "Judgement",
@@ -70,11 +71,6 @@ __getattr__ = import_on_use(
             "ViewBias",
             "learn_systematic_errors",
             "watch_motion",
-        ),
-        "worldpose.filtering.views": (
-            "BodyViews",
-            "perceived_covariance",
-            "view_bodies",
         ),
     },
 )

@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.body_fitting.objective import body_axes
 from worldpose.filtering.judging import (
+    BodyViews,
+    Places,
+    Residuals,
     TriangulatedDetections,
     body_residuals,
     judge_detections,
     learn_keypoint_spread,
 )
 from worldpose.filtering.settings import FilteringSettings
-from worldpose.filtering.views import BodyViews, Places, Residuals
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import by_step
 

@@ -6,8 +6,12 @@ import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
@@ -19,7 +23,12 @@ from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import write_match
-from worldpose.video import FrameIndex, index_frames
+from worldpose.video import FrameIndex, VideoReader, index_frames
+
+SAME_SHAPE: Final = 0.002
+"""Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
+BLACK: Final = 16.0
+"""Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
 def import_match(
@@ -209,13 +218,68 @@ def _index_video(file: Path, camera: CameraCalibration) -> FrameIndex:
     """Return the frames of a camera's video, which has the size in the calibration."""
     index = index_frames(file)
     if index.size != camera.image_size:
-        raise InputError(
-            str(file),
-            expected="{} x {} px, the size in the calibration".format(*camera.image_size),
-            found=f"{index.size[0]} x {index.size[1]}",
-            todo="Give the video that was calibrated, in its size.",
-        )
+        raise _wrong_size(file, camera, index)
     return index
+
+
+def _wrong_size(file: Path, camera: CameraCalibration, index: FrameIndex) -> InputError:
+    return InputError(
+        str(file),
+        expected="{} x {} px, the size in the calibration".format(*camera.image_size),
+        found=f"{index.size[0]} x {index.size[1]}",
+        todo="Give the video that was calibrated, in its size: a crop has another principal point.",
+    )
+
+
+def _fit_to_video(
+    file: Path, camera: CameraCalibration, index: FrameIndex, notes: list[str]
+) -> CameraCalibration:
+    """Return a camera in the pixels of its video, which may be resized, or have black bars.
+
+    Raises:
+        InputError: the video is neither what was calibrated nor the same picture resized.
+    """
+    if index.size == camera.image_size:
+        return camera
+    own, shown = np.array(camera.image_size), np.array(index.size)
+    scale = float((shown / own).min())
+    bar = 0.5 * (shown - scale * own)
+    if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
+        with VideoReader(file, index) as video:
+            if not _has_black_bars(video.frame(0), bar):
+                raise _wrong_size(file, camera, index)
+    # Pixel centres are whole numbers, so that the picture's corner is at -0.5.
+    middle = (np.array(camera.principal_point_px) + 0.5) * scale - 0.5 + bar
+    notes.append(
+        f"{file.name}: {index.size[0]} x {index.size[1]} px, calibrated are {{}} x {{}}: ".format(
+            *camera.image_size
+        )
+        + f"the calibration is scaled by {scale:.5f}"
+        + (f", with black bars of {bar.max():.1f} px" if bar.max() > 1.0 else "")
+    )
+    return camera.model_copy(
+        update={
+            "image_size": index.size,
+            "focal_px": tuple(scale * focal for focal in camera.focal_px),
+            "principal_point_px": tuple(middle.tolist()),
+        }
+    )
+
+
+def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
+    """Return whether a frame has black bars of a width on both sides of one axis, and no wider.
+
+    Args:
+        frame: (height, width, channels).
+        bar: their width along x and y [px], with a fraction.
+    """
+    axis = int(bar.argmax())
+    width = int(bar[axis])
+    lines = frame.mean(axis=(axis, 2)).astype(np.float64)
+    black = np.concatenate([lines[:width], lines[len(lines) - width :]])
+    # The line next to a bar with a fraction is a mixture.
+    beside = [lines[width + 2], lines[-width - 3]]
+    return width > 0 and bool(black.max() < BLACK and min(beside) > BLACK)
 
 
 def import_pose2sim(
@@ -228,7 +292,8 @@ def import_pose2sim(
     in a folder `<camera>_json` for each camera; without them people are detected in the videos of
     `videos/`. Poses and videos belong to the cameras of their names, or, as in Pose2Sim, in
     alphabetical order to the cameras in the calibration's order. `frame_rate` and `frame_range`
-    of Config.toml hold.
+    of Config.toml hold. Where a video is smaller or larger than the calibrated images, with or
+    without black bars, its camera is in the video's pixels, as the 2D poses are.
 
     Args:
         project: folder of a trial.
@@ -263,7 +328,9 @@ def import_pose2sim(
     notes = [f"cameras: {calibration}"]
     poses = _assign(places, list(cameras), calibration, notes) if places else {}
     videos = _assign(films, list(cameras), calibration, notes) if films else {}
-    indices = {name: _index_video(file, cameras[name]) for name, file in videos.items()}
+    indices = {name: index_frames(file) for name, file in videos.items()}
+    for name, file in videos.items():
+        cameras[name] = _fit_to_video(file, cameras[name], indices[name], notes)
     rate = fps if fps is not None else settings.get("frame_rate")
     if rate is None and not indices:
         raise InputError(

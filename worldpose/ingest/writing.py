@@ -21,12 +21,13 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
-from worldpose.ingest.validation import require_local
+from worldpose.ingest.validation import require_local, validate_record
 
 
 @dataclass(frozen=True)
@@ -189,3 +190,48 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:
+    """Write clock offsets of static cameras into match.yaml; everything else in it stays.
+
+    Args:
+        folder: the match folder.
+        offsets: `offset_frames` by camera [frame].
+
+    Raises:
+        InputError: match.yaml is invalid, or has no such camera.
+    """
+    file = folder / "match.yaml"
+    text = file.read_text(encoding="utf-8")
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    assert root is not None  # a match was read from this file
+    entries = {key.value: value for key, value in root.value}
+    edits = []
+    missing = dict(offsets)
+    for camera in entries["cameras"].value:
+        keys = {key.value: value for key, value in camera.value}
+        name = keys["id"].value
+        if name not in missing:
+            continue
+        number = str(missing.pop(name))
+        if "offset_frames" in keys:
+            old = keys["offset_frames"]
+            edits.append((old.start_mark.index, old.end_mark.index, number))
+            continue
+        at = keys["id"].end_mark.index
+        column = camera.value[0][0].start_mark.column
+        before = ", " if camera.flow_style else "\n" + " " * column
+        edits.append((at, at, f"{before}offset_frames: {number}"))
+    if missing:
+        raise InputError(
+            str(file),
+            expected=f"the cameras {', '.join(missing)}",
+            found="others",
+            todo="Correct the names.",
+        )
+    for start, stop, number in sorted(edits, reverse=True):
+        text = text[:start] + number + text[stop:]
+    validate_record(MatchSpec, yaml.safe_load(text), str(file))
+    with whole_file(file) as draft:
+        draft.write_text(text, encoding="utf-8")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
-from typing import Final
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,8 +17,18 @@ from numpy.typing import NDArray
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
+from worldpose.errors import UsageError
+from worldpose.formats.files import whole_file
 from worldpose.pitch import PitchTemplate
 
+if TYPE_CHECKING:
+    from worldpose.static_calibration.boards import LensFit
+    from worldpose.triangulation.synchronization import Synchronization
+
+PLOTS: Final = (".svg", ".pdf", ".png")
+"""Forms of a plot."""
+RESIDUAL_SHARE: Final = 0.02
+"""Length at which the root mean square residual is drawn, as a share of the image's side [1]."""
 PALETTE: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b4c9a")
 """One colour per person, after Okabe and Ito: distinguishable with any colour vision."""
 
@@ -102,3 +114,74 @@ def png(figure: Figure) -> bytes:
         picture, metadata={"Software": None}, pil_kwargs={"compress_level": 1}
     )
     return picture.getvalue()
+
+
+def require_plot(path: Path) -> None:
+    """Raise UsageError unless a file name has the suffix of a plot."""
+    if path.suffix.lower() not in PLOTS:
+        raise UsageError(
+            str(path),
+            expected=f"a file name that ends with {', '.join(PLOTS)}",
+            found=repr(path.suffix),
+            todo="Rename it.",
+        )
+
+
+def draw_synchronization(found: Synchronization, names: Sequence[str], path: Path) -> None:
+    """Write a plot of each camera's matches by its clock offset, as SVG, PDF or PNG.
+
+    Args:
+        found: the offsets.
+        names: of the cameras.
+        path: file to write; its suffix is the form.
+    """
+    figure = Figure(figsize=(7.0, 1.3 * len(names) + 0.8), layout="constrained")
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, name, matches, late, std, reason in zip(
+        panels, names, found.matches, found.late, found.std, found.reasons, strict=True
+    ):
+        panel.set_ylabel(name)
+        panel.grid(color=LINE, linewidth=0.5)
+        panel.plot(found.shifts, matches, color=PALETTE[0], linewidth=1.2)
+        if np.isfinite(late):
+            panel.axvline(late, color=PALETTE[1], linewidth=1.2)
+            panel.axvspan(late - 2.0 * std, late + 2.0 * std, color=PALETTE[1], alpha=0.25)
+            panel.set_title(f"{late:+.2f} frames, standard deviation {std:.2f}", fontsize=8)
+        else:
+            panel.set_title(reason, fontsize=8)
+    panels[-1].set_xlabel("later than the median camera [frames]")
+    figure.supylabel(
+        "people who meet those of other cameras, above usual [1 per frame]", fontsize=8
+    )
+    with whole_file(path) as draft:
+        figure.savefig(draft, format=path.suffix[1:].lower())
+
+
+def draw_lens_fits(fits: Mapping[str, LensFit], path: Path) -> None:
+    """Write a plot of board corners, their residuals, and residuals by radius, for each camera.
+
+    Args:
+        fits: lenses by camera.
+        path: file to write; its suffix is the form.
+    """
+    figure = Figure(figsize=(8.0, 3.2 * len(fits)), layout="constrained")
+    rows = figure.subplots(len(fits), 2, squeeze=False)
+    for (seen, radial), (name, fit) in zip(rows, fits.items(), strict=True):
+        width, height = fit.lens.image_size
+        x, y = fit.pixels.T
+        longer = RESIDUAL_SHARE * max(width, height) / max(fit.rms_px, 1e-6)
+        seen.quiver(x, y, *(longer * fit.residuals.T), angles="xy", scale_units="xy", scale=1.0)
+        seen.scatter(x, y, s=4, c=fit.image, cmap="tab20")
+        seen.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+        seen.set_title(
+            f"{name}: {fit.used.sum()} images, {100 * fit.coverage:.0f} % covered, residuals "
+            f"x {longer:.0f}",
+            fontsize=8,
+        )
+        radius = np.linalg.norm(fit.pixels - np.array(fit.lens.principal_point_px), axis=1)
+        radial.scatter(radius, np.linalg.norm(fit.residuals, axis=1), s=4, color=PALETTE[0])
+        radial.set(xlabel="distance from the principal point [px]", ylabel="residual [px]")
+        radial.set(xlim=(0, 0.5 * float(np.hypot(width, height))), ylim=(0, None))
+        radial.set_title(f"root mean square {fit.rms_px:.2f} px", fontsize=8)
+    with whole_file(path) as draft:
+        figure.savefig(draft, format=path.suffix[1:].lower())

@@ -96,7 +96,7 @@ def estimate_clocks(
     rig = Rig.from_cameras(cameras)
     count = len(rig.cameras)
     late, error = np.zeros(count), np.full(count, UNKNOWN)
-    parts = _choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
+    parts = choose_intervals(detections.detection_index.shape, max(3, round(WINDOW * fps)))
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
         sums = [_sum_equations(rig, detections[part], late, fps, loose) for part in parts]
@@ -128,7 +128,7 @@ def estimate_clocks(
     return CameraClocks(np.where(determined, late, np.nan), error, determined)
 
 
-def _choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
+def choose_intervals(shape: tuple[int, ...], length: int) -> list[slice]:
     """Return intervals of frames spread over the clip, with enough person-frames in total."""
     frames, _, persons = shape
     starts = np.arange(0, max(1, frames - length + 1), length)

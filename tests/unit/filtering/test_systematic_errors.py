@@ -8,6 +8,7 @@ from planted_errors import plant
 
 from data_contracts.conventions import COCO17
 from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
+from worldpose.filtering.judging import Residuals
 from worldpose.filtering.systematic_errors import (
     TERMS,
     ClockEquations,
@@ -18,7 +19,6 @@ from worldpose.filtering.systematic_errors import (
     learn_view_bias,
     watch_motion,
 )
-from worldpose.filtering.views import Residuals
 from worldpose.geometry import Rigid
 from worldpose.simulation.detector_errors import facing_axes
 

@@ -12,7 +12,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import read_match
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import write_match, write_offsets
 
 
 @pytest.fixture
@@ -261,3 +261,38 @@ def _nobody():
         boxes=empty((0, 0, 4), np.float32),
         score=empty((0, 0), np.float32),
     )
+
+
+def test_clock_offsets_are_written_into_match_yaml_and_all_else_stays(tmp_path):
+    file = tmp_path / "match.yaml"
+    file.write_text(
+        "match_id: m  # the final\n"
+        "fps: 25\n"
+        "cameras:\n"
+        "  - {id: a, width: 64, height: 48, offset_frames: 3}   # late\n"
+        "  - {id: b, width: 64, height: 48}\n"
+        "  - id: c\n"
+        "    width: 64   # small\n"
+        "    height: 48\n"
+        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
+        "clips:\n"
+        "  - {id: clip, frame_count: 3}\n"
+    )
+    write_offsets(tmp_path, {"a": -12, "b": 2, "c": 7})
+    assert file.read_text() == (
+        "match_id: m  # the final\n"
+        "fps: 25\n"
+        "cameras:\n"
+        "  - {id: a, width: 64, height: 48, offset_frames: -12}   # late\n"
+        "  - {id: b, offset_frames: 2, width: 64, height: 48}\n"
+        "  - id: c\n"
+        "    offset_frames: 7\n"
+        "    width: 64   # small\n"
+        "    height: 48\n"
+        "  - {id: d, width: 64, height: 48, offset_frames: 1}\n"
+        "clips:\n"
+        "  - {id: clip, frame_count: 3}\n"
+    )
+    with pytest.raises(InputError, match=r"match.yaml: expected the cameras z, found others"):
+        write_offsets(tmp_path, {"z": 1})
+    assert "offset_frames: 7" in file.read_text()

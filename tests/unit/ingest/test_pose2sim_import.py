@@ -15,6 +15,7 @@ from worldpose.errors import InputError
 from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.ingest import import_pose2sim, read_calibration, read_match, write_calibration_toml
 from worldpose.ingest.footage import read_unit
+from worldpose.video import write_video
 
 CAMERAS = ("cam01", "cam02")
 KINDS = {"COCO-17": 17, "BODY_25": 25, "HALPE-26": 26, "COCO-WholeBody": 133}
@@ -115,6 +116,51 @@ def test_other_names_belong_to_the_cameras_in_order_and_it_says_so(trial, tmp_pa
     spec, notes = import_pose2sim(trial, tmp_path / "m")
     assert [one.id for one in spec.static_cameras] == ["int_a", "int_b"]
     assert "pose: in alphabetical order, cam01_json is int_a, cam02_json is int_b" in notes
+
+
+def film(trial, size, bars=(0, 0)):
+    """Videos of a size (width, height) with black bars at both sides of an axis [px]."""
+    (trial / "videos").mkdir()
+    width, height = size
+    frame = np.full((height, width, 3), 120, np.uint8)
+    for axis, bar in enumerate(bars[::-1]):
+        if bar:
+            np.moveaxis(frame, axis, 0)[:bar] = 0
+            np.moveaxis(frame, axis, 0)[-bar:] = 0
+    for name in CAMERAS:
+        write_video(trial / "videos" / f"{name}.mp4", [frame] * 14, 60.0)
+
+
+def test_a_resized_video_scales_the_calibration(trial, tmp_path):
+    film(trial, (544, 960))
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    found = read_calibration(tmp_path / "m" / "calibration.toml")["cam02"]
+    assert (found.image_size, found.focal_px) == ((544, 960), (750.0, 750.0))
+    # The image's corner, at -0.5, is that of the resized image.
+    assert found.principal_point_px == (540.5 / 2 - 0.5, 960.5 / 2 - 0.5)
+    assert "cam02.mp4: 544 x 960 px, calibrated are 1088 x 1920: the calibration is scaled" in str(
+        notes
+    )
+
+
+def test_black_bars_shift_the_calibration(trial, tmp_path):
+    film(trial, (544, 1000), bars=(0, 20))
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    found = read_calibration(tmp_path / "m" / "calibration.toml")["cam01"]
+    assert (found.image_size, found.focal_px) == ((544, 1000), (750.0, 750.0))
+    assert found.principal_point_px == (540.5 / 2 - 0.5, 960.5 / 2 - 0.5 + 20.0)
+    assert "with black bars of 20.0 px" in str(notes)
+
+
+@pytest.mark.parametrize(("size", "bars"), [((1000, 1920), (0, 0)), ((544, 1000), (0, 40))])
+def test_a_cropped_video_is_refused(trial, tmp_path, size, bars):
+    film(trial, size, bars)
+    told = (
+        r"cam01.mp4: expected 1088 x 1920 px, the size in the calibration, found \d+ x \d+. .*crop"
+    )
+    with pytest.raises(InputError, match=told):
+        import_pose2sim(trial, tmp_path / "m")
+    assert not (tmp_path / "m").exists()
 
 
 def spoil(trial, what):

@@ -1,0 +1,226 @@
+"""Command calibrate: compute lenses from images or videos of a calibration board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from data_contracts.arrays import Image
+from flows.cli.console import JsonOption, line, print_json, print_table
+from worldpose.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from worldpose.static_calibration.boards import Board, BoardView, LensFit
+
+IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+VIDEOS: Final = (".mp4", ".mov", ".mkv", ".avi")
+FEW_FIELDS: Final = 0.4
+"""Share of the image with corners from which on nothing is said [1]."""
+
+
+def calibrate(
+    boards: Annotated[
+        Path,
+        typer.Argument(
+            metavar="BOARDS",
+            help="Folder with a folder of images, or a video, for each camera; or images of one.",
+        ),
+    ],
+    columns: Annotated[
+        int, typer.Option(min=2, max=100, help="Inner corners along one side of the board.")
+    ],
+    rows: Annotated[int, typer.Option(min=2, max=100, help="Inner corners along the other side.")],
+    square: Annotated[float, typer.Option(min=1e-4, max=10.0, help="Side of a square [m].")],
+    out: Annotated[Path, typer.Option("--out", help="TOML file of lenses to write.")],
+    camera: Annotated[
+        str | None, typer.Option(help="Name of the camera, if BOARDS has images of one.")
+    ] = None,
+    charuco: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DICTIONARY",
+            help="The board is a ChArUco board with this dictionary, such as DICT_4X4_50; "
+            "--columns and --rows then count its squares.",
+        ),
+    ] = None,
+    marker: Annotated[
+        float | None, typer.Option(help="Side of a marker of a ChArUco board [m].")
+    ] = None,
+    every: Annotated[
+        float, typer.Option(min=0.01, max=60.0, help="Time between frames of a video [s].")
+    ] = 0.5,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Plot of coverage and residuals to write: .svg, .pdf or .png."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute the lenses of cameras from images or videos of a checkerboard or ChArUco board.
+
+    The file can be edited, and `worldpose import --lens FILE --out MATCH` adds it to a match. The
+    pose of a camera comes from clicks.
+
+    Example: worldpose calibrate boards --columns 4 --rows 7 --square 0.06 --out lenses.toml
+    """
+    from worldpose.formats.files import whole_file
+    from worldpose.formats.lens_files import write_lens_toml
+    from worldpose.reports.drawing import draw_lens_fits, require_plot
+    from worldpose.static_calibration.boards import Board, calibrate_lens
+
+    if plot is not None:
+        require_plot(plot)
+    if (charuco is None) != (marker is None):
+        raise UsageError(
+            "--charuco",
+            expected="--charuco together with --marker",
+            found="one of them",
+            todo="Give both, or neither for a checkerboard.",
+        )
+    board = Board(columns, rows, square, charuco, marker)
+    fits = {}
+    files: dict[str, list[str]] = {}
+    for name, place in _cameras(boards, camera).items():
+        views, size, files[name] = _read_views(place, board, every)
+        fits[name] = calibrate_lens(name, views, size)
+    with whole_file(out) as draft:
+        write_lens_toml(draft, {name: fit.lens for name, fit in fits.items()})
+    if plot is not None:
+        draw_lens_fits(fits, plot)
+    if as_json:
+        print_json({"lenses": str(out), "cameras": {n: _as_json(f) for n, f in fits.items()}})
+        return
+    _print(fits, files)
+    line(f"wrote {out}; worldpose import --lens {out} --out MATCH adds it to a match")
+
+
+def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
+    """Return the folder or video of each camera.
+
+    Raises:
+        InputError: there are no images and no videos.
+        UsageError: images of one camera without its name, or a name with several cameras.
+    """
+    found = sorted(boards.iterdir()) if boards.is_dir() else []
+    if any(file.suffix.lower() in IMAGES for file in found) or boards.is_file():
+        return {camera or _camera_name(boards): boards}
+    places = {
+        _camera_name(place): place
+        for place in found
+        if place.suffix.lower() in VIDEOS or (place.is_dir() and _images(place))
+    }
+    if not places:
+        raise InputError(
+            str(boards),
+            expected="a folder of images or a video for each camera, or images of one camera",
+            found="nothing" if not boards.exists() else "none of them",
+            todo=f"Name the folders after the cameras; images end with {', '.join(IMAGES)}.",
+        )
+    if camera is not None and camera not in places:
+        raise UsageError(
+            f"--camera {camera}",
+            expected=f"one of {', '.join(places)}",
+            found=repr(camera),
+            todo="Correct the name.",
+        )
+    return places if camera is None else {camera: places[camera]}
+
+
+def _camera_name(place: Path) -> str:
+    """Return a camera's name by its folder or video; `int_cam01_img`, as in Pose2Sim, is cam01."""
+    return place.stem.removeprefix("int_").removesuffix("_img")
+
+
+def _images(folder: Path) -> list[Path]:
+    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in IMAGES]
+
+
+def _read_views(
+    place: Path, board: Board, every: float
+) -> tuple[list[BoardView | None], tuple[int, int], list[str]]:
+    """Return the board in each image of a folder, or in frames of a video, the size, and names.
+
+    Raises:
+        InputError: an image is unreadable, or images have several sizes.
+    """
+    from worldpose.static_calibration.boards import choose_views
+    from worldpose.video import VideoReader, index_frames
+
+    if place.is_file():
+        index = index_frames(place)
+        numbers = range(0, len(index), max(1, round(every * index.fps)))
+        with VideoReader(place, index) as video:
+            views, size = choose_views((video.frame(number) for number in numbers), board)
+        return views, size, [f"view {n}" for n in range(len(views))]
+    found: list[BoardView | None] = []
+    sizes: dict[tuple[int, int], Path] = {}
+    files = _images(place)
+    for file in files:
+        image = _read_image(file)
+        sizes.setdefault((image.shape[1], image.shape[0]), file)
+        found.append(board.find(image))
+    if len(sizes) > 1:
+        (one, first), (two, second) = list(sizes.items())[:2]
+        raise InputError(
+            str(place),
+            expected="images of one size",
+            found=f"{one[0]} x {one[1]} in {first.name}, {two[0]} x {two[1]} in {second.name}",
+            todo="Keep the images of one camera and one mode in a folder.",
+        )
+    return found, next(iter(sizes)), [file.name for file in files]
+
+
+def _read_image(file: Path) -> Image:
+    import cv2
+    import numpy as np
+
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(
+            str(file), expected="an image", found="none that OpenCV reads", todo="Save it again."
+        )
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _as_json(fit: LensFit) -> dict[str, object]:
+    return {
+        "lens": fit.lens.model_dump(mode="json"),
+        "rms_px": fit.rms_px,
+        "coverage": fit.coverage,
+        "images": int(fit.used.sum()),
+        "left_out": {str(n): reason for n, reason in enumerate(fit.reasons) if reason},
+    }
+
+
+def _print(fits: dict[str, LensFit], files: dict[str, list[str]]) -> None:
+    """Print a table of the lenses, and what is to know about the images."""
+    rows = []
+    for name, fit in fits.items():
+        lens = fit.lens
+        x, y = lens.principal_point_px
+        rows.append(
+            (
+                name,
+                f"{fit.used.sum()} of {len(fit.used)}",
+                f"{fit.rms_px:.2f}",
+                f"{lens.focal_px:.1f} +- {lens.focal_std_px:.1f}",
+                f"{x:.1f}, {y:.1f} +- {lens.principal_point_std_px:.1f}",
+                " ".join(f"{one:.4f}" for one in lens.distortion[:4]),
+                f"{100 * fit.coverage:.0f}",
+            )
+        )
+    head = (
+        *("camera", ">images", ">residual px", ">focal length px", ">principal point px"),
+        *("k1 k2 p1 p2", ">coverage %"),
+    )
+    print_table("lenses", head, rows)
+    for name, fit in fits.items():
+        for file, reason in zip(files[name], fit.reasons, strict=True):
+            if reason:
+                line(f"{name}: {file} is left out: {reason}")
+        if fit.coverage < FEW_FIELDS:
+            line(
+                f"{name}: only {100 * fit.coverage:.0f} % of the image have corners: distortion "
+                "elsewhere is a guess. Add images with the board near the borders."
+            )

@@ -1,0 +1,221 @@
+"""Command synchronize: find the clock offsets of a match's cameras from the people in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.run import RunRecord
+from flows.cli.computing import WorkersOption
+from flows.cli.console import (
+    DEFAULT_PROJECT,
+    JsonOption,
+    MatchArgument,
+    ProjectOption,
+    line,
+    print_json,
+    print_table,
+    progress,
+)
+from flows.registering import find_match
+from flows.results.best_results import static_cameras
+from flows.run_record import latest_run, require_no_other_run
+from flows.running import RunRequest, run_match
+from flows.settings import Overrides, selected_stages
+from flows.stage import Match
+from flows.stages.detection import seen_by_cameras
+from worldpose.errors import InputError, UsageError
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.store import Run, Store
+
+FRACTION = 0.1
+"""Remaining offset that is worth a correction [frame]."""
+
+
+class Proposal(NamedTuple):
+    """The clock offset of a camera, as stated and as found."""
+
+    camera: str
+    stated: int
+    """`offset_frames` in match.yaml [frame]."""
+    found: float | None
+    """The same with its fraction, by the people [frame]; None where they do not tell it."""
+    std: float | None
+    """Standard deviation [frame]."""
+    reason: str
+    """Why it is not known; empty where it is."""
+
+    @property
+    def proposed(self) -> int:
+        """The whole offset for match.yaml [frame]."""
+        return self.stated if self.found is None else round(self.found)
+
+
+def synchronize(
+    match: MatchArgument,
+    clip: Annotated[
+        str | None, typer.Option(help="Clip whose people are compared; the longest by default.")
+    ] = None,
+    max_offset: Annotated[
+        float, typer.Option(min=0.1, max=60.0, help="Largest offset between two cameras [s].")
+    ] = 2.0,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Plot of the matches by offset to write: .svg, .pdf or .png."),
+    ] = None,
+    apply: Annotated[
+        bool, typer.Option("--apply", help="Write the proposed offset_frames into match.yaml.")
+    ] = False,
+    workers: WorkersOption = None,
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the clock offsets of the static cameras from moving people, and propose offset_frames.
+
+    The cameras must be calibrated, and nothing must be known of their clocks. The command computes
+    the match up to the 2D poses first. The offset of the first camera that it can tell stays, and
+    --apply writes the others.
+
+    Example: worldpose synchronize matches/lab --plot clocks.svg --apply
+    """
+    from worldpose.reports.drawing import draw_synchronization, require_plot
+    from worldpose.triangulation.synchronization import synchronize as estimate
+
+    if plot is not None:
+        require_plot(plot)
+    store = Store.open_or_new(project)
+    with progress(verbose=False):
+        opened = find_match(store, match)
+        spec = opened.folder.spec
+        chosen = clip or max(spec.clips, key=lambda each: each.frame_count).id
+        if chosen not in {each.id for each in spec.clips}:
+            raise UsageError(
+                f"--clip {chosen}",
+                expected=f"a clip of the match: {', '.join(each.id for each in spec.clips)}",
+                found=repr(chosen),
+                todo="Correct the name.",
+            )
+        require_no_other_run(store, opened.match_id)
+        latest = latest_run(store, opened.match_id)
+        settings = {} if latest is None else _until_detection(latest)
+        request = RunRequest(settings, until_stage="detection", workers=workers, gates="never")
+        record = run_match(store, opened, request)
+    cameras, names, detections = load_clip(Run(store, record), opened, chosen)
+    pitch = opened.folder.pitch
+    found = estimate(
+        cameras,
+        detections,
+        spec.fps,
+        max_offset_s=max_offset,
+        pitch=None if pitch is None else PitchTemplate.from_spec(pitch),
+    )
+    stated = {camera.id: int(camera.offset_frames) for camera in spec.static_cameras}
+    known = np.isfinite(found.late)
+    reference = int(np.argmax(known)) if known.any() else 0
+    rows = [
+        Proposal(
+            name,
+            stated[name],
+            stated[name] - float(found.late[c] - found.late[reference]) if known[c] else None,
+            float(found.std[c]) if known[c] else None,
+            found.reasons[c],
+        )
+        for c, name in enumerate(names)
+    ]
+    if plot is not None:
+        draw_synchronization(found, names, plot)
+    changed = {row.camera: row.proposed for row in rows if row.proposed != row.stated}
+    if apply and changed:
+        from worldpose.ingest.writing import write_offsets
+
+        write_offsets(opened.folder.folder, changed)
+    if as_json:
+        print_json(
+            {
+                "clip": chosen,
+                "cameras": [row._asdict() | {"proposed": row.proposed} for row in rows],
+                "applied": changed if apply else {},
+            }
+        )
+    else:
+        _print(rows, changed, plot, applied=apply)
+    raise typer.Exit(0 if known.all() else 4)
+
+
+def _until_detection(latest: RunRecord) -> Overrides:
+    """Return the settings of an earlier run that this command's stages have."""
+    stages = {stage.name for stage in selected_stages(None, "detection")}
+    return {name: given for name, given in latest.overrides.items() if name in stages}
+
+
+def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:
+    """Return the calibrated cameras, their names, and their detections in a clip.
+
+    Raises:
+        InputError: fewer than two cameras have a calibration and 2D poses.
+    """
+    spec = match.folder.spec
+    span = spec.clip(clip)
+    where = slice(span.first_frame, span.first_frame + span.frame_count - 1)
+    known = static_cameras(run, spec)
+    seen = {
+        camera.id: unit
+        for camera, unit in zip(spec.static_cameras, seen_by_cameras(match, clip), strict=True)
+        if camera.id in known and unit in run
+    }
+    if len(seen) < 2:
+        raise InputError(
+            f"{match.match_id}: static cameras",
+            expected="two calibrated cameras with 2D poses",
+            found=", ".join(seen) or "none",
+            todo="Calibrate the cameras first; worldpose status tells what is missing.",
+        )
+    frames = np.arange(span.first_frame, span.first_frame + span.frame_count)
+    parts = [
+        KeypointDetections.from_arrays(run[unit].sel(frame=where)).reindex(frames)
+        for unit in seen.values()
+    ]
+    cameras = Camera.stack([known[name] for name in seen])
+    return cameras, list(seen), KeypointDetections.stack(parts)
+
+
+def _print(
+    rows: list[Proposal], changed: dict[str, int], plot: Path | None, *, applied: bool
+) -> None:
+    """Print a table of the offsets, and what to do with them."""
+    shown = [
+        (
+            row.camera,
+            str(row.stated),
+            "-" if row.found is None else f"{row.found:.2f}",
+            "-" if row.std is None else f"{row.std:.2f}",
+            "-" if row.found is None else str(row.proposed),
+            row.reason,
+        )
+        for row in rows
+    ]
+    head = ("camera", ">offset_frames", ">by the people", ">standard deviation", ">proposed", "")
+    print_table("clock offsets of the cameras", head, shown)
+    if plot is not None:
+        line(f"wrote {plot}")
+    if not changed:
+        line("match.yaml needs no change.")
+    elif applied:
+        line(f"wrote offset_frames of {', '.join(changed)} into match.yaml")
+    else:
+        line("Add --apply to write the proposed offsets into match.yaml.")
+    if any(
+        row.found is not None
+        and row.std is not None
+        and abs(row.found - row.proposed) > max(FRACTION, 3.0 * row.std)
+        for row in rows
+    ):
+        line(
+            "The fraction of a frame remains; worldpose run --set "
+            "triangulation.correct_clocks=true corrects it."
+        )

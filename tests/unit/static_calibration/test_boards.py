@@ -1,0 +1,120 @@
+"""Lenses from boards: known truth, images that do not count, and boards that tell nothing."""
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats.lens_files import read_lens_toml, write_lens_toml
+from worldpose.static_calibration.boards import Board, BoardView, calibrate_lens, choose_views
+
+SIZE = (1280, 720)
+MATRIX = np.array([[900.0, 0.0, 655.0], [0.0, 900.0, 349.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.12, 0.04, 0.0006, -0.0004, 0.0])
+BOARD = Board(7, 4, 0.06)
+PLACES = np.mgrid[:7, :4].T.reshape(-1, 2) * 0.06
+
+
+def view(rng, tilt=0.6, noise=0.1, far=0.7):
+    """Corners of a tilted board somewhere in the image."""
+    turn = rng.uniform(-tilt, tilt, 3)
+    middle = np.append(rng.uniform(-0.3, 0.3, 2) * [1.2, 0.6], 1.0) * far
+    rotation = cv2.Rodrigues(turn)[0]
+    points = np.column_stack([PLACES - PLACES.mean(axis=0), np.zeros(len(PLACES))])
+    shown, _ = cv2.projectPoints(
+        points @ rotation.T + middle, np.zeros(3), np.zeros(3), MATRIX, DISTORTION
+    )
+    return BoardView(PLACES, shown.reshape(-1, 2) + rng.normal(0.0, noise, (len(PLACES), 2)))
+
+
+def test_a_lens_is_found_within_its_stated_uncertainty():
+    rng = np.random.default_rng(3)
+    off = []
+    for _ in range(12):
+        fit = calibrate_lens("cam", [view(rng) for _ in range(10)], SIZE)
+        lens = fit.lens
+        off += [(lens.focal_px - 900.0) / lens.focal_std_px]
+        off += (
+            (np.array(lens.principal_point_px) - MATRIX[:2, 2]) / lens.principal_point_std_px
+        ).tolist()
+        assert fit.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.15)
+        assert lens.distortion[:2] == pytest.approx(DISTORTION[:2], abs=0.05)
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.8
+
+
+def test_images_without_a_flat_board_do_not_count():
+    rng = np.random.default_rng(5)
+    views = [view(rng) for _ in range(8)]
+    pixels = views[2].pixels.copy()
+    pixels[:7] = views[2].pixels[7:14]  # a row counted twice: the corners bend
+    views[2] = BoardView(PLACES, pixels)
+    views[5] = None
+    shifted = views[6].pixels + np.array([0.0, 0.02]) * views[6].pixels[:, [0]]  # another lens
+    views[6] = BoardView(PLACES, shifted * [1.0, 1.15])
+    fit = calibrate_lens("cam", views, SIZE)
+    assert np.flatnonzero(~fit.used).tolist() == [2, 5, 6]
+    assert fit.reasons[2] == "its corners are not those of a flat board"
+    assert fit.reasons[5] == "no whole board found"
+    assert "contradicts the others" in fit.reasons[6]
+    assert fit.lens.focal_px == pytest.approx(900.0, abs=6.0)
+    assert 0.0 < fit.coverage <= 1.0
+
+
+def test_too_few_boards_and_boards_that_face_the_camera_are_refused():
+    rng = np.random.default_rng(6)
+    with pytest.raises(InputError, match=r"cam: board images: expected 4 images or more .* 3 of 4"):
+        calibrate_lens("cam", [*(view(rng) for _ in range(3)), None], SIZE)
+    with pytest.raises(InputError, match=r"tell the focal length .* tilted by 30 to 45 degrees"):
+        calibrate_lens("cam", [view(rng, tilt=0.01, noise=0.5) for _ in range(6)], SIZE)
+
+
+def drawn(board_image, rng):
+    """A photograph of a board (without distortion), and its matrix."""
+    height, width = board_image.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    far = np.array([[250, 150], [950, 130], [1000, 600], [230, 560]], np.float32)
+    way = cv2.getPerspectiveTransform(
+        corners, far + rng.uniform(-60, 60, (4, 2)).astype(np.float32)
+    )
+    return cv2.warpPerspective(board_image, way, SIZE, borderValue=255), way
+
+
+@pytest.mark.parametrize("charuco", [False, True])
+def test_corners_are_found_where_they_were_drawn(charuco):
+    side, rng = 60, np.random.default_rng(1)
+    if charuco:
+        board = Board(8, 5, 0.06, "DICT_4X4_50", 0.045)
+        print_ = board._charuco().generateImage((8 * side, 5 * side), marginSize=0)
+        page = cv2.copyMakeBorder(print_, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+    else:
+        board = Board(7, 4, 0.06)
+        squares = (np.indices((5, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
+        page = np.kron(squares, np.ones((side, side), np.uint8))
+        page = cv2.copyMakeBorder(page, side, side, side, side, cv2.BORDER_CONSTANT, value=255)
+    image, way = drawn(page, rng)
+    found = board.find(image)
+    inner = np.stack(np.meshgrid(np.arange(2, 9), np.arange(2, 6)), -1).reshape(-1, 1, 2) * side
+    true = cv2.perspectiveTransform(inner.astype(np.float64) - 0.5, way)[:, 0]
+    apart = np.linalg.norm(true[:, None] - found.pixels[None], axis=-1)
+    assert len(found.pixels) == 28
+    assert apart.min(axis=0).max() < 0.3
+    assert found.bend < 0.02
+    views, size = choose_views([image, image, np.zeros_like(image)], board)
+    assert (len(views), size) == (1, SIZE)
+
+
+def test_a_wrong_dictionary_or_marker_is_told():
+    blank = np.full((48, 64), 255, np.uint8)
+    with pytest.raises(InputError, match=r"board: dictionary: expected one of OpenCV's: DICT_"):
+        Board(8, 5, 0.06, "DICT_9", 0.04).find(blank)
+    with pytest.raises(
+        InputError, match=r"board: marker: expected .* smaller than a square of 0.06"
+    ):
+        Board(8, 5, 0.06, "DICT_4X4_50", 0.06).find(blank)
+
+
+def test_a_lens_file_is_read_as_it_was_written(tmp_path):
+    rng = np.random.default_rng(8)
+    lens = calibrate_lens("cam", [view(rng) for _ in range(6)], SIZE).lens
+    write_lens_toml(tmp_path / "lenses.toml", {"cam": lens})
+    assert read_lens_toml(tmp_path / "lenses.toml", {"cam": SIZE})["cam"] == lens

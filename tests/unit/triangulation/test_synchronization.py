@@ -1,0 +1,119 @@
+"""Clock offsets of which nothing is known are found from moving people, or refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_contracts.keypoints import KeypointDetections
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.triangulation.synchronization import shift_frames, synchronize
+
+LATE = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])
+"""Offset of each camera [frame]: its frame t shows the time t + offset."""
+FINE = 4
+"""Simulated frames per frame: fractions of a frame are exact."""
+FPS = 25.0
+FRAMES, BEFORE = 70, 15
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Five people before five cameras, simulated at 100 frames per second."""
+    tiny = SCENARIOS["tiny"]
+    rig = tiny.rig.model_copy(update={"cameras": len(LATE)})
+    seconds = (FRAMES + BEFORE + 25) / FPS
+    changes = {"fps": FINE * FPS, "duration": seconds, "rig": rig, "broadcast": None}
+    return simulate_scene(tiny.model_copy(update=changes), 4)
+
+
+@pytest.fixture(scope="module")
+def pitch():
+    return PitchTemplate.from_spec(SCENARIOS["tiny"].pitch)
+
+
+def with_rows(detections, rows):
+    """Detections whose frame t of camera c is row rows[t, c]."""
+    cameras = np.arange(rows.shape[1])
+    arrays = {name: array[rows, cameras] for name, array in detections.arrays().items()}
+    return KeypointDetections(frame=np.arange(len(rows)), **arrays)
+
+
+def shifted(scene, late=LATE):
+    rows = FINE * (np.arange(FRAMES)[:, None] + BEFORE + late)
+    return with_rows(scene.static_views().detections, np.rint(rows).astype(int))
+
+
+def turned(scene, angle):
+    """The cameras with an error of the calibration [rad]."""
+    rng = np.random.default_rng(2)
+    still = np.zeros(3)
+    cameras = []
+    for camera in scene.cameras.values():
+        error = Rigid.from_rotvec(rng.normal(0.0, angle, 3), still)
+        pose = camera.cam_from_world
+        cameras.append(replace(camera, cam_from_world=error @ pose))
+    return Camera.stack(cameras)
+
+
+def errors(found, late=LATE):
+    off = found.late - late
+    return off - np.nanmedian(off)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3])
+def test_offsets_are_found_without_a_hint_and_with_wrong_cameras(scene, pitch, angle):
+    found = synchronize(turned(scene, angle), shifted(scene), FPS, pitch=pitch)
+    assert found.reasons == ("",) * 5
+    assert np.abs(errors(found)).max() < 0.2
+    assert (found.std < 0.1).all()
+    peaks = found.shifts[found.matches.argmax(axis=1)]
+    assert np.abs(peaks - found.late).max() < 4.0
+
+
+def test_without_a_pitch_people_may_be_anywhere(scene):
+    found = synchronize(turned(scene, 0.0), shifted(scene), FPS)
+    assert np.abs(errors(found)).max() < 0.2
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_where_nothing_moves_no_offset_is_told(scene, pitch, noise):
+    still = with_rows(scene.static_views().detections, np.full((FRAMES, 5), 60))
+    rng = np.random.default_rng(1)
+    moved = still.keypoints + rng.normal(0.0, noise, still.keypoints.shape)
+    found = synchronize(turned(scene, 0.0), replace(still, keypoints=moved), FPS, pitch=pitch)
+    assert np.isnan(found.late).all()
+    assert np.isinf(found.std).all()
+    assert all(found.reasons)
+
+
+def test_a_camera_that_shows_other_people_has_no_offset(scene, pitch):
+    seen = shifted(scene)
+    alone = seen.keypoints.copy()
+    alone[:, 3] = alone[::-1, 3] * [-1.0, 1.0] + [1900.0, 0.0]
+    found = synchronize(turned(scene, 0.0), replace(seen, keypoints=alone), FPS, pitch=pitch)
+    assert np.isnan(found.late[3])
+    assert found.reasons[3]
+    rest = np.array([0, 1, 2, 4])
+    assert np.abs(errors(found)[rest]).max() < 0.2
+
+
+def test_shifted_frames_lie_on_the_common_clock():
+    keypoints = np.arange(10.0)[:, None, None, None, None] + np.zeros((10, 2, 1, 17, 2))
+    given = KeypointDetections.from_keypoints(keypoints, np.ones((10, 2, 1, 17)))
+    moved = shift_frames(given, np.array([1]), np.array([3])).keypoints[:, 0, 0, 0, 0]
+    np.testing.assert_array_equal(moved, [np.nan, np.nan, np.nan, 0, 1, 2, 3, 4, 5, 6])
+
+
+def test_one_camera_has_nothing_to_be_compared_with(scene):
+    one = shifted(scene)
+    alone = with_rows(scene.static_views().detections, np.zeros((5, 1), int))
+    with pytest.raises(InputError, match="synchronization: expected two cameras or more"):
+        synchronize(turned(scene, 0.0)[:1], alone, FPS)
+    with pytest.raises(InputError, match="expected two cameras or more"):
+        synchronize(turned(scene, 0.0)[:3], one, FPS)

@@ -1,0 +1,313 @@
+"""Lenses from images of a checkerboard or a ChArUco board."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Image, Integers
+from data_contracts.cameras import LensCalibration
+from worldpose.errors import InputError
+
+MIN_VIEWS: Final = 4
+"""Least images with a board [1]: leaving out one must leave three, which determine a lens."""
+MIN_CORNERS: Final = 8
+"""Least corners of a board in an image [1]."""
+MAX_BEND: Final = 0.25
+"""Largest mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
+that were counted wrongly are off by whole squares."""
+OUTLIER: Final = 2.0
+"""The worst image is left out if the residual is larger with it by this factor [1]."""
+MIN_RESIDUAL_PX: Final = 0.3
+"""Residual up to which no image is left out [px]."""
+SAME_VIEW: Final = 0.02
+"""Views of a video whose corners moved by less than this share of the image width are one [1]."""
+SUBPIXEL_WINDOW: Final = 5
+"""Half the side of the window in which a corner of a ChArUco board is refined [px]."""
+MAX_FOCAL_STD: Final = 0.05
+"""Largest relative deviation of the focal length [1]; boards that all face the camera do not tell
+it."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat calibration board.
+
+    Attributes:
+        columns: inner corners along one side; squares for a ChArUco board [1].
+        rows: the same along the other side [1].
+        square_m: side of a square [m].
+        dictionary: ArUco dictionary of a ChArUco board, such as `DICT_4X4_50`; None = checkerboard.
+        marker_m: side of its markers [m].
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    dictionary: str | None = None
+    marker_m: float | None = None
+
+    def find(self, image: Image) -> BoardView | None:
+        """Return the corners of the board in an image (height, width[, 3]); None without one."""
+        import cv2  # late: it takes 0.2 s, and few commands need it
+
+        grey = np.asarray(
+            image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8
+        )
+        if self.dictionary is not None:
+            return self._find_charuco(grey)
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+        size = (self.columns, self.rows)
+        found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
+        if not found:
+            return None
+        places = np.mgrid[: self.columns, : self.rows].T.reshape(-1, 2) * self.square_m
+        return BoardView(places.astype(np.float64), corners.reshape(-1, 2).astype(np.float64))
+
+    def _find_charuco(self, grey: Image) -> BoardView | None:
+        import cv2
+
+        board = self._charuco()
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if ids is None or len(ids) < MIN_CORNERS:
+            return None
+        # The detector interpolates corners between markers.
+        window = (SUBPIXEL_WINDOW, SUBPIXEL_WINDOW)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
+        corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
+        places = np.asarray(board.getChessboardCorners())[ids.ravel(), :2]
+        return BoardView(places.astype(np.float64), corners.reshape(-1, 2).astype(np.float64))
+
+    def _charuco(self) -> Any:  # noqa: ANN401
+        """Return OpenCV's board.
+
+        Raises:
+            InputError: OpenCV has no such dictionary or refuses the sizes.
+        """
+        import cv2
+
+        known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        if self.dictionary not in known:
+            raise InputError(
+                "board: dictionary",
+                expected=f"one of OpenCV's: {', '.join(known)}",
+                found=repr(self.dictionary),
+                todo="Give the dictionary that the board was printed with.",
+            )
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(self.dictionary)))
+        side = self.marker_m if self.marker_m is not None else 0.0
+        if not 0.0 < side < self.square_m:
+            raise InputError(
+                "board: marker",
+                expected=f"the side of a marker, smaller than a square of {self.square_m:g} m",
+                found=f"{side:g} m",
+                todo="Measure the black square of a marker.",
+            )
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square_m, side, markers)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """Corners of a board in one image.
+
+    Attributes:
+        places: (n, 2) on the board [m].
+        pixels: (n, 2) in the image [px].
+    """
+
+    places: Floats
+    pixels: Floats
+
+    @property
+    def bend(self) -> float:
+        """Mean distance of the corners from the image of a plane, in squares of the image [1]."""
+        import cv2
+
+        matrix, _ = cv2.findHomography(self.places, self.pixels)
+        if matrix is None:
+            return float("inf")
+        flat = cv2.perspectiveTransform(self.places[None], matrix)[0]
+        off = np.linalg.norm(flat - self.pixels, axis=1).mean()
+        apart = np.linalg.norm(self.pixels[:, None] - self.pixels[None], axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        return float(off / np.median(apart.min(axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class LensFit:
+    """A lens, with what it was computed from.
+
+    Attributes:
+        lens: the lens, with standard deviations.
+        used: (images,) whether an image counts.
+        reasons: why each image does not count; empty where it does.
+        pixels: (n, 2) corners in the used images [px].
+        residuals: (n, 2) corner minus its projection [px].
+        image: (n,) index of each corner's image.
+        coverage: share of a grid of 8 x 8 fields of the image that have a corner [1].
+    """
+
+    lens: LensCalibration
+    used: Flags
+    reasons: tuple[str, ...]
+    pixels: Floats
+    residuals: Floats
+    image: Integers
+    coverage: float
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of a corner from its projection [px]."""
+        return _rms(self.residuals)
+
+
+def calibrate_lens(
+    camera: str, views: Sequence[BoardView | None], size: tuple[int, int]
+) -> LensFit:
+    """Return the lens of a camera from images of one board.
+
+    Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
+    (Zhang, 2000). Images in which corners are off a plane, or that contradict the others, are left
+    out. The standard deviations are those of leaving out one image at a time (jackknife).
+
+    Args:
+        camera: its name.
+        views: the board in each image; None where it was not found.
+        size: width and height of all images [px].
+
+    Raises:
+        InputError: too few images with a board, or the boards do not tell the focal length.
+    """
+    reasons = ["" if view is not None else "no whole board found" for view in views]
+    for n, view in enumerate(views):
+        if view is not None and view.bend > MAX_BEND:
+            reasons[n] = "its corners are not those of a flat board"
+    while True:
+        chosen = [n for n, reason in enumerate(reasons) if not reason]
+        if len(chosen) < MIN_VIEWS:
+            raise InputError(
+                f"{camera}: board images",
+                expected=f"{MIN_VIEWS} images or more with the whole board",
+                found=f"{len(chosen)} of {len(views)}",
+                todo="Check the number of corners and squares of the board, and add images in which"
+                " it is tilted, sharp and near the borders.",
+            )
+        kept = [view for view in (views[n] for n in chosen) if view is not None]
+        numbers, residuals = _solve(kept, size)
+        error = np.array([_rms(each) for each in residuals])
+        worst = int(error.argmax())
+        if error[worst] <= MIN_RESIDUAL_PX or len(kept) == MIN_VIEWS:
+            break
+        others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
+        if _rms(np.concatenate(residuals)) <= OUTLIER * _rms(np.concatenate(others)):
+            break
+        reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
+    left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
+    count = len(kept)
+    spread = (count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
+    std = np.sqrt(spread)
+    if std[0] > MAX_FOCAL_STD * numbers[0]:
+        raise InputError(
+            f"{camera}: board images",
+            expected=f"boards that tell the focal length within {100 * MAX_FOCAL_STD:g} %",
+            found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
+            todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
+        )
+    corner = np.array([_corner_factor(each, size) for each in left_out])
+    corner_std = np.sqrt((count - 1) / count * ((corner - corner.mean()) ** 2).sum())
+    # Three coefficients share the displacement of the corner.
+    lens = LensCalibration(
+        id=camera,
+        image_size=size,
+        focal_px=float(numbers[0]),
+        principal_point_px=(float(numbers[1]), float(numbers[2])),
+        distortion=(*(float(one) for one in numbers[3:7]), 0.0),
+        focal_std_px=float(max(std[0], LEAST_STD_PX)),
+        principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), LEAST_STD_PX)),
+        distortion_std=float(max(corner_std, LEAST_DISTORTION_STD)),
+    )
+    pixels = np.concatenate([view.pixels for view in kept])
+    fields = np.clip((8 * pixels / np.array(size)).astype(int), 0, 7)
+    return LensFit(
+        lens=lens,
+        used=np.array([not reason for reason in reasons]),
+        reasons=tuple(reasons),
+        pixels=pixels,
+        residuals=np.concatenate(residuals),
+        image=np.repeat(chosen, [len(each) for each in residuals]),
+        coverage=len(np.unique(fields, axis=0)) / 64.0,
+    )
+
+
+LEAST_STD_PX: Final = 0.1
+"""Least stated deviation of focal length and principal point [px]."""
+LEAST_DISTORTION_STD: Final = 1e-4
+"""The same of the corner's displacement [1]."""
+
+
+def _rms(residuals: Floats) -> float:
+    """Return the root mean square length of residuals (n, 2) [px]."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
+def _solve(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[Floats, list[Floats]]:
+    """Return f, cx, cy, k1, k2, p1, p2, and the residuals (n, 2) of each view [px]."""
+    import cv2
+
+    places = [np.column_stack([view.places, np.zeros(len(view.places))]) for view in views]
+    objects = [each.astype(np.float32) for each in places]
+    images = [view.pixels.astype(np.float32) for view in views]
+    middle = 0.5 * (np.array(size) - 1.0)
+    start = np.array([[max(size), 0.0, middle[0]], [0.0, max(size), middle[1]], [0.0, 0.0, 1.0]])
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
+    none = np.zeros(5)
+    _, matrix, distortion, turns, ways = cv2.calibrateCamera(
+        objects, images, size, start, none, flags=flags
+    )
+    residuals = []
+    for each, view, turn, way in zip(places, views, turns, ways, strict=True):
+        shown, _ = cv2.projectPoints(each, turn, way, matrix, distortion)
+        residuals.append(view.pixels - shown.reshape(-1, 2))
+    numbers = [matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
+    return np.array(numbers, dtype=np.float64), residuals
+
+
+def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
+    """Return how much the distortion moves the image's farthest corner, by its distance [1]."""
+    far = np.maximum(numbers[1:3], np.array(size) - numbers[1:3]) / numbers[0]
+    squared = float((far**2).sum())
+    return float(numbers[3] * squared + numbers[4] * squared**2)
+
+
+def choose_views(
+    frames: Iterable[Image], board: Board, most: int = 40
+) -> tuple[list[BoardView | None], tuple[int, int]]:
+    """Return different views of a board in the frames of a video, and the frames' size.
+
+    Args:
+        frames: (height, width, 3) each.
+        board: the board.
+        most: most views.
+    """
+    views: list[BoardView | None] = []
+    size = (0, 0)
+    for frame in frames:
+        size = (frame.shape[1], frame.shape[0])
+        view = board.find(frame)
+        if view is None or any(_is_same(view, other, size[0]) for other in views if other):
+            continue
+        views.append(view)
+        if len(views) == most:
+            break
+    return views, size
+
+
+def _is_same(one: BoardView, other: BoardView, width: int) -> bool:
+    """Return whether two views show a board at the same place."""
+    if one.places.shape != other.places.shape or not np.array_equal(one.places, other.places):
+        return False
+    return bool(np.abs(one.pixels - other.pixels).mean() < SAME_VIEW * width)

@@ -1,0 +1,499 @@
+"""Clock offsets of cameras that nothing is known of, from the people who move in their views.
+
+Whole frames are searched by how many detections of two cameras meet in 3D; the remainder is
+estimated from tracks (`estimate_clocks`).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
+from worldpose.camera_consistency import ConsistencySettings
+from worldpose.camera_consistency.comparison import Comparison
+from worldpose.camera_consistency.consistency import select_busiest_frames
+from worldpose.camera_consistency.hypotheses import STATED
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, projection
+from worldpose.pitch import PitchTemplate
+from worldpose.tracking import (
+    GroundPositions,
+    TrackingSettings,
+    estimate_plane_clocks,
+    locate_feet,
+    track_on_plane,
+    track_people,
+)
+from worldpose.tracking.plane_clocks import MIN_RUNNERS
+from worldpose.triangulation.clocks import (
+    GATES,
+    SETTLED,
+    VELOCITY_TIME,
+    choose_intervals,
+    shift_in_time,
+)
+from worldpose.triangulation.noise_model import NoiseModel
+from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.solving import solve_joints
+
+SAMPLES: Final = 60
+"""Frames of a camera that are compared with every shift of another."""
+LONGEST_S: Final = 30.0
+"""Longest part of a clip that is compared, the one with the most people [s]."""
+MIN_COMMON: Final = 0.3
+"""Least share of these frames that a shift leaves within the other camera's clip [1]."""
+JOINT_NOISE: Final = 0.025
+"""Standard deviation of a detector's joint on the body [m]: less than usual, so that people who
+move slowly stop to match soon."""
+BLOCK_S: Final = 0.25
+"""Frames nearer to each other count as one observation [s]."""
+DRAWS: Final = 200
+"""Repetitions with other observations (bootstrap)."""
+LIKELY: Final = 2.0
+"""A shift is excluded if it is worse than the best by this many standard errors."""
+MIN_CONTRAST: Final = 3.0
+"""Least peak of a camera's matches above the median shift, in standard errors [1]."""
+MAX_SPAN: Final = 30
+"""Largest distance from the best to another likely shift [frame]: the people's motion leads from
+there to the right one."""
+MAX_ERROR: Final = 0.25
+"""Largest standard error of a determined offset [frame]: twice of it is half a frame."""
+MAX_PLACE_ERROR: Final = 0.5
+"""The same by places on the pitch, which are less accurate [frame]."""
+ROUNDS: Final = 6
+"""Most rounds of whole and remaining offsets."""
+RUNNING_M_S: Final = 1.0
+"""Least speed of people whose places tell clocks [m/s]."""
+SEED: Final = 0
+UNCLEAR: Final = "no offset stands out: its people move too little, or no other camera shows them"
+WINDOW_S: Final = 0.5
+"""Length of an interval [s]; a person's errors within an interval count as one."""
+UNKNOWN_CLOCK: Final = 10.0
+"""Standard deviation of a clock offset beyond whole frames [frame]."""
+COLUMNS: Final = 5
+"""Unknowns of a camera: clock, rotation, logarithm of the focal length."""
+PRIOR: Final = (*(1.0 / 0.003**2,) * 3, 1.0 / 0.005**2)
+"""Information on rotation [1/rad^2] and on the logarithm of the focal length [1]: calibrations are
+expected to be within 3 mrad and 0.5 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Synchronization:
+    """Clock offsets of a clip's cameras.
+
+    Attributes:
+        late: (cameras,) [frame]: frame t shows the time t + late; relative to the median camera.
+            NaN where not determined.
+        std: (cameras,) standard deviation [frame]; infinite where not determined.
+        reasons: why the offset of each camera is not determined; empty where it is.
+        shifts: (n,) compared offsets [frame].
+        matches: (cameras, n) people of a camera who meet those of all others at each offset, with
+            the others at their own offsets [persons per frame]; NaN where not determined.
+    """
+
+    late: Floats
+    std: Floats
+    reasons: tuple[str, ...]
+    shifts: Integers
+    matches: Floats
+
+
+def synchronize(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    *,
+    max_offset_s: float = 2.0,
+    pitch: PitchTemplate | None = None,
+) -> Synchronization:
+    """Return the clock offset of every camera, without any prior knowledge of it.
+
+    The offset of two cameras is the one at which most of their people meet in 3D. Cameras are added
+    one by one, the clearest first. Then people are tracked with whole offsets, and the remainder is
+    estimated from their motion. Where no two cameras see people from different directions, their
+    places on the pitch are compared (`estimate_plane_clocks`). A camera that shows no motion, or no
+    person whom another shows, has no offset.
+
+    Args:
+        cameras: batch (cameras,).
+        detections: (frames, cameras, detections) in memory, before tracking.
+        fps: frames per second [1/s].
+        max_offset_s: largest offset between two cameras [s]; at most half of the clip.
+        pitch: the pitch that people stand on; None = they may be anywhere.
+
+    Raises:
+        InputError: fewer than two cameras, or shapes that do not fit together.
+    """
+    keypoints, confidence = detections.keypoints, detections.confidence
+    count = int(cameras.batch_shape[0])
+    if count < 2 or keypoints.shape != (*confidence.shape, 2) or confidence.shape[1] != count:
+        raise InputError(
+            "synchronization",
+            expected="two cameras or more, keypoints (frames, cameras, detections, joints, 2)",
+            found=f"{cameras.batch_shape}, {keypoints.shape}",
+            todo="Give the detections of all cameras of a clip.",
+        )
+    longest = round((LONGEST_S + 2.0 * max_offset_s) * fps)
+    detections = detections[select_busiest_frames(confidence, longest)]
+    keypoints, confidence = detections.keypoints, detections.confidence
+    points = np.where((confidence > 0.0)[..., None], keypoints, np.nan).astype(np.float64)
+    most = min(round(max_offset_s * fps), len(points) // 2)
+    table = _Table(cameras, points, fps, most, ground=pitch is not None)
+    whole, span, reasons = table.solve()
+    late, std = whole.astype(np.float64), np.full(count, np.inf)
+    known = np.isfinite(span)
+    if np.count_nonzero(known) >= 2:
+        chosen = np.flatnonzero(known)
+        late[chosen], std[chosen] = _refine(
+            cameras[chosen], detections, fps, chosen, whole[chosen], pitch
+        )
+        known &= std <= MAX_ERROR
+        known &= np.abs(late - whole) <= MAX_SPAN
+    for camera in np.flatnonzero(~known & np.isfinite(span)):
+        reasons[camera] = "its people move too little"
+    std[~known] = np.inf
+    if not known.any() and pitch is not None:
+        late, std = _compare_places(cameras, detections, fps, pitch, max_offset_s)
+        known = np.isfinite(std)
+        reasons = ["" if told else reason for told, reason in zip(known, reasons, strict=True)]
+    late = np.where(known, late - np.median(late[known]) if known.any() else 0.0, np.nan)
+    steps = np.rint(np.where(known, late, 0.0)).astype(np.int64)
+    return Synchronization(late, std, tuple(reasons), table.shifts, table.curves(steps, known))
+
+
+def _compare_places(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    pitch: PitchTemplate,
+    max_offset_s: float,
+) -> tuple[Floats, Floats]:
+    """Return offsets and standard deviations [frame] by the places of runners on the pitch.
+
+    Standing people have the same places at all offsets: a camera without `MIN_RUNNERS` runners
+    tells nothing.
+    """
+    positions = locate_feet(cameras, detections, pitch)
+    size = (pitch.length, pitch.width)
+    clocks = estimate_plane_clocks(positions, fps, pitch_size=size, max_offset_s=max_offset_s)
+    runs = np.zeros(int(cameras.batch_shape[0]), dtype=np.bool_)
+    for camera in range(len(runs)):
+        one = slice(camera, camera + 1)
+        alone = GroundPositions(
+            positions.xy[:, one],
+            positions.noise[:, one],
+            positions.calibration[:, one],
+            positions.height[:, one],
+        )
+        velocity = track_on_plane(alone, fps, pitch_size=size).velocity
+        seen = np.isfinite(velocity[..., 0]).any(axis=0)
+        speed = np.sqrt(np.nanmean((velocity[:, seen] ** 2).sum(axis=-1), axis=0))
+        runs[camera] = (speed > RUNNING_M_S).sum() >= MIN_RUNNERS
+    known = runs & (clocks.std * fps <= MAX_PLACE_ERROR)
+    if np.count_nonzero(known) < 2:
+        known[:] = False
+    return clocks.seconds * fps, np.where(known, clocks.std * fps, np.inf)
+
+
+def _refine(
+    cameras: Camera,
+    detections: KeypointDetections,
+    fps: float,
+    chosen: Integers,
+    whole: Integers,
+    pitch: PitchTemplate | None,
+) -> tuple[Floats, Floats]:
+    """Return the offsets of the chosen cameras with their fraction, and standard errors [frame]."""
+    late, error = whole.astype(np.float64), np.full(len(chosen), np.inf)
+    pitch_size = None if pitch is None else (pitch.length, pitch.width)
+    for _ in range(ROUNDS):
+        steps = np.rint(late).astype(np.int64)
+        shifted = shift_frames(detections, chosen, steps)
+        tracks = track_people(cameras, shifted, fps, TrackingSettings(), pitch_size=pitch_size)
+        people = shifted.assign_people(tracks.detection_index)
+        rest, error = _estimate_fractions(cameras, people, fps)
+        late = steps + rest
+        if (np.rint(late) == steps).all():
+            break
+    return late, error
+
+
+def _estimate_fractions(
+    cameras: Camera, people: KeypointDetections, fps: float
+) -> tuple[Floats, Floats]:
+    """Return clock offsets of a few frames at most, and standard errors [frame].
+
+    As in `estimate_clocks`, residuals are regressed on the people's image motion. Here the
+    orientation and the focal length of each camera are unknown, too: an error of the calibration
+    that moves people by a few centimetres is not taken for one of the clock.
+    """
+    settings = TriangulationSettings()
+    count, frames = int(cameras.batch_shape[0]), len(people.keypoints)
+    late, error = np.zeros(count), np.full(count, np.inf)
+    length = max(3, round(WINDOW_S * fps))
+    for gate in GATES:
+        loose = settings.model_copy(update={"max_deviation": gate})
+        common = shift_in_time(people, late)
+        parts = [
+            each
+            for part in choose_intervals((frames, count, people.detection_index.shape[2]), length)
+            for each in _sum_part(Rig.from_cameras(cameras), common[part], fps, loose)
+        ]
+        if not parts:
+            break
+        prior = np.tile([1.0 / UNKNOWN_CLOCK**2, *PRIOR], count)
+        information = np.stack([matrix for matrix, _ in parts])
+        score = np.stack([right for _, right in parts])
+        inverse = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
+        step = inverse @ score.sum(axis=0)
+        clock = slice(None, None, COLUMNS)
+        # A common offset moves people along their path and changes no residual.
+        told = np.diagonal(information.sum(axis=0))[clock] > 1.0 / UNKNOWN_CLOCK**2
+        rows = inverse[clock] - told @ inverse[clock] / max(1, told.sum())
+        left = (score - information @ step) @ rows.T
+        groups = len(parts)
+        stated = np.diagonal(rows @ information.sum(axis=0) @ rows.T)
+        scatter = (left**2).sum(axis=0) * groups / max(1, groups - 1)
+        error = np.where(told, np.sqrt(np.maximum(scatter, stated)), np.inf)
+        change = np.where(told, step[clock], 0.0)
+        change = np.clip(change - np.median(change[told]) if told.any() else change, -3.0, 3.0)
+        late += np.where(told, change, 0.0)
+        if np.abs(change).max() < SETTLED and gate == GATES[-1]:
+            break
+    return late, error
+
+
+def _sum_part(
+    rig: Rig, people: KeypointDetections, fps: float, settings: TriangulationSettings
+) -> list[tuple[Floats, Floats]]:
+    """Return the normal equations of clocks and cameras from each person in an interval.
+
+    The unknowns of a camera are its clock offset [frame], its rotation [rad] and the logarithm of
+    its focal length.
+    """
+    pixels, index = people.keypoints, people.detection_index
+    precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
+    joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
+    half = max(1, round(VELOCITY_TIME * fps))
+    if len(joints) <= 2 * half:
+        return []
+    here = slice(half, len(joints) - half)
+    velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
+    at = joints[here]
+    known = np.isfinite(at + velocity).all(axis=-1)
+    person = np.nonzero(known)[1]
+    at, velocity = at[known], velocity[known]
+    count, n = len(rig.cameras), len(at)
+    if not n:
+        return []
+    point, columns = np.zeros((n, count, 2, 3)), np.zeros((n, count, 2, COLUMNS))
+    miss, weight = np.zeros((n, count, 2)), np.zeros((n, count))
+    for camera in range(count):
+        image, jacobian = np.empty((1, n, 2)), np.empty((1, n, 2, 18))
+        status = np.empty((1, n), np.uint8)
+        row = rig.cameras[camera : camera + 1]
+        projection.project_with_jacobians(
+            row, np.ascontiguousarray(at[None]), image, jacobian, status
+        )
+        off = pixels[here, camera][known] - image[0]
+        depth = at @ rig.depths[camera, :3] + rig.depths[camera, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = rig.cameras[camera, 0] / depth
+            variance = settings.pixel_noise_px**2 + (size * settings.joint_noise_m) ** 2
+            own = precision[here, camera][known] / variance
+            squared = own * (off**2).sum(axis=-1)
+            own = own / (1.0 + squared / settings.max_deviation**2) ** 2
+        usable = np.isfinite(own * squared)
+        derivatives = np.where(usable[:, None, None], jacobian[0], 0.0)
+        point[:, camera] = derivatives[..., :3]
+        columns[:, camera, :, 0] = (derivatives[..., :3] @ velocity[..., None])[..., 0]
+        columns[:, camera, :, 1:4] = derivatives[..., 3:6]
+        columns[:, camera, :, 4] = (derivatives[..., 9:11] * row[0, :2]).sum(axis=-1)
+        miss[:, camera] = np.where(usable[:, None], off, 0.0)
+        weight[:, camera] = np.where(usable, own, 0.0)
+    weighed = weight[..., None, None] * columns
+    matrix = np.einsum("ncij,nc,ncik->njk", point, weight, point) + 1e-9 * np.eye(3)
+    right = np.einsum("ncij,nc,nci->nj", point, weight, miss)
+    mixed = np.einsum("ncik,ncij->nckj", weighed, point).reshape(n, count * COLUMNS, 3)
+    own = np.einsum("ncik,ncil->nckl", weighed, columns)
+    score = np.einsum("ncik,nci->nck", weighed, miss).reshape(n, -1)
+    follows = np.linalg.solve(matrix, np.swapaxes(mixed, 1, 2))
+    score = score - np.einsum("njk,nj->nk", follows, right)
+    found = []
+    for one in np.unique(person):
+        its = person == one
+        whole = -np.einsum("nkj,njl->kl", mixed[its], follows[its])
+        blocks = whole.reshape(count, COLUMNS, count, COLUMNS)
+        blocks[np.arange(count), :, np.arange(count)] += own[its].sum(axis=0)
+        found.append((whole, score[its].sum(axis=0)))
+    return found
+
+
+def shift_frames(
+    detections: KeypointDetections, chosen: Integers, late: Integers
+) -> KeypointDetections:
+    """Return detections of some cameras on the common clock, shifted by whole frames.
+
+    Args:
+        detections: (frames, cameras, detections).
+        chosen: (n,) the cameras.
+        late: (n,) [frame], frame t shows the time t + late.
+    """
+    frames = len(detections.keypoints)
+    arrays = {}
+    for name, array in detections.arrays().items():
+        moved = np.full((frames, len(chosen), *array.shape[2:]), np.nan)
+        for k, (camera, step) in enumerate(zip(chosen, late, strict=True)):
+            rows = np.arange(frames) - step
+            inside = (rows >= 0) & (rows < frames)
+            moved[inside, k] = array[rows[inside], camera]
+        arrays[name] = moved
+    return KeypointDetections(frame=np.arange(frames), **arrays)
+
+
+class _Table:
+    """Matches of every two cameras by moment and shift.
+
+    Attributes:
+        shifts: (n,) of the second camera [frame].
+        scores: by pair of cameras (a, b), a < b, (n, moments): matches of a at each moment with b
+            `shift` frames later; NaN where b has no such frame.
+    """
+
+    def __init__(
+        self, cameras: Camera, points: Floats, fps: float, most: int, *, ground: bool
+    ) -> None:
+        settings = ConsistencySettings(sample_frames=SAMPLES)
+        noise = np.full(int(cameras.batch_shape[0]), settings.pixel_noise_px)
+        comparison = Comparison(cameras, noise, points, ground, settings, JOINT_NOISE)
+        self.count, self.most = comparison.count, most
+        self.shifts = np.arange(-most, most + 1)
+        moments = comparison.sample
+        blocks = np.maximum(1, round(BLOCK_S * fps))
+        self._block = np.unique(moments // blocks, return_inverse=True)[1]
+        frames = np.arange(comparison.frames)
+        there = moments[None] + self.shifts[:, None]
+        inside = (there >= 0) & (there < comparison.frames)
+        inside[inside.mean(axis=1) < MIN_COMMON] = False
+        at = np.broadcast_to(np.arange(len(moments)), there.shape)[inside]
+        every = [comparison.view(c, STATED, frames) for c in range(self.count)]
+        self.scores: dict[tuple[int, int], Floats] = {}
+        for a, b in combinations(range(self.count), 2):
+            found = comparison.scores(comparison.views[a], every[b], at, there[inside])
+            table = np.full(there.shape, np.nan)
+            table[inside] = found
+            self.scores[a, b] = table
+
+    def solve(self) -> tuple[Integers, Floats, list[str]]:
+        """Return whole offsets, the distance of other likely ones, and reasons.
+
+        The distance is infinite where no offset is known [frame].
+        """
+        blocks = int(self._block.max()) + 1
+        rng = np.random.default_rng(SEED)
+        draws = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), DRAWS)
+        curves = self._means(np.ones((1, blocks)))
+        drawn = self._means(draws.astype(np.float64))
+        order, late, reasons = self._join(curves, drawn)
+        span = np.full(self.count, np.inf)
+        for camera in order if len(order) > 1 else ():
+            own = self._total(curves, camera, late, order)[0]
+            others = self._total(drawn, camera, late, order)
+            best = int(np.nanargmax(own))
+            late[camera] = self.shifts[best]
+            with warnings.catch_warnings():  # shifts that no draw has are no candidates
+                warnings.simplefilter("ignore", RuntimeWarning)
+                error = np.nanstd(others[:, best, None] - others, axis=0)
+            likely = self.shifts[own[best] - own <= LIKELY * error + 1e-9]
+            span[camera] = float(np.abs(likely - self.shifts[best]).max(initial=0))
+            if span[camera] > MAX_SPAN:
+                ends = f"{likely.min():+d} to {likely.max():+d}"
+                reasons[camera] = f"offsets of {ends} frames explain its people equally well"
+                span[camera] = np.inf
+        return late, span, reasons
+
+    def curves(self, late: Integers, known: Flags) -> Floats:
+        """Return the matches (cameras, n) of each camera with all others by its offset."""
+        found = np.full((self.count, len(self.shifts)), np.nan)
+        means = self._means(np.ones((1, int(self._block.max()) + 1)))
+        order = np.flatnonzero(known).tolist()
+        for camera in order if len(order) > 1 else ():
+            found[camera] = self._total(means, camera, late, order)[0]
+        return found
+
+    def _means(self, weights: Floats) -> dict[tuple[int, int], Floats]:
+        """Return mean matches (draws, n) of each pair; weights are (draws, blocks)."""
+        by_moment = weights[:, self._block]
+        means = {}
+        for pair, table in self.scores.items():
+            known = np.isfinite(table)
+            total = by_moment @ np.where(known, table, 0.0).T
+            number = by_moment @ known.T
+            with np.errstate(invalid="ignore", divide="ignore"):
+                means[pair] = np.where(number > 0.0, total / number, np.nan)
+        return means
+
+    def _total(
+        self,
+        means: dict[tuple[int, int], Floats],
+        camera: int,
+        late: Integers,
+        others: Sequence[int],
+    ) -> Floats:
+        """Return the matches (draws, n) of a camera with others, by its offset from -most on."""
+        draws = next(iter(means.values())).shape[0]
+        total = np.full((draws, len(self.shifts)), np.nan)
+        for other in others:
+            if other == camera:
+                continue
+            a, b = sorted((camera, other))
+            # Frame t of a shows what frame t + late[a] - late[b] of b shows.
+            wanted = self.shifts - late[other] if camera == a else late[other] - self.shifts
+            inside = np.abs(wanted) <= self.most
+            part = np.full_like(total, np.nan)
+            part[:, inside] = means[a, b][:, wanted[inside] + self.most]
+            usual = np.nanmedian(means[a, b], axis=1, keepdims=True)
+            total = np.where(
+                np.isfinite(part), np.where(np.isfinite(total), total, 0.0) + part - usual, total
+            )
+        return total
+
+    def _join(
+        self, curves: dict[tuple[int, int], Floats], drawn: dict[tuple[int, int], Floats]
+    ) -> tuple[list[int], Integers, list[str]]:
+        """Return the cameras in the order of their clearness, and their offsets."""
+        late = np.zeros(self.count, dtype=np.int64)
+        reasons = [UNCLEAR] * self.count
+        clearness = {pair: _contrast(curves[pair][0], drawn[pair]) for pair in curves}
+        best = max(clearness, key=lambda pair: clearness[pair])
+        order = [best[0]] if clearness[best] >= MIN_CONTRAST else []
+        while order and len(order) < self.count:
+            rest = [c for c in range(self.count) if c not in order]
+            totals = {c: self._total(curves, c, late, order)[0] for c in rest}
+            clear = {c: _contrast(totals[c], self._total(drawn, c, late, order)) for c in rest}
+            chosen = max(clear, key=lambda c: clear[c])
+            if clear[chosen] < MIN_CONTRAST:
+                break
+            late[chosen] = self.shifts[int(np.nanargmax(totals[chosen]))]
+            order.append(chosen)
+        for camera in order:
+            reasons[camera] = ""
+        return order, late, reasons
+
+
+def _contrast(curve: Floats, drawn: Floats) -> float:
+    """Return how far the peak (n,) is above the median shift, in standard errors of draws."""
+    if np.isfinite(curve).sum() < 3:
+        return 0.0
+    best = int(np.nanargmax(curve))
+    above = drawn[:, best] - np.nanmedian(drawn, axis=1)
+    error = float(above[np.isfinite(above)].std()) if np.isfinite(above).any() else np.inf
+    return float(curve[best] - np.nanmedian(curve)) / max(error, 1e-3)
