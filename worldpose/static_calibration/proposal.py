@@ -31,6 +31,7 @@ from worldpose.static_calibration.camera_candidates import (
     Candidates,
     SeenMarkings,
     join_candidates,
+    name_arcs,
     name_triples,
     project_markings,
     refine_candidates,
@@ -446,7 +447,15 @@ def _rank_rolled(
             )
             found = found[np.argsort(-scores, kind="stable")[:count]]
     samples = sample_markings(pitch, _FINE[0])
-    found = _thin_out(found)
+    circles = join_candidates(*(name_arcs(paint, pitch, focals, roll) for roll in rolls))
+    circles = refine_candidates(
+        paint, sample_markings(pitch, _SAMPLED[0]), circles, _RADII[:1], (len(focals) > 1, False)
+    )
+    scores = score_candidates(
+        paint, sample_markings(pitch, _SAMPLED[0]), circles, _SAMPLED[1]
+    ) + _log_prior(circles, prior, paint.size)
+    circles = _thin_out(circles[np.argsort(-scores, kind="stable")])
+    found = join_candidates(_thin_out(found), circles)
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
         found = refine_candidates(paint, samples, found[:count], radii, free)
