@@ -127,8 +127,7 @@ def project_markings(camera: Camera, pitch: PitchTemplate) -> dict[str, Floats]:
         if name.startswith("corner_arc"):
             continue
         pixels = camera.project(pitch.marking_points(name, 0.1))
-        inside = np.isfinite(pixels).all(axis=1)
-        inside &= (pixels > -2.0).all(axis=1) & (pixels < size + 1.0).all(axis=1)
+        inside = np.asarray(((pixels > -2.0) & (pixels < size + 1.0)).all(axis=1))
         if np.count_nonzero(inside) >= 2:
             found[name] = np.where(inside[:, None], pixels, np.nan)
     return found
@@ -152,7 +151,7 @@ def compare(
     for name, line in projected.items():
         if name in labelled or name in still.get("unsure", ()):
             continue
-        inner = ((line > border) & (line < camera.image_size - border)).all(axis=1)
+        inner = np.asarray(((line > border) & (line < camera.image_size - border)).all(axis=1))
         step = np.linalg.norm(np.diff(line, axis=0), axis=1)
         if float(np.nansum(step[inner[1:] & inner[:-1]])) * scale > SEEN:
             extra.append(name)
@@ -208,7 +207,9 @@ def summarize(title: str, scores: Sequence[Score]) -> None:
         f"{sum(each.wrong for each in scores)} wrong"
     )
     for group, shares in zip(("of these", "of all"), over, strict=True):
-        print(f"  JaC@5 / @10 / @20 {group}: {' / '.join(f'{100.0 * each:.1f}' for each in shares)}")
+        print(
+            f"  JaC@5 / @10 / @20 {group}: {' / '.join(f'{100.0 * each:.1f}' for each in shares)}"
+        )
     print(f"  {np.median([each.seconds for each in scores]):.1f} s per still (median)")
 
 

@@ -12,8 +12,7 @@ from scipy.interpolate import interp1d
 from data_contracts.arrays import Floats
 from worldpose.simulation.falls import dive, fall, slide
 from worldpose.simulation.motions import SETTLE, Action, Motion, jump, kick
-from worldpose.simulation.paths import MARGIN, STEP, GroundPath, keep_ready
-from worldpose.simulation.random_processes import drift
+from worldpose.simulation.paths import MARGIN, STEP, GroundPath, drift, keep_ready
 from worldpose.simulation.settings import ActionRates, CrowdSettings
 
 PASS_EVERY: Final = (2.0, 4.5)

@@ -1,8 +1,7 @@
-"""Candidate cameras from segments and arcs of paint, and their fit to the paint (C2).
+"""Candidate cameras from segments of paint, and their fit to the paint (C2).
 
 A triple of segments, two along one axis of the pitch and one along the other, with names from the
 template and a camera without roll, determines a camera. The search over names is exhaustive. A
-segment and the circle around it determine one too, where fewer straight markings are in view. A
 score compares the markings that a camera predicts with the paint; refinement moves them onto it.
 
 All cameras are those of the straight copy of `PaintMap`.
@@ -13,23 +12,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
+from worldpose.static_calibration.settings import CameraPrior
 
-_TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
+TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
 """Tilts below the horizon to try [rad]."""
 _LEVEL: Final = np.radians(5.0)
 """Deviation of two segments from a right angle, or from parallels, on the pitch [rad]."""
-_SEGMENTS: Final = 12
+SEGMENTS: Final = 12
 """Maximum segments to name, those with the most paint [1]."""
 _BEYOND: Final = (0.15, 1.5)
 """Reach of a segment beyond its marking: share of its length [1], and [m]."""
@@ -39,21 +38,6 @@ _FARTHEST: Final = 200.0
 """Distance of a camera from the centre spot in plan [m]."""
 _INSIDE: Final = 1.0
 """Distance of a camera from the outer lines inside of the pitch [m]."""
-_MIN_ARC: Final = 0.01
-"""Minimum share of the paint on a circle [1]."""
-_MIN_RADIUS: Final = 3.0
-"""Minimum radius of such a circle [m]: corner arcs are too small."""
-_ARC_BINS: Final = (0.08, 0.15, 160)
-"""Bins of the vote for circles: radius in its logarithm [1], place of the centre along the line in
-radii [1], and their number."""
-_RADIUS_RANGE: Final = (0.1, 5.0)
-"""Radii of circles to vote for, in heights of the camera [1]."""
-_ARC_POINTS: Final = 1200
-"""Pixels of paint that vote for circles, at least [1]."""
-_ARC_REACH: Final = 14.0
-"""Reach of the neighbors that give the direction of a pixel's paint [px]."""
-_ARCS: Final = 400
-"""Maximum candidates from circles, those with the most paint [1]."""
 _FOUND: Final = 0.7
 """Probability that a visible marking is found at one place [1]: players, shadows and wear hide
 the rest."""
@@ -126,7 +110,7 @@ def join_candidates(*parts: Candidates) -> Candidates:
     )
 
 
-def _straight_lines(pitch: PitchTemplate) -> tuple[Floats, Floats]:
+def straight_lines(pitch: PitchTemplate) -> tuple[Floats, Floats]:
     """Return painted lines along x (n, 3) as y, first and last x, and along y (m, 3) [m]."""
     along: tuple[list[list[float]], list[list[float]]] = ([], [])
     for line in pitch.lines.values():
@@ -168,8 +152,7 @@ class _Triples:
 
 def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
     """Return the cameras with a roll of all triples of segments under all names that fit them."""
-    x_lines, y_lines = _straight_lines(pitch)
-    half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
+    x_lines, y_lines = straight_lines(pitch)
     found: list[Floats] = []
     for triples in _ground_triples(paint, focals, roll):
         for axis, (pair, third) in enumerate(((x_lines, y_lines), (y_lines, x_lines))):
@@ -179,15 +162,14 @@ def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                 gap = triples.offsets[:, 0] - triples.offsets[:, 1]
                 with np.errstate(divide="ignore", invalid="ignore"):
                     height = sign * (first[0] - second[0]) / gap
-                tall = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1])
+                tall = np.flatnonzero((height > _HEIGHTS[0]) & (height < _HEIGHTS[1]))
                 for other in third:
-                    kept = np.flatnonzero(tall)
+                    kept = tall
                     up = height[kept]
                     beside = sign * first[0] - up * triples.offsets[kept, 0]
                     ahead = other[0] - up * triples.offset[kept]
                     place = (ahead, beside) if axis == 0 else (-beside, ahead)
-                    fits = np.hypot(place[0], place[1]) < _FARTHEST
-                    fits &= (np.abs(place[0]) > half[0]) | (np.abs(place[1]) > half[1])
+                    fits = are_plausible(pitch, up, place[0], place[1])
                     for index, line in enumerate((first, second)):
                         ends = triples.reach[kept, index] * up[:, None] + ahead[:, None]
                         fits &= _within(ends, line[1:])
@@ -211,201 +193,18 @@ def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                             ]
                         )
                     )
-    level = _level_cameras(np.concatenate([np.empty((0, 9)), *found]))
-    return replace(level, rotations=_about_axis(roll) @ level.rotations)
+    level = level_cameras(np.concatenate([np.empty((0, 9)), *found]))
+    return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
 
-class _PaintedArc(NamedTuple):
-    """A circle, and a straight marking that crosses, bounds or passes it.
-
-    Attributes:
-        axis: along which the marking runs: 0 = x, 1 = y.
-        line: place of the marking on the other axis [m].
-        center: place of the circle's centre on this axis [m].
-        depth: distance of the centre from the marking, positive on the arc's side, in radii [1].
-        ways: which parts of the arc are in view, 1 = beyond the centre, -1 = before it.
-        radius: of the circle [m].
-        side: of the marking on which the arc lies, on the other axis [1]; 0 = on both.
-    """
-
-    axis: int
-    line: float
-    center: float
-    depth: float
-    ways: tuple[float, ...]
-    radius: float
-    side: float
-
-
-def _painted_arcs(pitch: PitchTemplate) -> list[_PaintedArc]:
-    """Return circles with the lines that they cross or that bound them, and with touch lines.
-
-    Those that half a turn makes equal to others are left out.
-    """
-    found = []
-    x_lines, y_lines = (np.unique(lines[:, 0]) for lines in _straight_lines(pitch))
-    for name, arc in pitch.arcs.items():
-        x, y = pitch.points[arc.center][:2].tolist()
-        if x > 0.0 or arc.radius < _MIN_RADIUS:
-            continue
-        places = pitch.marking_points(name, 0.25)[:, 0]
-        for line in y_lines.tolist():
-            beyond = places - line
-            if abs(x - line) > 0.8 * arc.radius or np.abs(beyond).min() > 0.3:
-                continue
-            crossed = beyond.min() < -1.0 and beyond.max() > 1.0
-            side = 0.0 if crossed else float(np.sign(beyond[np.abs(beyond).argmax()]))
-            depth = -abs(x - line) / arc.radius
-            found.append(_PaintedArc(1, line, y, depth, (1.0,), arc.radius, side))
-        if name == "center_circle":
-            line = float(x_lines.max())
-            depth = (line - y) / arc.radius
-            found.append(_PaintedArc(0, line, x, depth, (1.0, -1.0), arc.radius, -1.0))
-    return found
-
-
-def name_arcs(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
-    """Return the cameras with a roll of all segments with a circle of paint around them.
-
-    On the ground the normal of a circle passes through its centre. A pixel's distance from the
-    segment and its normal give radius and centre of the one circle for which it votes.
-    """
+def are_plausible(pitch: PitchTemplate, up: Floats, x: Floats, y: Floats) -> Flags:
+    """Return whether cameras (k,) at these heights and places [m] are outside of the pitch."""
     half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
-    rows, counts = [np.empty((0, 9))], [np.zeros(0)]
-    for seen in _beside_segments(paint, focals, roll):
-        across = np.stack([seen.along[:, 1], -seen.along[:, 0]], axis=-1)
-        for arc in _painted_arcs(pitch):
-            for sign in (1.0, -1.0) if arc.side else (0.0,):
-                radius, center, count = _vote_circle(seen, arc, sign)
-                up = arc.radius / radius
-                # Arcs lie on one side of their line: the frame may have to be turned.
-                turn = sign * arc.side if arc.side else 1.0
-                turn, way = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
-                beside = arc.line - way * turn * up * seen.offset
-                ahead = arc.center - turn * up * center
-                x, y = (beside, ahead) if arc.axis else (ahead, beside)
-                axes = (turn * across, turn * seen.along)
-                axes = axes if arc.axis else (turn * seen.along, -turn * across)
-                fits = (up > _HEIGHTS[0]) & (up < _HEIGHTS[1]) & (count >= _MIN_ARC)
-                fits &= np.hypot(x, y) < _FARTHEST
-                fits &= (np.abs(x) > half[0]) | (np.abs(y) > half[1])
-                rows.append(np.column_stack([seen.focals, seen.tilts, up, *axes, x, y])[fits])
-                counts.append(count[fits])
-    best = np.argsort(-np.concatenate(counts), kind="stable")[:_ARCS]
-    level = _level_cameras(np.concatenate(rows)[best])
-    return replace(level, rotations=_about_axis(roll) @ level.rotations)
+    fits = (up > _HEIGHTS[0]) & (up < _HEIGHTS[1]) & (np.hypot(x, y) < _FARTHEST)
+    return np.asarray(fits & ((np.abs(x) > half[0]) | (np.abs(y) > half[1])))
 
 
-class _Beside(NamedTuple):
-    """Pixels of paint beside a segment, in the ground frame of level cameras.
-
-    Attributes:
-        focals: (g,) [px].
-        tilts: (g,) [rad].
-        along: (g, 2) unit vector of the segment.
-        offset: (g,) of the segment across it, to its right [1].
-        places: (g, m, 2) of the pixels to the right of the segment and along it [1].
-        normals: (g, m, 2) unit normals of the paint, likewise.
-    """
-
-    focals: Floats
-    tilts: Floats
-    along: Floats
-    offset: Floats
-    places: Floats
-    normals: Floats
-
-
-def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Beside]:
-    """Yield the paint beside each segment at all focal lengths and tilts."""
-    middle = 0.5 * np.array([paint.size[0] - 1, paint.size[1] - 1])
-    points, ways = _paint_directions(paint.points)
-    if not len(points):
-        return
-    level = _about_axis(roll)[:2, :2]
-    ends = ((paint.segments[:_SEGMENTS] - middle) @ level).reshape(-1, 2)
-    start = (points - middle) @ level
-    focal, tilt = (
-        part.ravel() for part in np.meshgrid(focals * paint.size[0], _TILTS, indexing="ij")
-    )
-    lines, places, beyond = (
-        _to_ground(pixels, focal, tilt) for pixels in (ends, start, start + ways @ level)
-    )
-    lines = lines.reshape(len(focal), -1, 2, 2)
-    way = beyond - places
-    normals = np.stack([-way[..., 1], way[..., 0]], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    for index in range(lines.shape[1]):
-        along = lines[:, index, 1] - lines[:, index, 0]
-        along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        kept = np.isfinite(along).all(axis=-1)
-        axes = np.stack([along[:, ::-1] * [1.0, -1.0], along], axis=-1)[kept]
-        offset = (lines[kept, index].mean(axis=1) * axes[..., 0]).sum(axis=-1)
-        beside = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
-        yield _Beside(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
-
-
-def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
-    """Return places (g, n, 2) on the ground, right and forward; NaN above the horizon."""
-    cosine, sine, away = np.cos(tilt)[:, None], np.sin(tilt)[:, None], focal[:, None]
-    depth = pixels[:, 1] * cosine + away * sine
-    depth = np.where(depth > 1e-3 * away, depth, np.nan)
-    return np.stack([pixels[:, 0] / depth, (away * cosine - pixels[:, 1] * sine) / depth], axis=-1)
-
-
-def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
-    """Return some pixels of paint (m, 2), and unit vectors (m, 2) along it."""
-    points = paint[:: max(1, len(paint) // _ARC_POINTS)]
-    if not len(points):
-        return points, points
-    distance, index = cKDTree(paint).query(points, k=16, distance_upper_bound=_ARC_REACH)
-    near = np.isfinite(distance)
-    count = near.sum(axis=1)
-    around = np.where(near[..., None], paint[np.minimum(index, len(paint) - 1)], 0.0)
-    mean = around.sum(axis=1) / count[:, None]
-    off = np.where(near[..., None], around - mean[:, None], 0.0)
-    spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", off, off))
-    clear = (count >= 8) & (spread[:, 1] > 20.0 * spread[:, 0])
-    return mean[clear], axes[clear][:, :, 1]
-
-
-def _vote_circle(seen: _Beside, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
-    """Return radius, centre along the segment and share of pixels (g,) of the circle most vote for.
-
-    Args:
-        seen: paint.
-        arc: the circle and its marking.
-        sign: side of the paint, 0 = both.
-    """
-    beside, ahead, turned, onward = np.moveaxis(
-        np.concatenate([seen.places, seen.normals], axis=-1), -1, 0
-    )
-    rows = int(np.log(_RADIUS_RANGE[1] / _RADIUS_RANGE[0]) / _ARC_BINS[0]) + 1
-    cells = rows * _ARC_BINS[2]
-    counts = np.zeros(len(beside) * cells, np.int64)
-    for way in arc.ways:
-        steep = arc.depth + way * np.abs(turned)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            radius = np.abs(beside) / steep
-            used = (steep > 0.2) & (radius > _RADIUS_RANGE[0]) & (radius < _RADIUS_RANGE[1])
-            if sign:
-                used &= beside * sign > 0.0
-        g, m = np.nonzero(used)
-        found = radius[g, m]
-        toward = way * np.sign(beside[g, m]) * np.sign(turned[g, m])
-        column = (ahead[g, m] / found - toward * onward[g, m]) / _ARC_BINS[1] + 0.5 * _ARC_BINS[2]
-        row = np.log(found / _RADIUS_RANGE[0]) / _ARC_BINS[0]
-        kept = (column >= 0.0) & (column < _ARC_BINS[2])
-        cell = row[kept].astype(np.int64) * _ARC_BINS[2] + column[kept].astype(np.int64)
-        counts += np.bincount(g[kept] * cells + cell, minlength=len(counts))
-    votes = counts.reshape(-1, cells)
-    best = votes.argmax(axis=1)
-    size = _RADIUS_RANGE[0] * np.exp((best // _ARC_BINS[2] + 0.5) * _ARC_BINS[0])
-    place = (best % _ARC_BINS[2] + 0.5 - 0.5 * _ARC_BINS[2]) * _ARC_BINS[1] * size
-    return size, place, votes.max(axis=1) / max(1, beside.shape[1])
-
-
-def _about_axis(roll: float) -> Floats:
+def turn_about_axis(roll: float) -> Floats:
     """Return the turn (3, 3) of a camera about its axis."""
     cosine, sine = np.cos(roll), np.sin(roll)
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -417,7 +216,7 @@ def _within(ends: Floats, line: Floats) -> NDArray[np.bool_]:
     return np.asarray((ends[:, 0] > line[0] - beyond) & (ends[:, 1] < line[1] + beyond))
 
 
-def _level_cameras(rows: Floats) -> Candidates:
+def level_cameras(rows: Floats) -> Candidates:
     """Return cameras on the near side of rows (k, 9).
 
     Args:
@@ -442,10 +241,10 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
     """Yield triples at all focal lengths and tilts, one segment's direction after another's."""
     width, height = paint.size
     middle = 0.5 * np.array([width - 1, height - 1])
-    ends = (paint.segments[:_SEGMENTS] - middle) @ _about_axis(roll)[:2, :2]
+    ends = (paint.segments[:SEGMENTS] - middle) @ turn_about_axis(roll)[:2, :2]
     if len(ends) < 3:
         return
-    focal, tilt = (part.ravel() for part in np.meshgrid(focals * width, _TILTS, indexing="ij"))
+    focal, tilt = (part.ravel() for part in np.meshgrid(focals * width, TILTS, indexing="ij"))
     cosine, sine = np.cos(tilt)[:, None, None], np.sin(tilt)[:, None, None]
     away = focal[:, None, None]
     depth = ends[None, ..., 1] * cosine + away * sine
@@ -557,6 +356,33 @@ def score_candidates(
         worth = loss + (gain - loss) * found
         scores[part] = (seen.lengths * worth).sum(axis=1) / (INDEPENDENT * paint.size[0])
     return scores
+
+
+def score_with_prior(
+    paint: PaintMap, samples: LineSamples, found: Candidates, prior: CameraPrior, spread: float
+) -> Floats:
+    """Return the scores (k,) of candidates with the densities of heights, distances and focals.
+
+    Args:
+        paint: of the image.
+        samples: of the markings.
+        found: (k,) cameras.
+        prior: heights, distances, focal lengths.
+        spread: standard deviation of a marking's distance from its paint [px].
+    """
+    scores = score_candidates(paint, samples, found, spread)
+    return scores + _log_prior(found, prior, paint.size)
+
+
+def _log_prior(candidates: Candidates, prior: CameraPrior, size: tuple[int, int]) -> Floats:
+    """Return log densities (k,) of heights, distances and focal lengths, up to a constant."""
+    deviations = (
+        np.log(candidates.centers[:, 2] / prior.height_m) / prior.log_height_std,
+        np.log(np.linalg.norm(candidates.centers[:, :2], axis=1) / prior.distance_m)
+        / prior.log_distance_std,
+        np.log(candidates.focals / (size[0] * prior.focal)) / prior.log_focal_std,
+    )
+    return np.asarray(-0.5 * np.square(deviations).sum(axis=0))
 
 
 def refine_candidates(
