@@ -1,13 +1,15 @@
 """Compares the camera of a real broadcast clip with lines drawn by hand.
 
     python benchmarks/broadcast_clip.py fetch DATA
-    python benchmarks/broadcast_clip.py score DATA
+    python benchmarks/broadcast_clip.py score DATA [--proposed]
 
 The clip: 51 frames of a league match from the repository of narya (MIT), squeezed to 512 x 512
 there; `fetch` gets them by git, checks the digest of the folder and restores 16:9. Key frames
 (0, 25, 50) are clicked and drawn, and further six frames drawn twice, off enlargements by eye
 (tests/real/broadcast_clip); the second drawing was made without the first. Distances are across
 the lines, in the columns of the squeezed images; `score` also prints what the camera states there.
+`--proposed` takes no click: key frames are proposed in eight frames, as the stage does, with the
+side `near`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import time
 from pathlib import Path
 
 import cv2
@@ -27,6 +30,7 @@ from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
     BroadcastClip,
     calibrate_broadcast,
+    propose_key_frames,
 )
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.pitch import PitchTemplate
@@ -38,6 +42,8 @@ FOLDER = "test_img"
 TREE = "28b4a46a77f33086b844a19ada649bf380d80a72"
 """Git's digest of the folder and all its files."""
 FRAMES, FPS = 51, 25.0
+PROPOSED_FRAMES = 8
+"""Frames in which the stage proposes key frames [1]."""
 SIZE = (910, 512)
 """Width, height of the restored images [px]."""
 SQUEEZED = 512
@@ -104,12 +110,20 @@ def read_drawn(name: str) -> KeyFrames:
 
 
 def calibrate(
-    data: Path, settings: BroadcastCalibrationSettings | None = None
+    data: Path, settings: BroadcastCalibrationSettings | None = None, *, proposed: bool = False
 ) -> BroadcastCalibration:
-    """Return the clip's camera, from its key frames."""
+    """Return the clip's camera, from its key frames, clicked or proposed."""
     with open_video(data / "frames") as video:
         pictures = [picture for _, picture in video.frames(grey=True)]
-    clip = BroadcastClip(read_drawn("clicks.json").key_frames, lambda: iter(pictures), FPS)
+        numbers = np.linspace(0, FRAMES - 1, PROPOSED_FRAMES).astype(int).tolist()
+        shown = [next(video.frames(number, number + 1)) for number in numbers]
+    keys = [*read_drawn("clicks.json").key_frames]
+    if proposed:
+        start, pitch = time.perf_counter(), PitchTemplate.standard()
+        keys = propose_key_frames(shown, pitch, side="near", where=str(data))
+        took = time.perf_counter() - start
+        print(f"key frames proposed in frames {[key.frame for key in keys]}, {took:.0f} s")
+    clip = BroadcastClip(keys, lambda: iter(pictures), FPS)
     settings = settings or BroadcastCalibrationSettings()
     return calibrate_broadcast(PitchTemplate.standard(), clip, settings)
 
@@ -168,9 +182,11 @@ def repeatability(one: list[Row], two: list[Row]) -> float:
     return float(np.sqrt(np.mean([(means[0][key] - means[1][key]) ** 2 for key in both]) / 2.0))
 
 
-def score(data: Path) -> None:
+def score(data: Path, proposed: bool) -> None:
     """Print distances of hand-drawn lines, by drawing and by marking."""
-    found = calibrate(data)
+    start = time.perf_counter()
+    found = calibrate(data, proposed=proposed)
+    print(f"{time.perf_counter() - start:.0f} s for {FRAMES} frames")
     camera, std = found.camera, np.sqrt(np.diag(found.uncertainty.clip))
     print("center {:.2f} {:.2f} {:.2f} m".format(*camera.center), end="")
     print(", standard deviations {:.2f} {:.2f} {:.2f}".format(*std[:3]))
@@ -199,12 +215,13 @@ def main() -> None:
     parser.add_argument("command", choices=("fetch", "score"))
     parser.add_argument("data", type=Path)
     parser.add_argument("--repository", default=REPOSITORY)
+    parser.add_argument("--proposed", action="store_true")
     options = parser.parse_args()
     if options.command == "fetch":
         options.data.mkdir(parents=True, exist_ok=True)
         fetch(options.data, options.repository)
     else:
-        score(options.data)
+        score(options.data, options.proposed)
 
 
 if __name__ == "__main__":

@@ -57,6 +57,8 @@ SIZE = (1280, 720)
 """Width, height of the images of drawn lines [px]."""
 RIGHT_PX = 5.0
 """Largest distance of a drawn line from its marking, at a width of 960 [px]."""
+GOOD_M = 0.05
+"""Median ground error at the players of a good camera [m]."""
 WRONG_M = 0.5
 """Median ground error from which an accepted camera is wrong [m]."""
 SIDE_FRAMES = 12
@@ -266,7 +268,7 @@ def images(files: Sequence[Path], out: Path | None) -> Iterator[Outcome]:
 
 
 def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
-    """Print the share that is accepted, and the errors among those."""
+    """Print the share that is accepted, the errors among those, and why others are not."""
     accepted = np.array([each.accepted for each in outcomes])
     errors = np.array([each.error for each in outcomes])
     seconds = np.median([each.seconds for each in outcomes])
@@ -278,6 +280,8 @@ def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
             f"error of the accepted [{unit}]: median {np.median(errors[known]):.3g}, "
             f"95 % {np.quantile(errors[known], 0.95):.3g}; {wrong} wrong (over {limit:g})"
         )
+        if unit == "m":
+            print(f"{(errors[known] <= GOOD_M).mean():.1%} of them within {100 * GOOD_M:g} cm")
     refused = ~accepted & np.isfinite(errors)
     if refused.any():
         right = int(np.count_nonzero(errors[refused] <= limit))

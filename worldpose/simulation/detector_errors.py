@@ -24,8 +24,7 @@ from worldpose.formats import write_archive
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.gait import walk
-from worldpose.simulation.motions import bursts, drift
-from worldpose.simulation.paths import wander
+from worldpose.simulation.paths import bursts, drift, wander
 from worldpose.simulation.settings import CrowdSettings, ObservationNoise, Scenario
 from worldpose.simulation.skeletons import draw_body
 

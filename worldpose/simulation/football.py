@@ -11,8 +11,8 @@ from scipy.interpolate import interp1d
 
 from data_contracts.arrays import Floats
 from worldpose.simulation.falls import dive, fall, slide
-from worldpose.simulation.motions import SETTLE, Action, Motion, drift, jump, kick
-from worldpose.simulation.paths import MARGIN, STEP, GroundPath, keep_ready
+from worldpose.simulation.motions import SETTLE, Action, Motion, jump, kick
+from worldpose.simulation.paths import MARGIN, STEP, GroundPath, drift, keep_ready
 from worldpose.simulation.settings import ActionRates, CrowdSettings
 
 PASS_EVERY: Final = (2.0, 4.5)

@@ -32,8 +32,7 @@ from worldpose.simulation.detector_errors import (
     project_bodies,
     report,
 )
-from worldpose.simulation.motions import bursts, drift
-from worldpose.simulation.paths import Clip, GroundPath
+from worldpose.simulation.paths import Clip, GroundPath, bursts, drift
 from worldpose.simulation.settings import BroadcastSettings, RigSettings, Scenario
 
 STANDARD_PERSON: Final = 1.8

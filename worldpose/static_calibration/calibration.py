@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.pitch.template import law_points
 from worldpose.static_calibration.adjustment import (
     Problem,
     adjust,
     build_problem,
+    camera_row,
 )
 from worldpose.static_calibration.click_outliers import (
     CLEAR_GAIN,
@@ -95,6 +97,7 @@ def calibrate_camera(
     settings: StaticCalibrationSettings | None = None,
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
+    start: Camera | None = None,
 ) -> StaticCalibration:
     """Return the camera of an image, its covariance and its report.
 
@@ -112,6 +115,8 @@ def calibrate_camera(
         where: file or camera, for messages.
         lens: a lens that was calibrated before, the prior of focal length, principal point and
             distortion; its k1, k2 and k3 are then all solved for. None = not known.
+        start: a camera near the answer, which replaces stage 1. Where the markings are their own
+            image after half a turn, it decides the side.
 
     Raises:
         InputError: a name is unknown, a pixel lies outside the image, names are mirrored, the
@@ -127,7 +132,11 @@ def calibrate_camera(
     evidence = gather_evidence(pitch, clicked, image_size, stated.sample_spacing_m, where)
     check_amount(evidence, pitch, where)
     problem = build_problem(evidence, image_size, stated, where=where, lens=lens)
-    found = fit_inliers_at_best_noise(problem, find_start(problem, stated), stated)
+    if start is None:
+        near = find_start(problem, stated)
+    else:
+        near, _ = fit_from_starts(problem, camera_row(start)[None], stated.wrong_click)
+    found = fit_inliers_at_best_noise(problem, near, stated)
     found = _find_explanation(found, pitch, stated)
     check_determined(found, pitch)
     found = _try_k3(found)

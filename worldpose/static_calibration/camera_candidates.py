@@ -18,16 +18,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
+from worldpose.static_calibration.settings import CameraPrior
 
-_TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
+TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
 """Tilts below the horizon to try [rad]."""
 _LEVEL: Final = np.radians(5.0)
 """Deviation of two segments from a right angle, or from parallels, on the pitch [rad]."""
-_SEGMENTS: Final = 12
+SEGMENTS: Final = 12
 """Maximum segments to name, those with the most paint [1]."""
 _BEYOND: Final = (0.15, 1.5)
 """Reach of a segment beyond its marking: share of its length [1], and [m]."""
@@ -109,7 +110,7 @@ def join_candidates(*parts: Candidates) -> Candidates:
     )
 
 
-def _straight_lines(pitch: PitchTemplate) -> tuple[Floats, Floats]:
+def straight_lines(pitch: PitchTemplate) -> tuple[Floats, Floats]:
     """Return painted lines along x (n, 3) as y, first and last x, and along y (m, 3) [m]."""
     along: tuple[list[list[float]], list[list[float]]] = ([], [])
     for line in pitch.lines.values():
@@ -151,8 +152,7 @@ class _Triples:
 
 def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
     """Return the cameras with a roll of all triples of segments under all names that fit them."""
-    x_lines, y_lines = _straight_lines(pitch)
-    half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
+    x_lines, y_lines = straight_lines(pitch)
     found: list[Floats] = []
     for triples in _ground_triples(paint, focals, roll):
         for axis, (pair, third) in enumerate(((x_lines, y_lines), (y_lines, x_lines))):
@@ -162,15 +162,14 @@ def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                 gap = triples.offsets[:, 0] - triples.offsets[:, 1]
                 with np.errstate(divide="ignore", invalid="ignore"):
                     height = sign * (first[0] - second[0]) / gap
-                tall = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1])
+                tall = np.flatnonzero((height > _HEIGHTS[0]) & (height < _HEIGHTS[1]))
                 for other in third:
-                    kept = np.flatnonzero(tall)
+                    kept = tall
                     up = height[kept]
                     beside = sign * first[0] - up * triples.offsets[kept, 0]
                     ahead = other[0] - up * triples.offset[kept]
                     place = (ahead, beside) if axis == 0 else (-beside, ahead)
-                    fits = np.hypot(place[0], place[1]) < _FARTHEST
-                    fits &= (np.abs(place[0]) > half[0]) | (np.abs(place[1]) > half[1])
+                    fits = are_plausible(pitch, up, place[0], place[1])
                     for index, line in enumerate((first, second)):
                         ends = triples.reach[kept, index] * up[:, None] + ahead[:, None]
                         fits &= _within(ends, line[1:])
@@ -194,11 +193,18 @@ def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                             ]
                         )
                     )
-    level = _level_cameras(np.concatenate([np.empty((0, 9)), *found]))
-    return replace(level, rotations=_about_axis(roll) @ level.rotations)
+    level = level_cameras(np.concatenate([np.empty((0, 9)), *found]))
+    return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
 
-def _about_axis(roll: float) -> Floats:
+def are_plausible(pitch: PitchTemplate, up: Floats, x: Floats, y: Floats) -> Flags:
+    """Return whether cameras (k,) at these heights and places [m] are outside of the pitch."""
+    half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
+    fits = (up > _HEIGHTS[0]) & (up < _HEIGHTS[1]) & (np.hypot(x, y) < _FARTHEST)
+    return np.asarray(fits & ((np.abs(x) > half[0]) | (np.abs(y) > half[1])))
+
+
+def turn_about_axis(roll: float) -> Floats:
     """Return the turn (3, 3) of a camera about its axis."""
     cosine, sine = np.cos(roll), np.sin(roll)
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -210,7 +216,7 @@ def _within(ends: Floats, line: Floats) -> NDArray[np.bool_]:
     return np.asarray((ends[:, 0] > line[0] - beyond) & (ends[:, 1] < line[1] + beyond))
 
 
-def _level_cameras(rows: Floats) -> Candidates:
+def level_cameras(rows: Floats) -> Candidates:
     """Return cameras on the near side of rows (k, 9).
 
     Args:
@@ -235,10 +241,10 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
     """Yield triples at all focal lengths and tilts, one segment's direction after another's."""
     width, height = paint.size
     middle = 0.5 * np.array([width - 1, height - 1])
-    ends = (paint.segments[:_SEGMENTS] - middle) @ _about_axis(roll)[:2, :2]
+    ends = (paint.segments[:SEGMENTS] - middle) @ turn_about_axis(roll)[:2, :2]
     if len(ends) < 3:
         return
-    focal, tilt = (part.ravel() for part in np.meshgrid(focals * width, _TILTS, indexing="ij"))
+    focal, tilt = (part.ravel() for part in np.meshgrid(focals * width, TILTS, indexing="ij"))
     cosine, sine = np.cos(tilt)[:, None, None], np.sin(tilt)[:, None, None]
     away = focal[:, None, None]
     depth = ends[None, ..., 1] * cosine + away * sine
@@ -350,6 +356,33 @@ def score_candidates(
         worth = loss + (gain - loss) * found
         scores[part] = (seen.lengths * worth).sum(axis=1) / (INDEPENDENT * paint.size[0])
     return scores
+
+
+def score_with_prior(
+    paint: PaintMap, samples: LineSamples, found: Candidates, prior: CameraPrior, spread: float
+) -> Floats:
+    """Return the scores (k,) of candidates with the densities of heights, distances and focals.
+
+    Args:
+        paint: of the image.
+        samples: of the markings.
+        found: (k,) cameras.
+        prior: heights, distances, focal lengths.
+        spread: standard deviation of a marking's distance from its paint [px].
+    """
+    scores = score_candidates(paint, samples, found, spread)
+    return scores + _log_prior(found, prior, paint.size)
+
+
+def _log_prior(candidates: Candidates, prior: CameraPrior, size: tuple[int, int]) -> Floats:
+    """Return log densities (k,) of heights, distances and focal lengths, up to a constant."""
+    deviations = (
+        np.log(candidates.centers[:, 2] / prior.height_m) / prior.log_height_std,
+        np.log(np.linalg.norm(candidates.centers[:, :2], axis=1) / prior.distance_m)
+        / prior.log_distance_std,
+        np.log(candidates.focals / (size[0] * prior.focal)) / prior.log_focal_std,
+    )
+    return np.asarray(-0.5 * np.square(deviations).sum(axis=0))
 
 
 def refine_candidates(

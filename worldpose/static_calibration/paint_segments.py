@@ -38,9 +38,11 @@ _DIRECTIONS: Final = 12
 """Directions of ridges to try [1]: 15 degrees apart."""
 _HALF_WIDTHS: Final = (3.0, 5.0, 8.0)
 """Distances between a ridge's middle and the grass beside it [px]."""
-_MIN_CONTRAST: Final = 8.0
-"""Minimum brightness of a ridge above both sides, CIE L in 0 to 255 [1]: faded paint has 10 to 20,
-noise of grass 2 to 4."""
+_CONTRAST: Final = (4.0, 8.0)
+"""Least and greatest minimum brightness of a ridge above both sides, CIE L in 0 to 255 [1]: faded
+paint has 10 to 20, thin far lines and fog 4 to 8."""
+_ABOVE_NOISE: Final = 6.0
+"""This minimum, in medians of all ridges [1]: nearly all are noise of the grass, of 0.5 to 4."""
 _MIN_EXTENT: Final = 20
 """Minimum extent of connected ridge pixels [px]; shorter ones are noise of the grass."""
 _CROWDED: Final = (41, 0.12)
@@ -63,6 +65,8 @@ _BENDS: Final = (0.0, -0.03, -0.06, -0.09, -0.12, -0.15, -0.18, -0.22, -0.26)
 to an action camera."""
 _BEND_GAIN: Final = 0.9
 """Length of straight paint, of the maximum, that suffices for no displacement [1]."""
+_BEND_DOUBT: Final = 0.6
+"""Length of straight paint, of the maximum, from which no displacement is tried too [1]."""
 _OTHER_BENDS: Final = (1.0, 0.8, 0.65)
 """Displacements to offer for a bent image, of the one that makes the most paint straight [1]: a
 single long line prefers one that is too large."""
@@ -163,7 +167,9 @@ def thin_ridges(strength: NDArray[np.float32], normal: Floats) -> Ridges:
         strength: (height, width) contrast of ridges one pixel wide, 0 elsewhere.
         normal: (height, width) angle of the ridge's normal in [0, pi) [rad].
     """
-    thin = (strength > _MIN_CONTRAST).astype(np.uint8)
+    ridges = strength[strength > 0.0]
+    noise = float(np.median(ridges)) if len(ridges) else 0.0
+    thin = (strength > np.clip(_ABOVE_NOISE * noise, *_CONTRAST)).astype(np.uint8)
     joined = cv2.dilate(thin, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
     large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= _MIN_EXTENT
@@ -274,10 +280,13 @@ def _find_lenses(ridges: Ridges, image_size: tuple[int, int], scale: float) -> t
         flat = _flatten(ridges, guess_lens(bend, image_size), scale, size)[0]
         segments = _find_segments(flat, float(np.hypot(size[0], size[1])), _COMPARED)
         straight.append(sum(count for count, _ in segments))
+    straightest = guess_lens(0.0, image_size)
     if straight[0] >= _BEND_GAIN * max(straight):
-        return (guess_lens(0.0, image_size),)
+        return (straightest,)
     best = _BENDS[int(np.argmax(straight))]
-    return tuple(guess_lens(share * best, image_size) for share in _OTHER_BENDS)
+    bent = tuple(guess_lens(share * best, image_size) for share in _OTHER_BENDS)
+    # A lens that bends a circle straight gains paint too.
+    return (straightest, *bent) if straight[0] >= _BEND_DOUBT * max(straight) else bent
 
 
 def _map_distances(

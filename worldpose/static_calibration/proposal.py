@@ -34,8 +34,9 @@ from worldpose.static_calibration.camera_candidates import (
     name_triples,
     project_markings,
     refine_candidates,
-    score_candidates,
+    score_with_prior,
 )
+from worldpose.static_calibration.circle_candidates import name_circles
 from worldpose.static_calibration.line_samples import LineSamples, sample_markings
 from worldpose.static_calibration.paint_segments import PaintMap, find_paint, trace_marking
 from worldpose.static_calibration.report import StaticCalibration
@@ -76,6 +77,9 @@ _SAME: Final = 8.0
 """Median displacement of the markings below which two cameras are the same proposal [px]."""
 _DRAWN: Final = 40
 """Maximum pixels to draw along a marking [1]."""
+_DRAWN_SHARE: Final = 0.4
+"""Minimum share on paint of a marking that the calibration uses [1]: thin far lines are found in
+pieces."""
 _ON_PAINT: Final = 4.0
 """Maximum distance of a marking from its paint [px]."""
 
@@ -329,6 +333,7 @@ def calibrate_proposal(
             settings=stated,
             where=where,
             lens=lens,
+            start=proposal.camera,
         )
 
     calibration = calibrate(proposal.drawn)
@@ -337,9 +342,11 @@ def calibrate_proposal(
         names = {each.name for each in thin}
         kept = (each for each in proposal.drawn.drawn if each.name not in names)
         calibration = calibrate(ClickedMarkings(drawn=(*kept, *thin)))
-    places = pitch.sample_lines(_FINE[0]).points_world
+    lines = calibration.report.lines  # each camera has its own ground
+    there = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
     pixels, others = (
-        camera.project(places) for camera in (proposal.camera, calibration.estimate.camera)
+        camera.project(ground.sample_lines(_FINE[0]).points_world)
+        for camera, ground in ((proposal.camera, pitch), (calibration.estimate.camera, there))
     )
     inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
     moved = float(np.median(np.linalg.norm(pixels - others, axis=1)[inside]))
@@ -354,9 +361,8 @@ def calibrate_proposal(
         f"{PROPOSED}: {proposal.found:.0%} of their length on paint, "
         f"{proposal.margin:.0f} above other cameras"
     )
-    report = calibration.report
-    report = replace(report, decisions=(decision, *report.decisions))
-    return replace(calibration, report=report)
+    decisions = (decision, *calibration.report.decisions)
+    return replace(calibration, report=replace(calibration.report, decisions=decisions))
 
 
 def _trace_thin_markings(
@@ -436,25 +442,31 @@ def _rank_rolled(
 ) -> tuple[Candidates, Floats]:
     """Return different cameras near some rolls, the best first, and their scores (k,)."""
     found = join_candidates(*(name_triples(paint, pitch, focals, roll) for roll in rolls))
-    if not len(found):
+    circles = join_candidates(*(name_circles(paint, pitch, focals, roll) for roll in rolls))
+    if not len(found) + len(circles):
         return found, np.zeros(0)
-    for (spacing, spread), count in ((_COARSE, _GOOD), (_SAMPLED, 10 * _REFINED)):
-        if len(found) > count or spacing == _SAMPLED[0]:
-            samples = sample_markings(pitch, spacing)
-            scores = score_candidates(paint, samples, found, spread) + _log_prior(
-                found, prior, paint.size
-            )
-            found = found[np.argsort(-scores, kind="stable")[:count]]
+    if len(found) > _GOOD:
+        found = _keep_best(paint, sample_markings(pitch, _COARSE[0]), found, prior, _COARSE[1])
+    samples = sample_markings(pitch, _SAMPLED[0])
+    # The vote for circles is coarse: bins of 8 to 15 %.
+    near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
+    found = _keep_best(paint, samples, join_candidates(found, near), prior, _SAMPLED[1])
     samples = sample_markings(pitch, _FINE[0])
-    found = _thin_out(found)
+    found = _thin_out(found[: 10 * _REFINED])
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
         found = refine_candidates(paint, samples, found[:count], radii, free)
-        scores = score_candidates(paint, samples, found, _FINE[1]) + _log_prior(
-            found, prior, paint.size
-        )
+        scores = score_with_prior(paint, samples, found, prior, _FINE[1])
         found, scores = _order(paint, samples, found, scores)
     return found, scores
+
+
+def _keep_best(
+    paint: PaintMap, samples: LineSamples, found: Candidates, prior: CameraPrior, spread: float
+) -> Candidates:
+    """Return the good candidates, the best first."""
+    scores = score_with_prior(paint, samples, found, prior, spread)
+    return found[np.argsort(-scores, kind="stable")[:_GOOD]]
 
 
 def _order(
@@ -466,17 +478,6 @@ def _order(
     found, scores = _stand_on(found[order], "near"), scores[order]
     different = _different(paint, samples, found)
     return found[different], scores[different]
-
-
-def _log_prior(candidates: Candidates, prior: CameraPrior, size: tuple[int, int]) -> Floats:
-    """Return log densities (k,) of heights, distances and focal lengths, up to a constant."""
-    deviations = (
-        np.log(candidates.centers[:, 2] / prior.height_m) / prior.log_height_std,
-        np.log(np.linalg.norm(candidates.centers[:, :2], axis=1) / prior.distance_m)
-        / prior.log_distance_std,
-        np.log(candidates.focals / (size[0] * prior.focal)) / prior.log_focal_std,
-    )
-    return np.asarray(-0.5 * np.square(deviations).sum(axis=0))
 
 
 def _thin_out(candidates: Candidates) -> Candidates:
@@ -542,7 +543,7 @@ def _support(
         on = mine & (seen.distances[0] < _ON_PAINT)
         found = float(seen.lengths[0, on].sum()) / length
         support.append(MarkingSupport(name, length, found))
-        if found * length < INDEPENDENT * paint.size[0] or found < 0.5:
+        if found * length < INDEPENDENT * paint.size[0] or found < _DRAWN_SHARE:
             continue
         nearest, place = np.unique(seen.nearest[0, on], return_index=True)
         chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _DRAWN)).astype(np.int64)

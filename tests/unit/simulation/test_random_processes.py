@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from worldpose.simulation import ObservationNoise
-from worldpose.simulation.motions import bursts, drift
+from worldpose.simulation.paths import bursts, drift
 
 
 def lengths_of_stretches(on):

@@ -1,0 +1,138 @@
+"""Cameras from one straight marking and the circle around it, against the true camera."""
+
+import numpy as np
+import pytest
+
+from worldpose.geometry import Camera
+from worldpose.pitch import PitchTemplate
+from worldpose.simulation.renderer import render_pitch
+from worldpose.simulation.scene import look_at
+from worldpose.static_calibration import calibrate_without_clicks
+from worldpose.static_calibration.camera_candidates import refine_candidates
+from worldpose.static_calibration.circle_candidates import name_circles
+from worldpose.static_calibration.line_samples import sample_markings
+from worldpose.static_calibration.paint_segments import (
+    Ridges,
+    guess_lens,
+    straighten_paint,
+    thin_ridges,
+)
+from worldpose.static_calibration.proposal import propose_from_paint
+
+PITCH = PitchTemplate.standard()
+SIZE = (1280, 720)
+FOCALS = np.geomspace(0.45, 5.0, 13)
+VIEWS = {
+    "halfway line and circle": ((0.0, 1.0), 2300.0, ("halfway_line", "center_circle")),
+    "touch line and half a circle": ((-17.0, 18.0), 2300.0, ("touch_line_far", "center_circle")),
+    "area and arc": ((-33.0, 0.0), 2600.0, ("penalty_area_left_front", "penalty_arc_left")),
+}
+
+
+def camera(aim, focal, center=(-2.0, -66.0, 15.0)):
+    return Camera(
+        focal=np.array([focal, focal]),
+        principal_point=0.5 * (np.array(SIZE) - 1.0),
+        distortion=np.zeros(5),
+        cam_from_world=look_at(np.array(center), np.array([*aim, 0.0]), 0.0),
+        image_size=np.array(SIZE),
+    )
+
+
+def paint_of(true, names):
+    """Pixels of markings, as a flawless detector would find them."""
+    points, normals = [], []
+    for name in names:
+        pixels = true.project(PITCH.marking_points(name, 0.02))
+        inside = ((pixels >= 0.0) & (pixels <= np.array(SIZE) - 1.0)).all(axis=1)
+        way = np.gradient(pixels, axis=0)
+        points.append(pixels[inside])
+        normals.append((np.arctan2(way[:, 1], way[:, 0]) + 0.5 * np.pi)[inside] % np.pi)
+    ridges = Ridges(np.concatenate(points), np.concatenate(normals))
+    return straighten_paint(ridges, np.ones(SIZE[::-1], np.bool_), guess_lens(0.0, SIZE), 1.0)
+
+
+def farthest(found, true, names):
+    """The largest distance of the markings' pixels in two cameras, up to half a turn [px]."""
+    off = []
+    for turn in (1.0, -1.0):
+        moved = []
+        for name in names:
+            places = PITCH.marking_points(name, 0.5)
+            pixels = true.project(places)
+            others = found.project(places * [turn, turn, 1.0])
+            seen = ((pixels >= 0.0) & (pixels <= np.array(SIZE) - 1.0)).all(axis=1)
+            moved.append(np.linalg.norm(others - pixels, axis=1)[seen].max())
+        off.append(max(moved))
+    return min(off)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_marking_and_a_circle_give_a_camera_that_explains_them(view):
+    aim, focal, names = VIEWS[view]
+    true = camera(aim, focal)
+    paint = paint_of(true, names)
+    found = name_circles(paint, PITCH, FOCALS, 0.0)
+    assert len(found) > 10
+    assert (found.centers[:, 1] <= 0.0).all()  # on the near side
+    samples = sample_markings(PITCH, 1.0)
+    near = refine_candidates(paint, samples, found, (25.0, 12.0, 6.0, 5.0), (True, False))
+    cameras = [
+        Camera(
+            focal=np.full(2, near.focals[k]),
+            principal_point=true.principal_point,
+            distortion=np.zeros(5),
+            cam_from_world=look_at_pose(near.rotations[k], near.centers[k]),
+            image_size=true.image_size,
+        )
+        for k in range(len(near))
+    ]
+    assert min(farthest(each, true, names) for each in cameras) < 4.0
+
+
+def look_at_pose(rotation, center):
+    pose = look_at(np.array([0.0, -10.0, 5.0]), np.zeros(3), 0.0)
+    return type(pose)(rotation, -rotation @ center)
+
+
+def test_midfield_is_proposed_where_three_straight_markings_are_not_in_view():
+    true = camera((0.0, -6.0), 3900.0)  # no touch line in view
+    names = ("halfway_line", "center_circle")
+    proposal = propose_from_paint([paint_of(true, names)], PITCH, side="near")
+    assert proposal is not None
+    assert proposal.is_clear
+    assert farthest(proposal.camera, true, names) < 3.0
+
+
+def test_a_midfield_still_is_calibrated_on_the_stated_side():
+    true = camera((0.0, 1.0), 2300.0)
+    still = render_pitch(true, PITCH, None, 5)
+    for side, sign in (("near", -1.0), ("far", 1.0)):
+        found = calibrate_without_clicks(PITCH, still, side=side).estimate.camera
+        assert found.center[1] * sign > 30.0
+        assert farthest(found, true, ("halfway_line", "center_circle")) < 3.0
+
+
+def test_a_pitch_that_falls_to_its_goal_line_does_not_contradict_its_proposal():
+    fallen = PITCH.with_surface(np.array([0.2, 0.6]))
+    true = camera((-44.0, 0.0), 2600.0, (-30.0, -66.0, 15.0))
+    still = render_pitch(true, fallen, None, 6)
+    found = calibrate_without_clicks(PITCH, still, side="near")
+    assert found.report.lines is not None
+    pitch = PITCH.with_surface(found.report.lines.estimate.surface)
+    places = fallen.marking_points("goal_line_left", 0.5)
+    pixels = true.project(places)
+    seen = ((pixels >= 0.0) & (pixels <= np.array(SIZE) - 1.0)).all(axis=1)
+    others = found.estimate.camera.project(pitch.marking_points("goal_line_left", 0.5))
+    assert np.linalg.norm(others - pixels, axis=1)[seen].max() < 3.0
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.5, True), (3.0, False)])
+def test_faint_paint_counts_where_the_grass_is_even(noise, kept):
+    rng = np.random.default_rng(1)
+    strength = np.abs(rng.normal(0.0, 1.48 * noise, (200, 400))).astype(np.float32)
+    strength[rng.random(strength.shape) < 0.5] = 0.0
+    strength[100, 50:350] = 6.0
+    ridges = thin_ridges(strength, np.full(strength.shape, 0.5 * np.pi))
+    on_line = (ridges.points[:, 1] == 100.0) & (ridges.points[:, 0] >= 50.0)
+    assert bool(np.count_nonzero(on_line) > 250) is kept

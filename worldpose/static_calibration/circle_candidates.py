@@ -1,0 +1,231 @@
+"""Candidate cameras from a segment of paint and the circle around it (C2).
+
+Where the centre circle, or the arc of a penalty area, is in view, one straight marking beside it
+determines a camera without roll: midfield shows no three straight markings. On the ground the
+normal of a circle passes through its centre, so that every pixel of paint votes for one circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_contracts.arrays import Floats
+from worldpose.pitch import PitchTemplate
+from worldpose.static_calibration.camera_candidates import (
+    SEGMENTS,
+    TILTS,
+    Candidates,
+    are_plausible,
+    level_cameras,
+    straight_lines,
+    turn_about_axis,
+)
+from worldpose.static_calibration.paint_segments import PaintMap
+
+_MIN_ARC: Final = 0.01
+"""Minimum share of the paint on a circle [1]."""
+_MIN_RADIUS: Final = 3.0
+"""Minimum radius of such a circle [m]: corner arcs are too small."""
+_ARC_BINS: Final = (0.08, 0.15, 160)
+"""Bins of the vote for circles: radius in its logarithm [1], place of the centre along the line in
+radii [1], and their number."""
+_RADIUS_RANGE: Final = (0.1, 5.0)
+"""Radii of circles to vote for, in heights of the camera [1]."""
+_ARC_POINTS: Final = 1200
+"""Pixels of paint that vote for circles, at least [1]."""
+_ARC_REACH: Final = 14.0
+"""Reach of the neighbors that give the direction of a pixel's paint [px]."""
+_ARCS: Final = 400
+"""Maximum candidates from circles, those with the most paint [1]."""
+
+
+class _PaintedArc(NamedTuple):
+    """A circle, and a straight marking that crosses, bounds or passes it.
+
+    Attributes:
+        axis: along which the marking runs: 0 = x, 1 = y.
+        line: place of the marking on the other axis [m].
+        center: place of the circle's centre on this axis [m].
+        depth: distance of the centre from the marking, positive on the arc's side, in radii [1].
+        ways: which parts of the arc are in view, 1 = beyond the centre, -1 = before it.
+        radius: of the circle [m].
+        side: of the marking on which the arc lies, on the other axis [1]; 0 = on both.
+    """
+
+    axis: int
+    line: float
+    center: float
+    depth: float
+    ways: tuple[float, ...]
+    radius: float
+    side: float
+
+
+def _painted_arcs(pitch: PitchTemplate) -> list[_PaintedArc]:
+    """Return circles with the lines that they cross or that bound them, and with touch lines.
+
+    Those that half a turn makes equal to others are left out.
+    """
+    found = []
+    x_lines, y_lines = (np.unique(lines[:, 0]) for lines in straight_lines(pitch))
+    for name, arc in pitch.arcs.items():
+        x, y = pitch.points[arc.center][:2].tolist()
+        if x > 0.0 or arc.radius < _MIN_RADIUS:
+            continue
+        places = pitch.marking_points(name, 0.25)[:, 0]
+        for line in y_lines.tolist():
+            beyond = places - line
+            if abs(x - line) > 0.8 * arc.radius or np.abs(beyond).min() > 0.3:
+                continue
+            crossed = beyond.min() < -1.0 and beyond.max() > 1.0
+            side = 0.0 if crossed else float(np.sign(beyond[np.abs(beyond).argmax()]))
+            depth = -abs(x - line) / arc.radius
+            found.append(_PaintedArc(1, line, y, depth, (1.0,), arc.radius, side))
+        if name == "center_circle":
+            line = float(x_lines.max())
+            depth = (line - y) / arc.radius
+            found.append(_PaintedArc(0, line, x, depth, (1.0, -1.0), arc.radius, -1.0))
+    return found
+
+
+def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
+    """Return the cameras with a roll of all segments with a circle of paint around them.
+
+    On the ground the normal of a circle passes through its centre. A pixel's distance from the
+    segment and its normal give radius and centre of the one circle for which it votes.
+    """
+    rows, counts = [np.empty((0, 9))], [np.zeros(0)]
+    for seen in _beside_segments(paint, focals, roll):
+        across = np.stack([seen.along[:, 1], -seen.along[:, 0]], axis=-1)
+        for arc in _painted_arcs(pitch):
+            for sign in (1.0, -1.0) if arc.side else (0.0,):
+                radius, center, count = _vote_circle(seen, arc, sign)
+                up = arc.radius / radius
+                # Arcs lie on one side of their line: the frame may have to be turned.
+                turn = sign * arc.side if arc.side else 1.0
+                turn, way = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
+                beside = arc.line - way * turn * up * seen.offset
+                ahead = arc.center - turn * up * center
+                x, y = (beside, ahead) if arc.axis else (ahead, beside)
+                axes = (turn * across, turn * seen.along)
+                axes = axes if arc.axis else (turn * seen.along, -turn * across)
+                fits = (count >= _MIN_ARC) & are_plausible(pitch, up, x, y)
+                rows.append(np.column_stack([seen.focals, seen.tilts, up, *axes, x, y])[fits])
+                counts.append(count[fits])
+    best = np.argsort(-np.concatenate(counts), kind="stable")[:_ARCS]
+    level = level_cameras(np.concatenate(rows)[best])
+    return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
+
+
+class _Beside(NamedTuple):
+    """Pixels of paint beside a segment, in the ground frame of level cameras.
+
+    Attributes:
+        focals: (g,) [px].
+        tilts: (g,) [rad].
+        along: (g, 2) unit vector of the segment.
+        offset: (g,) of the segment across it, to its right [1].
+        places: (g, m, 2) of the pixels to the right of the segment and along it [1].
+        normals: (g, m, 2) unit normals of the paint, likewise.
+    """
+
+    focals: Floats
+    tilts: Floats
+    along: Floats
+    offset: Floats
+    places: Floats
+    normals: Floats
+
+
+def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Beside]:
+    """Yield the paint beside each segment at all focal lengths and tilts."""
+    middle = 0.5 * np.array([paint.size[0] - 1, paint.size[1] - 1])
+    points, ways = _paint_directions(paint.points)
+    if not len(points):
+        return
+    level = turn_about_axis(roll)[:2, :2]
+    ends = ((paint.segments[:SEGMENTS] - middle) @ level).reshape(-1, 2)
+    start = (points - middle) @ level
+    focal, tilt = (
+        part.ravel() for part in np.meshgrid(focals * paint.size[0], TILTS, indexing="ij")
+    )
+    lines, places, beyond = (
+        _to_ground(pixels, focal, tilt) for pixels in (ends, start, start + ways @ level)
+    )
+    lines = lines.reshape(len(focal), -1, 2, 2)
+    way = beyond - places
+    normals = np.stack([-way[..., 1], way[..., 0]], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    for index in range(lines.shape[1]):
+        along = lines[:, index, 1] - lines[:, index, 0]
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        kept = np.isfinite(along).all(axis=-1)
+        axes = np.stack([along[:, ::-1] * [1.0, -1.0], along], axis=-1)[kept]
+        offset = (lines[kept, index].mean(axis=1) * axes[..., 0]).sum(axis=-1)
+        beside = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
+        yield _Beside(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
+
+
+def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
+    """Return places (g, n, 2) on the ground, right and forward; NaN above the horizon."""
+    cosine, sine, away = np.cos(tilt)[:, None], np.sin(tilt)[:, None], focal[:, None]
+    depth = pixels[:, 1] * cosine + away * sine
+    depth = np.where(depth > 1e-3 * away, depth, np.nan)
+    return np.stack([pixels[:, 0] / depth, (away * cosine - pixels[:, 1] * sine) / depth], axis=-1)
+
+
+def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
+    """Return some pixels of paint (m, 2), and unit vectors (m, 2) along it."""
+    points = paint[:: max(1, len(paint) // _ARC_POINTS)]
+    if not len(points):
+        return points, points
+    distance, index = cKDTree(paint).query(points, k=16, distance_upper_bound=_ARC_REACH)
+    near = np.isfinite(distance)
+    count = near.sum(axis=1)
+    around = np.where(near[..., None], paint[np.minimum(index, len(paint) - 1)], 0.0)
+    mean = around.sum(axis=1) / count[:, None]
+    off = np.where(near[..., None], around - mean[:, None], 0.0)
+    spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", off, off))
+    clear = (count >= 8) & (spread[:, 1] > 20.0 * spread[:, 0])
+    return mean[clear], axes[clear][:, :, 1]
+
+
+def _vote_circle(seen: _Beside, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
+    """Return radius, centre along the segment and share of pixels (g,) of the circle most vote for.
+
+    Args:
+        seen: paint.
+        arc: the circle and its marking.
+        sign: side of the paint, 0 = both.
+    """
+    beside, ahead, turned, onward = np.moveaxis(
+        np.concatenate([seen.places, seen.normals], axis=-1), -1, 0
+    )
+    rows = int(np.log(_RADIUS_RANGE[1] / _RADIUS_RANGE[0]) / _ARC_BINS[0]) + 1
+    cells = rows * _ARC_BINS[2]
+    counts = np.zeros(len(beside) * cells, np.int64)
+    for way in arc.ways:
+        steep = arc.depth + way * np.abs(turned)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            radius = np.abs(beside) / steep
+            used = (steep > 0.2) & (radius > _RADIUS_RANGE[0]) & (radius < _RADIUS_RANGE[1])
+            if sign:
+                used &= beside * sign > 0.0
+        g, m = np.nonzero(used)
+        found = radius[g, m]
+        toward = way * np.sign(beside[g, m]) * np.sign(turned[g, m])
+        column = (ahead[g, m] / found - toward * onward[g, m]) / _ARC_BINS[1] + 0.5 * _ARC_BINS[2]
+        row = np.log(found / _RADIUS_RANGE[0]) / _ARC_BINS[0]
+        kept = (column >= 0.0) & (column < _ARC_BINS[2])
+        cell = row[kept].astype(np.int64) * _ARC_BINS[2] + column[kept].astype(np.int64)
+        counts += np.bincount(g[kept] * cells + cell, minlength=len(counts))
+    votes = counts.reshape(-1, cells)
+    best = votes.argmax(axis=1)
+    size = _RADIUS_RANGE[0] * np.exp((best // _ARC_BINS[2] + 0.5) * _ARC_BINS[0])
+    place = (best % _ARC_BINS[2] + 0.5 - 0.5 * _ARC_BINS[2]) * _ARC_BINS[1] * size
+    return size, place, votes.max(axis=1) / max(1, beside.shape[1])
