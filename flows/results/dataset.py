@@ -9,13 +9,13 @@ from data_contracts.release import CheckReport, DataSetStatistics, Finding
 from worldpose.body import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import list_clips, read_clip
+from worldpose.dataset.faults import CheckSettings
 from worldpose.dataset.manifest import (
     changed_files,
     clip_frame_rate,
     read_frame_rates,
     read_manifest,
 )
-from worldpose.dataset.settings import CheckSettings
 from worldpose.dataset.statistics import (
     camera_kind,
     clip_statistics,

@@ -13,6 +13,7 @@ from worldpose.dataset.contents import PointSource, ShippedClip, View
 from worldpose.dataset.faults import (
     SOUND,
     Agreement,
+    CheckSettings,
     Fault,
     agreement_findings,
     axis_orders,
@@ -30,7 +31,6 @@ from worldpose.dataset.plausibility import (
     visibility_findings,
     world_fault,
 )
-from worldpose.dataset.settings import CheckSettings
 from worldpose.formats.camera_file import CameraRows
 from worldpose.geometry.boxes import box_iou
 

@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
-from worldpose.dataset.faults import LATEST, Fault, camera_faults, frame_faults, point_faults
-from worldpose.dataset.settings import CheckSettings
+from worldpose.dataset.faults import (
+    LATEST,
+    CheckSettings,
+    Fault,
+    camera_faults,
+    frame_faults,
+    point_faults,
+)
 from worldpose.formats.camera_file import CameraRows
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
