@@ -75,7 +75,7 @@ def report(name: str, found: Synchronization, true: NDArray[np.float64]) -> bool
     return unknown == 0 and worst <= WANTED
 
 
-def real(
+def shift_real_detections(
     cameras: Camera, seen: KeypointDetections, fps: float, pitch: PitchTemplate | None
 ) -> Iterator[bool]:
     """Yield whether each case of shifted real detections is found."""
@@ -87,7 +87,7 @@ def real(
         yield report(str(true.tolist()), found, true + own.late)
 
 
-def simulated(first: int) -> Iterator[bool]:
+def simulate_cases(first: int) -> Iterator[bool]:
     """Yield whether each simulated case is found."""
     for name, count in CASES.items():
         for seed in range(first, first + count):
@@ -122,13 +122,13 @@ def main() -> None:
     parser.add_argument("arguments", nargs="+")
     asked = parser.parse_args()
     if asked.what == "simulated":
-        cases = simulated(int(asked.arguments[0]))
+        cases = simulate_cases(int(asked.arguments[0]))
     elif asked.what == "shelf":
         given = Path(asked.arguments[0]) / "import"
         known = worldpose.read_cameras(given / "calibration.toml")
         files = [given / "detections" / f"{name}.json" for name in known]
         seen = KeypointDetections.stack([worldpose.read_observations(file) for file in files])
-        cases = real(Camera.stack(list(known.values())), seen, 25.0, None)
+        cases = shift_real_detections(Camera.stack(list(known.values())), seen, 25.0, None)
     else:
         store = Store.open(asked.arguments[0])
         match = open_match(store, asked.arguments[1])
@@ -136,7 +136,7 @@ def main() -> None:
         cameras, _, seen = load_clip(run, match, match.folder.spec.clips[0].id)
         pitch = match.folder.pitch
         place = None if pitch is None else PitchTemplate.from_spec(pitch)
-        cases = real(cameras, seen, match.folder.spec.fps, place)
+        cases = shift_real_detections(cameras, seen, match.folder.spec.fps, place)
     found = list(cases)
     print(f"{sum(found)} of {len(found)} cases: all offsets within {WANTED} frames")
 
