@@ -170,12 +170,12 @@ def _require_published(
 ) -> None:
     """Raise CorruptionError unless size and SHA-256 of the bytes there are the published ones."""
     if there is None:
-        raise _changed(blobs, path, "the file is missing")
+        raise _corruption_error(blobs, path, "the file is missing")
     size, sha256 = there
     if size != file.size:
-        raise _changed(blobs, path, f"the file has {size} bytes, not {file.size}")
+        raise _corruption_error(blobs, path, f"the file has {size} bytes, not {file.size}")
     if sha256 != file.sha256:
-        raise _changed(blobs, path, "its SHA-256 differs from the one in the manifest")
+        raise _corruption_error(blobs, path, "its SHA-256 differs from the one in the manifest")
 
 
 def verify_published(blobs: Blobs, result: ResultId, file: StoredFile) -> None:
@@ -209,7 +209,7 @@ def read_published_range(
         found = f"the SHA-256 of its part at byte {before} differs from the one in the manifest"
     else:
         return data[start - before : stop - before]
-    raise _changed(blobs, path, found)
+    raise _corruption_error(blobs, path, found)
 
 
 def digest_parts(data: bytes, sizes: Sequence[int]) -> tuple[tuple[int, str], ...]:
@@ -223,7 +223,7 @@ def digest_parts(data: bytes, sizes: Sequence[int]) -> tuple[tuple[int, str], ..
     return tuple(parts)
 
 
-def _changed(blobs: Blobs, path: str, found: str) -> CorruptionError:
+def _corruption_error(blobs: Blobs, path: str, found: str) -> CorruptionError:
     return CorruptionError(
         f"{blobs.url}/{path} has changed since its publication: {found}. Run "
         "`worldpose verify --repair` to find and repair all damage."
