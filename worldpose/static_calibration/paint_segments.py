@@ -169,7 +169,7 @@ def thin_ridges(strength: NDArray[np.float32], normal: Floats) -> Ridges:
     """
     ridges = strength[strength > 0.0]
     noise = float(np.median(ridges)) if len(ridges) else 0.0
-    thin = (strength > np.clip(_ABOVE_NOISE * noise, *_CONTRAST)).astype(np.uint8)
+    thin = (strength > np.clip(_ABOVE_NOISE * noise, _CONTRAST[0], _CONTRAST[1])).astype(np.uint8)
     joined = cv2.dilate(thin, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
     large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= _MIN_EXTENT

@@ -1,9 +1,9 @@
 """Cameras and markings proposed from an image alone, without a click (C2).
 
-Straight segments of paint are the evidence. A triple of them, two along one axis of the pitch and
-one along the other, with names from the template and a level camera, determines a camera. Every
-plausible assignment gives a candidate; the paint that it explains, and the markings that it
-predicts and the image lacks, decide. The best candidates are refined on the nearest paint.
+Paint is the evidence. Three straight segments, two along one axis of the pitch and one along the
+other, with names from the template and a level camera, determine a camera; so do one segment and a
+circle. Every plausible assignment gives a candidate; the paint that it explains, and the markings
+that it predicts and the image lacks, decide. The best ones are refined on the nearest paint.
 
 The pitch looks the same after half a turn. The side on which the camera stands decides.
 """
@@ -223,7 +223,7 @@ def propose_camera(
     if found is None:
         raise InputError(
             where,
-            expected="at least three straight markings, one of them across the others",
+            expected="three straight markings, one across the others, or one and a circle",
             found="paint that fits no camera",
             todo=_TO_CLICK,
         )

@@ -131,7 +131,7 @@ def test_too_little_paint_is_refused_with_what_to_click():
     paint = paint_of(camera(), ["penalty_area_left_front"])
     assert propose_from_paint([paint], PITCH, side="near") is None
     grass = np.full((720, 1280, 3), (60, 120, 50), np.uint8)
-    with pytest.raises(InputError, match=r"image of cam3: expected at least three straight.*Click"):
+    with pytest.raises(InputError, match=r"image of cam3: expected three straight.*Click"):
         calibrate_without_clicks(PITCH, grass, side="near", where="image of cam3")
 
 

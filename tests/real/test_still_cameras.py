@@ -1,0 +1,86 @@
+"""Cameras of real stills without a click; skipped where the stills are absent.
+
+WORLDPOSE_TEST_DATA names a folder with `still_cameras` (benchmarks/still_cameras.py fetch).
+"""
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from worldpose.geometry import Camera, Rigid
+from worldpose.pitch import PitchTemplate
+
+DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "still_cameras"
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "still_cameras.py"
+MIDFIELD, AREA = "che0", "var9"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    spec = importlib.util.spec_from_file_location("still_cameras", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["still_cameras"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def overhead():
+    """A camera 60 m above the centre spot, 10 px per metre; x to the right, y up."""
+    return Camera(
+        focal=np.array([600.0, 600.0]),
+        principal_point=np.array([599.5, 399.5]),
+        distortion=np.zeros(5),
+        cam_from_world=Rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 60.0])),
+        image_size=np.array([1200, 800]),
+    )
+
+
+def test_labels_name_markings_and_lie_in_their_images(bench):
+    stills, names = bench.read_labels(), set(PitchTemplate.standard().marking_names)
+    assert len(stills) >= 60
+    assert len({still["camera"] for still in stills}) >= 30
+    assert len({still["name"] for still in stills}) == len(stills)
+    halves = [{still["camera"] for still in bench.read_labels(half)} for half in ("tuned", "held")]
+    assert not halves[0] & halves[1]
+    for still in stills:
+        assert len(still["markings"]) >= 2
+        assert set(still["markings"]) | set(still["unsure"]) <= names
+        pixels = np.concatenate([np.array(each) for each in still["markings"].values()])
+        assert (pixels > -2.0).all()  # ends at the border
+        assert (pixels < np.array(still["size"]) + 1.0).all()
+
+
+def test_jaccard_counts_right_wrong_and_unlabelled_markings(bench):
+    camera, pitch = overhead(), PitchTemplate.standard().with_surface(np.zeros(2))
+    seen = bench.project_markings(camera, pitch)
+    right = {
+        name: line[np.isfinite(line).all(axis=1)][::20].tolist() for name, line in seen.items()
+    }
+    assert bench.compare(camera, pitch, {"markings": right})[0].tolist() == [1.0, 1.0, 1.0]
+    # 9.6 px of 1200 are 7.7 of 960: wrong at 5 px, right at 10.
+    moved = [[x + 9.6, y] for x, y in right["halfway_line"]]
+    shares, bad = bench.compare(camera, pitch, {"markings": {**right, "halfway_line": moved}})
+    assert shares[0] == pytest.approx(1.0 - 1.0 / len(right))
+    assert shares[1:].tolist() == [1.0, 1.0]
+    assert bad == ["halfway_line 8 px"]
+    fewer = {name: line for name, line in right.items() if name != "center_circle"}
+    shares, bad = bench.compare(camera, pitch, {"markings": fewer})
+    assert shares[0] == pytest.approx(1.0 - 1.0 / len(right))
+    assert bad == ["center_circle is not there"]
+    unsure = {"markings": fewer, "unsure": ["center_circle"]}
+    assert bench.compare(camera, pitch, unsure)[0][0] == 1.0
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no still_cameras")
+@pytest.mark.parametrize("name", [MIDFIELD, AREA])
+def test_a_real_still_is_calibrated_without_a_click(bench, name):
+    (still,) = bench.read_labels(only=[name])
+    picture = cv2.imread(str(DATA / f"{name}.png"))
+    score = bench.score_still(np.ascontiguousarray(picture[..., ::-1]), still, None)
+    assert score.accepted
+    assert score.jaccard[0] == 1.0
