@@ -45,12 +45,12 @@ def write_image(folder, name, image, **further):
 
 
 def middle_of_the_pitch():
-    """An image with two lines and a part of a circle: no single camera explains them."""
+    """An image with one line and a part of a circle: no single camera explains them."""
     camera = Camera(
-        focal=np.array([2600.0, 2600.0]),
+        focal=np.array([3600.0, 3600.0]),
         principal_point=0.5 * (np.array(SIZE) - 1.0),
         distortion=np.zeros(5),
-        cam_from_world=look_at(np.array([0.0, -60.0, 22.0]), np.array([0.0, -5.0, 0.0]), 0.005),
+        cam_from_world=look_at(np.array([0.0, -60.0, 22.0]), np.array([0.0, -9.0, 0.0]), 0.005),
         image_size=np.array(SIZE),
     )
     return render_pitch(camera, PITCH, None, 3)
