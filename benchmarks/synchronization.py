@@ -8,7 +8,7 @@ Cameras are shifted by -12, -3.5, 0, 2.25 and 20 frames in five orders. Real det
 and interpolated between frames; their own offsets, estimated before the shift, count as true. In a
 run whose people cannot be triangulated, shifts are whole frames. Simulated are 40 clips of 4 s in
 five scenarios, at four times the frame rate, so that fractions are exact, before five cameras whose
-orientation is off by 1 mrad per axis.
+orientation has an error of 1 mrad per axis.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ OPTIONS = ("--columns", "7", "--rows", "4", "--square", "0.06")
 
 
 def photograph(rng):
-    """A picture of a tilted checkerboard with 7 x 4 inner corners, without distortion."""
+    """An image of a tilted checkerboard with 7 x 4 inner corners, without distortion."""
     side = 40
     squares = np.indices((5, 8)).sum(axis=0) % 2 * 255
     page = np.kron(squares, np.ones((side, side))).astype(np.uint8)

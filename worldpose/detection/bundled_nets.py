@@ -438,7 +438,7 @@ class FloatNet:
 class QuantizedNet:
     """A net in 8-bit integers, for images of bytes.
 
-    Integers give equal bytes for an image whatever images are beside it.
+    Integers give equal bytes for an image, whatever the other images of the batch are.
 
     Attributes:
         weights_sha256: SHA-256 of the file of float weights that it was made from.

@@ -18,7 +18,7 @@ MIN_CORNERS: Final = 8
 """Least corners of a board in an image [1]."""
 MAX_BEND: Final = 0.25
 """Largest mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
-that were counted wrongly are off by whole squares."""
+that were counted wrongly have errors of whole squares."""
 OUTLIER: Final = 2.0
 """The worst image is left out if the residual is larger with it by this factor [1]."""
 MIN_RESIDUAL_PX: Final = 0.3
@@ -171,7 +171,7 @@ def calibrate_lens(
     """Return the lens of a camera from images of one board.
 
     Focal length (square pixels), principal point, k1, k2, p1 and p2 are estimated by OpenCV
-    (Zhang, 2000). Images in which corners are off a plane, or that contradict the others, are left
+    (Zhang, 2000). Images whose corners are not on a plane, or that contradict the others, are left
     out. The standard deviations are those of leaving out one image at a time (jackknife).
 
     Args:
