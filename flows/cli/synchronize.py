@@ -192,7 +192,7 @@ def _print(
         (
             row.camera,
             str(row.stated),
-            "-" if row.found is None else f"{row.found:.2f}",
+            "-" if row.found is None else f"{round(row.found, 2) + 0.0:.2f}",  # never -0.00
             "-" if row.std is None else f"{row.std:.2f}",
             "-" if row.found is None else str(row.proposed),
             row.reason,

@@ -146,12 +146,14 @@ def draw_synchronization(found: Synchronization, names: Sequence[str], path: Pat
         if np.isfinite(late):
             panel.axvline(late, color=PALETTE[1], linewidth=1.2)
             panel.axvspan(late - 2.0 * std, late + 2.0 * std, color=PALETTE[1], alpha=0.25)
-            panel.set_title(f"{late:+.2f} frames, standard deviation {std:.2f}", fontsize=8)
+            panel.set_title(
+                f"{round(late, 2) + 0.0:+.2f} frames, standard deviation {std:.2f}", fontsize=8
+            )
         else:
             panel.set_title(reason, fontsize=8)
     panels[-1].set_xlabel("later than the median camera [frames]")
     figure.supylabel(
-        "people who meet those of other cameras, above usual [1 per frame]", fontsize=8
+        "matches with people of other cameras, above their usual number [per frame]", fontsize=8
     )
     with whole_file(path) as draft:
         figure.savefig(draft, format=path.suffix[1:].lower())
