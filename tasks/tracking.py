@@ -83,8 +83,10 @@ def _ground_arrays(store: Store, work: Work, people: Identities) -> dict[str, ND
     if pitch is None or not people.on_plane.any():
         return {}
     clip = open_clip(store, work)
-    positions = _locate_feet(clip, pitch)
     index = np.where(people.on_plane[:, None], people.detection_index, -1)
+    # Without triangulated people, all feet tell the clocks.
+    is_placed = np.isfinite(people.joints).any()
+    positions = _locate_feet(clip, pitch, _mark(index, clip) if is_placed else None)
     middle = triangulated_places(people.joints)
     clocks = _estimate_clocks(positions, clip, pitch, people.joints)
     tracks = locate_tracks(positions, index, clip.fps, clocks.seconds, middle)
@@ -176,15 +178,30 @@ def _pitch(work: Work) -> PitchTemplate | None:
     return None if given is None else PitchTemplate.from_spec(PitchSpec(any_size=True, **given))
 
 
-def _locate_feet(clip: ClipInputs, pitch: PitchTemplate) -> GroundPositions:
-    """Return people's foot positions by camera."""
+def _mark(detection_index: NDArray[np.integer], clip: ClipInputs) -> NDArray[np.bool_]:
+    """Return the mask (frames, cameras, detections) of people's detections."""
+    mask = np.zeros(clip.detections.score.shape, dtype=np.bool_)
+    frame, camera, person = np.nonzero(detection_index >= 0)
+    mask[frame, camera, detection_index[frame, camera, person]] = True
+    return mask
+
+
+def _locate_feet(
+    clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None
+) -> GroundPositions:
+    """Return foot positions by camera of chosen detections; None = all."""
     pitch = clip.raise_pitch(pitch)
-    frames = len(clip.detections.frame)
-    parts = [clip.detections[start : start + BLOCK] for start in range(0, frames, BLOCK)]
+    blocks = [slice(n, n + BLOCK) for n in range(0, len(clip.detections.frame), BLOCK)]
     return GroundPositions.concatenate(
         [
-            locate_feet(clip.cameras, part, pitch, camera_covariance=clip.camera_covariance)
-            for part in parts
+            locate_feet(
+                clip.cameras,
+                clip.detections[rows],
+                pitch,
+                camera_covariance=clip.camera_covariance,
+                chosen=None if chosen is None else chosen[rows],
+            )
+            for rows in blocks
         ]
     )
 
@@ -211,12 +228,10 @@ def _track_on_plane(
     Returns:
         The people, metrics, and a sentence on clocks; None without any of them.
     """
-    positions = _locate_feet(clip, pitch)
+    is_triangulated = _mark(found.detection_index, clip)
+    positions = _locate_feet(clip, pitch, ~is_triangulated)
     clocks = _estimate_clocks(positions, clip, pitch, found.joints)
-    detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]))
-    frame, camera, person = np.nonzero(found.detection_index >= 0)
-    taken = found.detection_index[frame, camera, person]
-    positions.xy[frame, camera, taken] = np.nan
+    detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]) | is_triangulated)
     if not np.isfinite(positions.xy).any():
         return None
     tracks = track_on_plane(

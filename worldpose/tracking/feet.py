@@ -96,6 +96,7 @@ def locate_feet(
     pitch: PitchTemplate,
     *,
     camera_covariance: Floats | None = None,
+    chosen: Flags | None = None,
 ) -> GroundPositions:
     """Return where detected people stand on the pitch.
 
@@ -108,6 +109,7 @@ def locate_feet(
         detections: (frames, cameras, detections); without a box, the ankles alone tell the place.
         pitch: surface under the feet.
         camera_covariance: (cameras, 12, 12) covariance of the calibration; None = exact.
+        chosen: (frames, cameras, detections), detections to locate; the others are NaN. None = all.
     """
     keypoints, confidence, boxes = detections.keypoints, detections.confidence, detections.boxes
     shape = detections.score.shape
@@ -118,9 +120,11 @@ def locate_feet(
     is_whole = np.zeros(shape, dtype=np.bool_)
     for c in range(shape[1]):
         camera = cameras[c]
-        feet = np.array(keypoints[:, c, :, ANKLES, :], dtype=np.float64)  # (2, frames, people, 2)
-        seen = np.moveaxis(np.asarray(confidence[:, c][..., ANKLES]), -1, 0) >= MIN_CONFIDENCE
-        feet[~seen] = np.nan
+        here = np.ones(shape[::2], dtype=np.bool_) if chosen is None else chosen[:, c]
+        points = np.asarray(keypoints[:, c][here], dtype=np.float64)  # (people, 17, 2)
+        box = np.asarray(boxes[:, c][here], dtype=np.float64)
+        feet = np.moveaxis(points[:, ANKLES, :], 1, 0).copy()  # (2, people, 2)
+        feet[(confidence[:, c][here][:, ANKLES] < MIN_CONFIDENCE).T] = np.nan
         places = np.stack([_meet(camera, foot, pitch, ANKLE_HEIGHT) for foot in feet])
         found = np.isfinite(places[..., 0])
         center = camera.center[:2]
@@ -136,12 +140,11 @@ def locate_feet(
         along = ((nearer - place) * sight).sum(axis=-1)
         place[both] += (0.5 * along[..., None] * sight)[both]
         height_std = np.where(both, FOOT_HEIGHT_STD, 1.5 * FOOT_HEIGHT_STD)
-        box = np.asarray(boxes[:, c], dtype=np.float64)
-        size = _image_heights(keypoints[:, c], boxes[:, c])
         bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
         # A person who is cut by the image's border has no known middle or feet.
         inside = _are_inside(box, camera.image_size)
-        is_whole[:, c] = (inside | np.isnan(box[..., 0])) & ~_are_parts(box, confidence[:, c])
+        is_part = _are_parts(boxes[:, c], confidence[:, c], here)
+        is_whole[:, c][here] = (inside | np.isnan(box[..., 0])) & ~is_part
         lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
         absent = ~np.isfinite(place[..., 0])
         place[absent] = lower[absent]
@@ -149,15 +152,17 @@ def locate_feet(
         known = ~absent & np.isfinite(lower[..., 0])
         place[known] = ((1.0 - BOX_SHARE) * place + BOX_SHARE * lower)[known]
         top = np.stack([bottom[..., 0], box[..., 1]], axis=-1)
-        height[:, c] = _height_above(camera, top, place, pitch)
-        xy[:, c] = place
-        noise[:, c] = _foot_noise(camera, place, height_std, size)
+        height[:, c][here] = _height_above(camera, top, place, pitch)
+        xy[:, c][here] = place
+        noise[:, c][here] = _foot_noise(camera, place, height_std, _image_heights(points, box))
         if camera_covariance is not None:
             known = np.isfinite(place[..., 0])
             flat = place[known]
-            points = np.concatenate([flat, pitch.height(flat[:, 0], flat[:, 1])[:, None]], axis=1)
-            motion = surface_motion(camera, pitch, points)
-            calibration[:, c][known] = motion @ camera_covariance[c] @ motion.swapaxes(1, 2)
+            on_ground = np.column_stack([flat, pitch.height(flat[:, 0], flat[:, 1])])
+            motion = surface_motion(camera, pitch, on_ground)
+            lasting = np.zeros((len(place), 2, 2))
+            lasting[known] = motion @ camera_covariance[c] @ motion.swapaxes(1, 2)
+            calibration[:, c][here] = lasting
     xy[~np.isfinite(noise).all(axis=(-1, -2))] = np.nan
     xy[~np.isfinite(calibration).all(axis=(-1, -2))] = np.nan
     kept = np.asarray(boxes, dtype=np.float64)
@@ -173,24 +178,28 @@ def _are_inside(boxes: Floats, image_size: NDArray[np.int64]) -> Flags:
     return np.asarray(low.all(axis=-1) & high.all(axis=-1))
 
 
-def _are_parts(boxes: Floats, confidence: AnyFloats) -> Flags:
-    """Return which boxes (frames, detections, 4) a surer detection may explain.
+def _are_parts(boxes: AnyFloats, confidence: AnyFloats, chosen: Flags) -> Flags:
+    """Return which chosen boxes a surer detection of their frame may explain.
 
     Detectors give a person's upper body, or the legs, a box of their own beside the whole one.
 
     Args:
         boxes: (frames, detections, 4) [px].
         confidence: (frames, detections, 17).
+        chosen: (frames, detections).
     """
-    low = np.maximum(boxes[:, :, None, :2], boxes[:, None, :, :2])
-    high = np.minimum(boxes[:, :, None, 2:], boxes[:, None, :, 2:])
+    frame, detection = np.nonzero(chosen)
+    all_boxes = np.asarray(boxes, dtype=np.float64)
+    others, own = all_boxes[frame], all_boxes[frame, detection][:, None]
     total = np.nansum(confidence, axis=-1)
+    low, high = np.maximum(own[..., :2], others[..., :2]), np.minimum(own[..., 2:], others[..., 2:])
+    area = (all_boxes[..., 2:] - all_boxes[..., :2]).prod(axis=-1)
     with np.errstate(invalid="ignore"):
         common = np.clip(high - low, 0.0, None).prod(axis=-1)
-        area = (boxes[..., 2:] - boxes[..., :2]).prod(axis=-1)
-        overlap = common >= PART_OVERLAP * np.minimum(area[:, :, None], area[:, None])
-    surer = total[:, None] > total[:, :, None]
-    return np.asarray((overlap & surer).any(axis=2))
+        smaller = np.minimum(area[frame, detection][:, None], area[frame])
+        overlap = common >= PART_OVERLAP * smaller
+    surer = total[frame] > total[frame, detection][:, None]
+    return np.asarray((overlap & surer).any(axis=1))
 
 
 def count_covering_cameras(cameras: Camera, positions: GroundPositions) -> NDArray[np.int64]:

@@ -286,14 +286,10 @@ class FrameTracker:
 
     def track_ends(self, person: Person) -> tuple[End, End]:
         """Return the start and the end of a person's track."""
-        fixed = [
-            (frame, sighting.joints)
-            for frame, sighting in person.sightings.items()
-            if np.isfinite(sighting.joints).any()
-        ]
-        frames = np.array([frame for frame, _ in fixed])
-        joints = np.stack([joints for _, joints in fixed])
-        return fit_track_ends(person.number, frames, joints, self.fps, self.settings)
+        frames, _, _, joints = person.sightings.stack()
+        fixed = np.isfinite(joints).any(axis=(1, 2))
+        places = joints[fixed].astype(np.float64)
+        return fit_track_ends(person.number, frames[fixed], places, self.fps, self.settings)
 
     def _merge(self, frame: int) -> None:
         """End people whose track has coincided with another's for `merge_time_s`."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats, Singles
+from worldpose.compiled import compile_kernel
 from worldpose.tracking.feet import GroundPositions
 from worldpose.tracking.plane_paths import (
     MIN_TRACK_S,
@@ -145,17 +146,15 @@ class _Track:
 
     def predict(self, move: Floats, drift: Floats) -> None:
         """Go to the next frame."""
-        self.state = move @ self.state
-        self.covariance = move @ self.covariance @ move.T + drift
+        self.state, self.covariance = _predict(self.state, self.covariance, move, drift)
         self.steps.append((self.state, self.covariance, self.state, self.covariance))
 
     def correct(self, sight: _Sight, clock: float) -> None:
         """Update the state with a detection in an image `clock` [s] after the frame."""
         look = _look(clock)
-        gain = self.covariance @ look.T
-        gain = gain @ np.linalg.inv(look @ gain + sight.noise)
-        self.state = self.state + gain @ (sight.place - look @ self.state)
-        self.covariance = self.covariance - gain @ look @ self.covariance
+        self.state, self.covariance = _correct(
+            self.state, self.covariance, sight.place, sight.noise, look
+        )
         before = self.steps[-1]
         self.steps[-1] = (before[0], before[1], self.state, self.covariance)
 
@@ -166,6 +165,42 @@ class _Track:
         if is_whole and (self.last_whole < frame or not self.seen):
             self.seen += 1
             self.last_whole = frame
+
+
+@compile_kernel
+def _predict(
+    state: Floats, covariance: Floats, move: Floats, drift: Floats
+) -> tuple[Floats, Floats]:
+    """Return state (4,) and covariance (4, 4) after one frame."""
+    return move @ state, move @ covariance @ move.T + drift
+
+
+@compile_kernel
+def _correct(
+    state: Floats, covariance: Floats, place: Floats, noise: Floats, look: Floats
+) -> tuple[Floats, Floats]:
+    """Return state (4,) and covariance (4, 4) after a measurement, `place` = `look` @ state."""
+    gain = covariance @ look.T
+    gain = gain @ np.linalg.inv(look @ gain + noise)
+    return state + gain @ (place - look @ state), covariance - gain @ look @ covariance
+
+
+@compile_kernel
+def _smooth_backwards(
+    move: Floats,
+    expected: Floats,
+    expected_covariance: Floats,
+    state: Floats,
+    covariance: Floats,
+) -> None:
+    """Smooth filtered states (frames, 4) and covariances (frames, 4, 4) in place.
+
+    Rauch, Tung and Striebel; `expected` and its covariance are the predicted ones.
+    """
+    for n in range(len(state) - 2, -1, -1):
+        gain = covariance[n] @ move.T @ np.linalg.inv(expected_covariance[n + 1])
+        state[n] += gain @ (state[n + 1] - expected[n + 1])
+        covariance[n] += gain @ (covariance[n + 1] - expected_covariance[n + 1]) @ gain.T
 
 
 def _look(clock: float) -> Floats:
@@ -210,6 +245,7 @@ def track_on_plane(
     dt = 1.0 / fps
     move, drift, inflation = _motion(fps)
     shirts = _learn_shirts(positions)
+    is_seen = np.asarray(np.isfinite(positions.xy[..., 0]).any(axis=2))
     running: list[_Track] = []
     ended: list[_Track] = []
     for frame in range(frames):
@@ -217,7 +253,7 @@ def track_on_plane(
             track.predict(move, drift)
         if triangulated is not None:
             _follow_triangulated(running, triangulated.xy[frame], frame)
-        for c in range(cameras):
+        for c in np.flatnonzero(is_seen[frame]).tolist():
             _update(running, positions, (frame, c), float(clocks[c]), inflation, shirts[c])
         lost = [track for track in running if _is_lost(track, frame, dt)]
         ended += lost
@@ -472,23 +508,11 @@ def _follow_triangulated(tracks: list[_Track], places: Floats, frame: int) -> No
 
 
 def _smooth(track: _Track, move: Floats) -> PlanePath:
-    """Return the track up to its last sighting, smoothed backwards (Rauch, Tung and Striebel)."""
+    """Return the track up to its last sighting, smoothed backwards."""
     steps = track.steps[: track.last_seen - track.first + 1]
-    state, covariance = steps[-1][2], steps[-1][3]
-    states, covariances = [state], [covariance]
-    for here, after in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
-        gain = here[3] @ move.T @ np.linalg.inv(after[1])
-        state = here[2] + gain @ (state - after[0])
-        covariance = here[3] + gain @ (covariance - after[1]) @ gain.T
-        states.append(state)
-        covariances.append(covariance)
-    return PlanePath(
-        track.first,
-        np.stack(states[::-1]),
-        np.stack(covariances[::-1]),
-        track.index,
-        track.person,
-    )
+    expected, expected_covariance, state, covariance = map(np.stack, zip(*steps, strict=True))
+    _smooth_backwards(move, expected, expected_covariance, state, covariance)
+    return PlanePath(track.first, state, covariance, track.index, track.person)
 
 
 def _collect(
@@ -509,15 +533,17 @@ def _collect(
         rows = slice(path.first, path.last + 1)
         state[rows, n] = path.state
         covariance[rows, n] = path.covariance[:, :2, :2]
-        lasting = np.zeros((2, 2))
-        for frame in range(path.first, path.last + 1):
-            seen = path.index.get(frame, {})
+        frames_seen = sorted(path.index)
+        lasting = np.zeros((len(frames_seen) + 1, 2, 2))
+        for number, frame in enumerate(frames_seen):
+            seen = path.index[frame]
             for camera, detection in seen.items():
                 index[frame, camera, n] = detection
-            if seen:
-                each = [positions.calibration[frame, camera, d] for camera, d in seen.items()]
-                lasting = min(each, key=np.trace)
-            covariance[frame, n] += lasting
+            each = [positions.calibration[frame, camera, d] for camera, d in seen.items()]
+            lasting[number + 1] = min(each, key=np.trace)
+        # That of the last frame in which the person was seen.
+        last = np.searchsorted(frames_seen, np.arange(path.first, path.last + 1), side="right")
+        covariance[rows, n] += lasting[last]
     if detection_index is not None:
         index = detection_index.astype(np.int16)
     continues = np.array([-1 if path is None else path.person for path in paths], dtype=np.int64)

@@ -116,7 +116,7 @@ def drop_bystanders(
 
 def _distance_outside(person: Person, half: Floats) -> float:
     """Return the least distance outside of the lines [m]; 0 on the pitch or without position."""
-    places = np.array([sighting.joints[:, :2] for sighting in person.sightings.values()])
+    places = person.sightings.stack()[3][..., :2].astype(np.float64)
     places = places[np.isfinite(places[..., 0]).any(axis=1)]
     outside = np.maximum(np.abs(np.nanmean(places, axis=1)) - half, 0.0)
     return float(np.linalg.norm(outside, axis=1).min()) if len(places) else 0.0
@@ -186,12 +186,11 @@ def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distanc
 
 def located_frames(person: Person) -> LocatedFrames:
     """Return a track in the frames that determine its position."""
-    frames = sorted(person.sightings)
-    sightings = [person.sightings[frame] for frame in frames]
-    joints = np.array([each.joints for each in sightings])
-    views = np.array([np.count_nonzero(each.index >= 0) for each in sightings])
-    placed = np.isfinite(joints[..., 0]).any(axis=1)
-    return LocatedFrames(np.array(frames)[placed], joints[placed], views[placed])
+    frames, index, _, joints = person.sightings.stack()
+    order = np.argsort(frames)
+    order = order[np.isfinite(joints[order, :, 0]).any(axis=1)]
+    views = np.count_nonzero(index[order] >= 0, axis=1)
+    return LocatedFrames(frames[order], joints[order].astype(np.float64), views)
 
 
 def people_at_births(people: list[Person]) -> dict[int, list[Person]]:

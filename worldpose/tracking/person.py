@@ -84,6 +84,15 @@ class Sightings(MutableMapping[int, Sighting]):
     def __delitem__(self, frame: int) -> None:
         del self._place[frame]
 
+    def stack(self) -> tuple[Integers, NDArray[np.int16], Singles, Singles]:
+        """Return all sightings: frame (n,), and the arrays of a sighting, each (n, ...)."""
+        place = np.fromiter(self._place.values(), dtype=np.int64, count=len(self._place))
+        frame = np.fromiter(self._place, dtype=np.int64, count=len(self._place))
+        index, ray_distance, joints = (
+            np.concatenate(parts)[place] for parts in zip(*self._blocks, strict=True)
+        )
+        return frame, index, ray_distance, joints
+
     def __iter__(self) -> Iterator[int]:
         return iter(self._place)
 

@@ -171,11 +171,11 @@ def _build_result(
         for person in chain:
             # Matches in single views after the last fix may show any person.
             first, last = (person.shown_from, frames) if causal else (0, person.last_fixed)
-            for frame, sighting in person.sightings.items():
-                if first <= frame <= last:
-                    index[frame, :, n] = sighting.index
-                    distance[frame, :, n] = sighting.ray_distance
-                    joints[frame, n] = sighting.joints
+            frame, seen, apart, pose = person.sightings.stack()
+            kept = (first <= frame) & (frame <= last)
+            index[frame[kept], :, n] = seen[kept]
+            distance[frame[kept], :, n] = apart[kept]
+            joints[frame[kept], n] = pose[kept]
         tracks.append(_summarize_track(n, index[:, :, n]))
     matched = np.isfinite(distance)
     count = int(np.count_nonzero(matched))
