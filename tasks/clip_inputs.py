@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,6 +27,33 @@ PAGE = 256
 """Frames per read."""
 PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
+
+
+class ChunkedRows:
+    """Rows of a stored array, read by whole chunks; the last one read stays in memory.
+
+    A page seldom ends where a chunk does: by pages, each chunk would be decoded two or three times.
+    """
+
+    def __init__(self, array: xr.DataArray) -> None:
+        chunks = array.encoding.get("chunks")
+        length = chunks[0] if chunks else PAGE
+        self._array = array
+        self._length = length * math.ceil(PAGE / length)
+        self._last: tuple[int, NDArray[Any]] = (-1, np.empty(0))
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Return the rows from a start to a stop."""
+        length = self._length
+        parts = []
+        for number in range(rows.start // length, (rows.stop - 1) // length + 1):
+            held, values = self._last  # read at once: threads may replace it
+            first = number * length
+            if held != number:
+                values = self._array[first : first + length].values
+                self._last = (number, values)
+            parts.append(values[max(rows.start - first, 0) : rows.stop - first])
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 class StoredArray:
@@ -60,11 +88,11 @@ class StoredArray:
         detections = max(1, *(array.sizes["detection"] for array in arrays))
         frames, _, *rest = arrays[0].shape
         self.shape: tuple[int, ...] = (frames, len(arrays), detections, *rest)
-        self._arrays = arrays
+        self._arrays = [ChunkedRows(array) for array in arrays]
         self._clips = clips
         self._redetected = redetected
-        self._rejected = rejected
-        self._shift = shift
+        self._rejected = None if rejected is None else ChunkedRows(rejected)
+        self._shift = None if shift is None else ChunkedRows(shift)
         self._page = lru_cache(PAGES)(self._read)
 
     def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
@@ -79,33 +107,34 @@ class StoredArray:
     def _read(self, number: int) -> NDArray[np.float32]:
         start, stop = number * PAGE, min((number + 1) * PAGE, self.shape[0])
         page = np.full((stop - start, *self.shape[1:]), np.nan, dtype=np.float32)
-        for camera, array in enumerate(self._arrays):
-            page[:, camera, : array.sizes["detection"]] = array[start:stop].values
         rows = slice(start, stop)
+        for camera, array in enumerate(self._arrays):
+            part = array[rows]
+            page[:, camera, : part.shape[1]] = part
         if self._shift is not None:
-            page -= _align_results(self._clips, self._shift, page.shape, rows)
+            page -= _align_results(self._clips, self._shift[rows], page.shape, rows)
             for camera, clip in enumerate(self._clips):
                 if "shift" in clip:
                     page[:, camera, : clip.sizes["detection"]] -= clip["shift"][rows].values
         if self._rejected is not None:
-            page[_align_results(self._clips, self._rejected, page.shape[:4], rows)] = np.nan
+            rejected = _align_results(self._clips, self._rejected[rows], page.shape[:4], rows)
+            page[rejected] = np.nan
         if not self._redetected:
             page[_mark_redetected(self._clips, page.shape[:3], rows)] = np.nan
         return page
 
 
 def _align_results(
-    clips: Sequence[xr.Dataset], results: xr.DataArray, shape: tuple[int, ...], rows: slice
+    clips: Sequence[xr.Dataset], before: NDArray[Any], shape: tuple[int, ...], rows: slice
 ) -> NDArray[Any]:
     """Return filtering results of the previous iteration for current detections; zero for new ones.
 
     Args:
         clips: detections of each camera.
-        results: (frames, cameras, previous detections, ...).
+        before: (rows, cameras, previous detections, ...), results in these frames.
         shape: (rows, cameras, detections, ...) shape of the result.
         rows: slice of the frames.
     """
-    before = results[rows].values
     out = np.zeros(shape, dtype=before.dtype)
     both = min(shape[2], before.shape[2])
     out[:, :, :both] = before[:, :, :both]
@@ -203,7 +232,7 @@ def load_dropped_boxes(store: Store, work: Work) -> NDArray[np.bool_] | None:
         store, work, slice(dropped["frame"].values[0], dropped["frame"].values[-1])
     )
     detections = max(1, *(clip.sizes["detection"] for clip in seen))
-    return _align_results(seen, dropped, (*dropped.shape[:2], detections), slice(None))
+    return _align_results(seen, dropped.values, (*dropped.shape[:2], detections), slice(None))
 
 
 def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:

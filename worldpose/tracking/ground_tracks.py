@@ -49,8 +49,8 @@ MIN_SEEN: Final = 0.4
 BYSTANDER_M: Final = 1.5
 """A person always farther outside of the pitch is a bystander [m]: assistants run within a metre of
 the lines; benches and photographers are 2 m away, and a place by feet can be 0.3 m off."""
-TRIANGULATED_STD_M: Final = 0.15
-"""Standard deviation of the feet from the mid-hip of a triangulated person, per axis [m]."""
+TRIANGULATED_NOISE: Final = np.diag([0.15**2, 0.15**2])
+"""Covariance of the feet from the mid-hip of a triangulated person [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class _Sight:
     @classmethod
     def at_place(cls, place: Floats) -> _Sight:
         """Return the place of a triangulated person."""
-        return cls(place, TRIANGULATED_STD_M**2 * np.eye(2))
+        return cls(place, TRIANGULATED_NOISE)
 
 
 @dataclass(eq=False)
@@ -151,9 +151,8 @@ class _Track:
 
     def correct(self, sight: _Sight, clock: float) -> None:
         """Update the state with a detection in an image `clock` [s] after the frame."""
-        look = _look(clock)
         self.state, self.covariance = _correct(
-            self.state, self.covariance, sight.place, sight.noise, look
+            self.state, self.covariance, sight.place, sight.noise, clock
         )
         before = self.steps[-1]
         self.steps[-1] = (before[0], before[1], self.state, self.covariance)
@@ -177,9 +176,12 @@ def _predict(
 
 @compile_kernel
 def _correct(
-    state: Floats, covariance: Floats, place: Floats, noise: Floats, look: Floats
+    state: Floats, covariance: Floats, place: Floats, noise: Floats, clock: float
 ) -> tuple[Floats, Floats]:
-    """Return state (4,) and covariance (4, 4) after a measurement, `place` = `look` @ state."""
+    """Return state (4,) and covariance (4, 4) after a position was seen `clock` [s] later."""
+    look = np.zeros((2, 4))
+    for axis in range(2):
+        look[axis, axis], look[axis, axis + 2] = 1.0, clock
     gain = covariance @ look.T
     gain = gain @ np.linalg.inv(look @ gain + noise)
     return state + gain @ (place - look @ state), covariance - gain @ look @ covariance

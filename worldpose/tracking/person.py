@@ -206,6 +206,7 @@ def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Float
     return out, shift, known
 
 
+@compile_kernel
 def separations(a: Floats, b: Floats) -> Floats:
     """Return the mean distance of the joints known in both poses of every pair [m].
 
@@ -216,8 +217,18 @@ def separations(a: Floats, b: Floats) -> Floats:
     Returns:
         (n, m) [m]; infinite where no joint is known in both.
     """
-    distances = np.linalg.norm(a[:, None] - b[None], axis=-1)
-    known = np.isfinite(distances)
-    count = known.sum(axis=-1)
-    total = np.where(known, distances, 0.0).sum(axis=-1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.inf)
+    out = np.full((len(a), len(b)), np.inf)
+    for n in range(len(a)):
+        for m in range(len(b)):
+            total, count = 0.0, 0
+            for joint in range(a.shape[1]):
+                x = a[n, joint, 0] - b[m, joint, 0]
+                y = a[n, joint, 1] - b[m, joint, 1]
+                z = a[n, joint, 2] - b[m, joint, 2]
+                distance = math.sqrt(x * x + y * y + z * z)
+                if not math.isnan(distance):
+                    total += distance
+                    count += 1
+            if count:
+                out[n, m] = total / count
+    return out
