@@ -2,12 +2,18 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency import ConsistencySettings, check_consistency
-from worldpose.camera_consistency.hypotheses import LEFT_RIGHT
+from worldpose.camera_consistency.hypotheses import (
+    LEFT_RIGHT,
+    MAX_TANGENTIAL,
+    lens_hypotheses,
+    tangential_shift,
+)
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
 
@@ -142,6 +148,28 @@ def test_lens_coefficients_in_another_order_are_named():
     result = check(cameras, keypoints)
     assert named(result) == [(1, "lens")]
     assert "k1 k2 k3 p1 p2" in result.faults[0].detail
+
+
+def test_no_lens_has_large_tangential_coefficients():
+    # A real camera whose principal point is some pixels off: p1 p2 k1 k2 k3 fitted people better.
+    camera = looking((5, -42, 9), (22, 2, 1), 1200.0, (-0.0467, 0.1376, -0.0005, -0.0005, 0.0))
+    shifts = [tangential_shift(camera, each.camera.distortion) for each in lens_hypotheses(camera)]
+    assert len(shifts) > 5
+    assert max(shifts) <= MAX_TANGENTIAL
+
+
+def test_the_tangential_shift_is_that_of_a_corner_in_opencv():
+    camera = looking((5, -42, 9), (22, 2, 1), 1200.0)
+    corners = np.array([(0, 0), (1919, 0), (0, 1079), (1919, 1079)]) - camera.principal_point
+    rays = np.column_stack([corners / camera.focal, np.ones(4)])
+    matrix = np.diag([*camera.focal, 1.0])
+    moved = [
+        cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
+        for lens in (np.zeros(5), np.array([0.0, 0.0, 0.003, -0.002, 0.0]))
+    ]
+    expected = np.linalg.norm(moved[1] - moved[0], axis=1).max() / 1919
+    found = tangential_shift(camera, np.array([-0.3, 0.1, 0.003, -0.002, 0.02]))
+    assert found == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("late", [-9, 6])
