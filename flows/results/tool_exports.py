@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from data_contracts.conventions import COCO17
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from flows.results.best_results import (
     PLANE,
@@ -40,6 +41,7 @@ from worldpose.formats.tables import (
     write_parquet,
 )
 from worldpose.ingest import read_match
+from worldpose.store import Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,6 +64,7 @@ def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
         if origin.spec.pitch != "none"
         else "the world of the given calibration, right-handed",
         "joints": _joint_definition(origin, clip, stage),
+        "keypoints": _keypoint_source(origin.run),
         "filled": "gaps interpolated on request; joints without a contributing camera are flagged"
         if origin.filled
         else "joints without a contributing camera come from the motion or the rest of the body",
@@ -72,7 +75,27 @@ def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
         model = str(origin.run[unit].attrs["body_model"])
         terms = "CC0 1.0" if model.startswith(OPEN_BODY) else "the terms of its publisher apply"
         notes["body_model"] = f"{model} ({terms})"
+        offsets = np.round(1e3 * origin.run[unit]["joint_offsets"].values) + 0.0  # no -0
+        notes["joint_offsets_mm"] = "forward, left, up in the body, from model to detector: " + (
+            ", ".join(
+                f"{joint} " + " ".join(f"{number:.0f}" for number in offset)
+                for joint, offset in zip(COCO17, offsets, strict=True)
+            )
+        )
     return notes
+
+
+def _keypoint_source(run: Run) -> str:
+    """Return which detector the 2D poses are of, with its version."""
+    detected = [name for name in run if name.startswith("detection/")]
+    if not detected:
+        return "2D poses given with the match"
+    recipe = run.manifest(detected[0]).recipe
+    pose, sources = str(recipe.settings["pose"]), cast(dict[str, Any], recipe.sources)
+    digest = sources["weights"][pose]
+    if digest is None:
+        return f"the {pose} pose net of this version"
+    return f"{pose.rpartition('/')[2]}, SHA-256 {digest[:16]}"
 
 
 def _joint_definition(origin: Origin, clip: str, stage: str) -> str:

@@ -12,6 +12,9 @@ from command_line import succeed
 
 from flows.registering import open_match
 from flows.reports.match_pictures import background_image
+from flows.results.best_results import Origin
+from flows.results.tool_exports import describe_clip
+from worldpose import open_run
 from worldpose.store import Store
 
 
@@ -44,6 +47,9 @@ def test_a_match_of_videos_alone_is_reported_over_images_of_its_videos(server, t
     # Clicks and people of cameras are drawn over grass; a plot without an image has almost none.
     over_grass = [green_share(image) > 0.15 for image in report_images(page)]
     assert sum(over_grass) >= 5
+    origin = Origin(open_run(project, match_id), open_match(store, match_id).registration)
+    keypoints = describe_clip(origin, "clip")["keypoints"]
+    assert keypoints == "the embedded pose net of this version"
 
 
 @pytest.mark.slow

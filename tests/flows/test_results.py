@@ -89,6 +89,18 @@ def test_joints_of_bodies_are_exported_where_the_detector_sees_them_on_request(t
     assert (np.nanmax(tracks.covariance - result["covariance"].values, axis=(0, 1)) <= 1e-12).all()
 
 
+def test_exported_files_state_the_detector_and_the_offsets_of_its_joints(tiny_run, tmp_path):
+    succeed("export", TINY, "--format", "csv", "--out", tmp_path, "--project", tiny_run)
+    (about,) = (tmp_path / "tables").glob("*.joints.csv-metadata.json")
+    (notes,) = json.loads(about.read_text())["notes"]
+    assert notes["keypoints"] == "2D poses given with the match"
+    offsets = open_run(tiny_run, TINY)["body_fitting/clip"]["joint_offsets"].values
+    knee = re.search(r"left_knee (-?\d+) (-?\d+) (-?\d+)", notes["joint_offsets_mm"])
+    np.testing.assert_allclose(
+        np.array(knee.groups(), float), 1e3 * offsets[COCO17.index("left_knee")], atol=0.5001
+    )
+
+
 def test_exported_coco_lies_on_the_detections(tiny, tiny_run, tmp_path):
     succeed(*("export", TINY, "--format", "coco", "--out", tmp_path, "--project", tiny_run))
     spec = yaml.safe_load((tiny / "match.yaml").read_text())

@@ -355,6 +355,11 @@ class Run(Mapping[str, "xr.Dataset"]):
             self._opened[name] = self._label(result)
         return self._opened[name]
 
+    def manifest(self, name: str) -> ResultManifest:
+        """Return how a result was computed: recipe, versions, metrics, warnings."""
+        stage, _, unit = name.partition("/")
+        return self._store.manifest(self.record.match_id, stage, unit, self.record.results[name])
+
     def bodies(self, clip: str) -> xr.Dataset:
         """Return the best bodies of a clip: refitted ones where the run has them.
 
