@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from data_contracts.release import EXPORT_FORMATS
+from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -120,6 +121,11 @@ def export(
         for path in written:
             size = f", {path.stat().st_size / 1e6:.1f} MB" if path.suffix == ".html" else ""
             line(f"wrote {path}{size}")
+
+
+_LISTED = "\n".join(f"  {name:15} {purpose}" for name, purpose in EXPORT_PURPOSES.items())
+# Click keeps the lines of a paragraph that begins with this sign.
+export.__doc__ = f"{inspect.getdoc(export)}\n\n\b\nFormats:\n{_LISTED}"
 
 
 def report(

@@ -16,7 +16,7 @@ from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival
 from flows.method import METHOD
-from flows.progress import in_short
+from flows.review.metric_words import in_short, reason_words
 from flows.service.layout import served_state
 from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.web.app_context import PageContext
@@ -340,7 +340,7 @@ def _details(match: MatchStatus) -> str:
 
 
 def _describe_unit(unit: UnitSummary) -> str:
-    said = [in_browser(unit.why), *unit.objections, in_short(unit.figures)]
+    said = [in_browser(unit.why), *map(reason_words, unit.objections), in_short(unit.figures)]
     return "; ".join(filter(None, said))
 
 
