@@ -148,6 +148,14 @@ def report(
             "--camera", help="Static camera of a video; the one with most people by default."
         ),
     ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            "--figures",
+            metavar="FOLDER",
+            help="Also write the page's figures as SVG and PDF, with their data as JSON.",
+        ),
+    ] = None,
     run: RunOption = "latest",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -162,13 +170,23 @@ def report(
     store = Store.open(project)
     known = find_match(store, match)
     films = write_report(
-        store, known, out, run_id=run, reference=reference, videos=videos, camera=camera
+        store,
+        known,
+        out,
+        run_id=run,
+        reference=reference,
+        videos=videos,
+        camera=camera,
+        figures=figures,
     )
     if as_json:
         written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
-        print_json({"match": known.match_id, **written})
+        folder = {} if figures is None else {"figures": str(figures.resolve())}
+        print_json({"match": known.match_id, **written, **folder})
     else:
         line(f"report:  {out.resolve()}")
         for film in films:
             line(f"video:   {film.resolve()}")
+        if figures is not None:
+            line(f"figures: {figures.resolve()}")
         line(f"results: {store.url}/results/{known.match_id}")

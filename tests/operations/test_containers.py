@@ -11,9 +11,11 @@ import os
 import resource
 import secrets
 import shutil
+import signal
 import subprocess
 import sys
 import time
+import urllib.error
 from pathlib import Path
 from threading import Event, Thread
 
@@ -190,6 +192,14 @@ def deployment(images, tmp_path):
     started.end()
 
 
+def log_in(deployment):
+    """Somebody on the pages; None while the container starts."""
+    try:
+        return Browser(deployment)
+    except (urllib.error.URLError, ConnectionError):
+        return None
+
+
 def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment, tmp_path, capsys):
     began, times = time.monotonic(), {}
 
@@ -202,7 +212,7 @@ def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment,
     note("match made")
     deployment.begin()
     note("all containers started")
-    browser = wait_until(lambda: Browser(deployment), deployment.explain)
+    browser = wait_until(lambda: log_in(deployment), deployment.explain)
     note("pages answer")
     shutil.copytree(match, deployment.inbox / ".arriving")
     (deployment.inbox / ".arriving").rename(deployment.inbox / "arrived")
@@ -216,8 +226,17 @@ def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment,
 
     wait_until(lambda: status() not in ("none", "not run"), deployment.explain)
     note("run began")
-    # The container of a worker dies during the run, and compose starts it again.
-    podman("kill", "--signal=KILL", deployment.name("dask-worker"))
+    # A worker dies during the run, and its container is started again, by its restart policy.
+    worker = deployment.name("dask-worker")
+    started = podman("inspect", "--format={{.State.StartedAt}}", worker)
+    os.kill(int(podman("inspect", "--format={{.State.Pid}}", worker)), signal.SIGKILL)
+
+    def is_started_again():
+        said = podman("inspect", "--format={{.State.StartedAt}} {{.State.Running}}", worker)
+        return not said.startswith(started.strip()) and said.endswith("true\n")
+
+    wait_until(is_started_again, deployment.explain)
+    note("worker killed and started again")
 
     def is_done():
         browser.approve_all(NAME)
