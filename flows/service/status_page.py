@@ -101,7 +101,7 @@ summary { cursor: pointer; }
 @media (max-width: 48rem) {
   main, body > header { padding-inline: .7rem; flex-wrap: wrap; }
   table, tbody { display: block; }
-  .right { flex-wrap: wrap; }
+  #who, #ask { display: none; }
   dialog table { display: table; }
   dialog tbody { display: table-row-group; }
   dialog tr { display: table-row; }
@@ -125,7 +125,7 @@ fetch("/api/session").then(async (answer) => {
   secret = session.form_secret;
   who.textContent = `${session.who}, ${session.role}`;
   leave.hidden = false;
-});
+}).catch(() => {});
 leave.addEventListener("click", async () => {
   const headers = { "content-type": "application/json", "x-form-secret": secret };
   const answer = await fetch("/api/logout", { method: "POST", headers, body: "{}" });
@@ -139,9 +139,13 @@ document.addEventListener("keydown", (event) => {
   else if (event.key === "q" || event.key === "Q") location.assign("/");
   else if (event.key === "r" || event.key === "R") location.reload();
 });
-setInterval(() => help.open || location.reload(), 1000 * Number(document.body.dataset.refresh));
+setInterval(async () => {
+  if (help.open) return;
+  const isUp = await fetch("/api/health").then((answer) => answer.ok, () => false);
+  if (isUp && !help.open) location.reload();
+}, 1000 * Number(document.body.dataset.refresh));
 """
-"""Log-out and keys; the page is loaded anew unless its help is open."""
+"""Log-out and keys; the page loads again while the service answers and its help is closed."""
 HELP: Final = """<dialog id="help" aria-label="Help"><h2>Keys</h2><table>
 <tr><td><kbd>?</kbd></td><td>this help</td></tr>
 <tr><td><kbd>Q</kbd></td><td>matches with pending reviews</td></tr>
