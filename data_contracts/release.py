@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, Literal
 
 from pydantic import Field, JsonValue
@@ -23,26 +24,28 @@ from data_contracts.records import (
     Share,
 )
 
-EXPORT_FORMATS: Final = (
-    "joints",
-    "coco",
-    "worldpose",
-    "positions",
-    "minimap",
-    "trc",
-    "c3d",
-    "bvh",
-    "mot",
-    "gltf",
-    "csv",
-    "parquet",
-    "viewer",
-    "challenge",
-    "challenge-2025",
-    "tracks",
-    "slahmr-cameras",
-    "rerun",
-)
+EXPORT_PURPOSES: Final[Mapping[str, str]] = {
+    "joints": "joints with covariances for numpy",
+    "coco": "keypoints per camera image, for training and labelling tools",
+    "worldpose": "SMPL bodies and cameras as in the WorldPose data set",
+    "positions": "a table of positions and speeds on the pitch",
+    "minimap": "a video of the pitch from above",
+    "trc": "markers for OpenSim",
+    "c3d": "markers for motion capture programs such as Visual3D",
+    "bvh": "a skeleton in motion for Blender and game engines",
+    "mot": "joint angles for OpenSim",
+    "gltf": "a 3D scene of bodies and cameras for Blender and the web",
+    "csv": "tables of joints, people and strides for spreadsheets and R",
+    "parquet": "the tables of csv with types, for pandas and databases",
+    "viewer": "a 3D view in one file, for any browser without a network",
+    "challenge": "the files of the pose challenge, with a submission",
+    "challenge-2025": "the files of the pose challenge of 2025",
+    "tracks": "boxes in MOTChallenge lines for other methods",
+    "slahmr-cameras": "the broadcast camera for SLAHMR",
+    "rerun": "a recording for the rerun viewer",
+}
+"""Format to what its files are for."""
+EXPORT_FORMATS: Final = tuple(EXPORT_PURPOSES)
 """Names that `worldpose export --format` accepts."""
 
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
+from flows.review.metric_words import all_reasons, in_short
+
 logger = logging.getLogger("worldpose.run")
 
 EXPECTATION_SECONDS: Final = 60.0
@@ -130,7 +132,7 @@ class Reporter:
 
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
         """Report that a unit's result needs review."""
-        logger.warning("%s: waits for review: %s", unit, "; ".join(reasons))
+        logger.warning("%s: waits for review: %s", unit, all_reasons(reasons))
 
     def unit_failed(self, unit: str, message: str) -> None:
         """Report that a unit has no result."""
@@ -140,11 +142,6 @@ class Reporter:
     def report_interruption(self) -> None:
         """Report that the user ended the run; its process ends next."""
         logger.warning("interrupted")
-
-
-def in_short(figures: Mapping[str, float]) -> str:
-    """Format a unit's metrics on one line, without those of single cameras."""
-    return ", ".join(f"{name} {value:.4g}" for name, value in figures.items() if "." not in name)
 
 
 _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)

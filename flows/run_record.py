@@ -21,6 +21,7 @@ from flows.method import METHOD
 from flows.progress import reporter
 from flows.renames import rename_settings
 from flows.review.edit_conflicts import EditedMeanwhileError
+from flows.review.metric_words import all_reasons
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
@@ -351,7 +352,7 @@ class RunLog:
             lines = gate.warnings(self.figures[name]) if gate is not None else ()
             if lines:
                 yield (
-                    f"{name} may be wrong: {'; '.join(lines)}. Check it on the pages: "
+                    f"{name} may be wrong: {all_reasons(lines)}. Check it on the pages: "
                     "worldpose run --gates auto requests that."
                 )
 

@@ -63,11 +63,12 @@ def wait_until_up(base):
 
 
 @contextmanager
-def serving(project, folder):
+def serving(project, folder, *options):
     """The address of a process that serves a project's pages; its log lies in a folder."""
     port = free_port()
     environment = {**os.environ, "WORLDPOSE_REVIEW_TOKEN": TOKEN}
     command = [*WORLDPOSE, "review", "serve", "--port", str(port), "--project", str(project)]
+    command += map(str, options)
     with (folder / "pages.log").open("wb") as log:
         server = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
     base = f"http://127.0.0.1:{port}"

@@ -17,7 +17,8 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
-from flows.progress import Reporter, in_short, reporting_to
+from flows.progress import Reporter, reporting_to
+from flows.review.metric_words import all_reasons, in_short
 
 output = Console(soft_wrap=True)
 errors = Console(stderr=True, soft_wrap=True)
@@ -139,7 +140,7 @@ class ConsoleReporter(Reporter):
     def unit_waits(self, unit: str, reasons: Sequence[str]) -> None:
         """Print the unit and why it needs review."""
         super().unit_waits(unit, reasons)
-        line(f"{'':13}{unit} waits for review: {'; '.join(reasons)}", to=errors)
+        line(f"{'':13}{unit} waits for review: {all_reasons(reasons)}", to=errors)
 
     def unit_failed(self, unit: str, message: str) -> None:
         """Print the unit and why it failed."""

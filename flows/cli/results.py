@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from data_contracts.release import EXPORT_FORMATS
+from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -122,6 +123,11 @@ def export(
             line(f"wrote {path}{size}")
 
 
+_LISTED = "\n".join(f"  {name:15} {purpose}" for name, purpose in EXPORT_PURPOSES.items())
+# Click keeps the lines of a paragraph that begins with this sign.
+export.__doc__ = f"{inspect.getdoc(export)}\n\n\b\nFormats:\n{_LISTED}"
+
+
 def report(
     match: MatchArgument,
     out: Annotated[Path, typer.Option("--out", help="Output page.")] = Path("report.html"),
@@ -142,6 +148,14 @@ def report(
             "--camera", help="Static camera of a video; the one with most people by default."
         ),
     ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            "--figures",
+            metavar="FOLDER",
+            help="Also write the page's figures as SVG and PDF, with their data as JSON.",
+        ),
+    ] = None,
     run: RunOption = "latest",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -156,13 +170,23 @@ def report(
     store = Store.open(project)
     known = find_match(store, match)
     films = write_report(
-        store, known, out, run_id=run, reference=reference, videos=videos, camera=camera
+        store,
+        known,
+        out,
+        run_id=run,
+        reference=reference,
+        videos=videos,
+        camera=camera,
+        figures=figures,
     )
     if as_json:
         written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
-        print_json({"match": known.match_id, **written})
+        folder = {} if figures is None else {"figures": str(figures.resolve())}
+        print_json({"match": known.match_id, **written, **folder})
     else:
         line(f"report:  {out.resolve()}")
         for film in films:
             line(f"video:   {film.resolve()}")
+        if figures is not None:
+            line(f"figures: {figures.resolve()}")
         line(f"results: {store.url}/results/{known.match_id}")

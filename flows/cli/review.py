@@ -35,6 +35,7 @@ from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
 from flows.review.descriptions import correction_json, in_words, review_json, when
+from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -346,7 +347,7 @@ def _print_list(shown: list[Review]) -> None:
         request = each.request
         line(f"{request.id}  {each.state}, {request.match_id}, {when(request.created_at)}")
         for reason in request.reasons:
-            line(f"  {reason}")
+            line(f"  {reason_words(reason)}")
 
 
 def _print_review(shown: Review, as_json: bool) -> None:
@@ -358,14 +359,19 @@ def _print_review(shown: Review, as_json: bool) -> None:
     line(f"{request.id}: {shown.state}")
     line(f"  {shown.question}")
     for reason in request.reasons:
-        line(f"  because {reason}")
+        line(f"  because {reason_words(reason)}")
     if decision is not None:
         line(f"  {decision.verdict} by {decision.who}, {when(decision.decided_at)}")
         line(f"  {decision.why or '(no reason given)'}")
     for unit, key in request.keys.items():
         line(f"  {unit} {key}, run {request.run_id}")
-    print_table("metrics", ("metric", ">value"), _metric_rows(shown))
+    print_table("metrics", ("metric", ">value", "unit"), _metric_rows(shown))
 
 
-def _metric_rows(shown: Review) -> list[tuple[str, str]]:
-    return [(name, f"{value:.4g}") for name, value in sorted(shown.request.figures.items())]
+def _metric_rows(shown: Review) -> list[tuple[str, str, str]]:
+    rows = []
+    for key, value in sorted(shown.request.figures.items()):
+        name, _, part = key.partition(".")
+        words, unit = metric_words(name)
+        rows.append((f"{words} {part}".rstrip(), f"{value:.4g}", unit))
+    return rows

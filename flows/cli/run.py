@@ -33,6 +33,7 @@ from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
 from flows.results.comparison import KINDS, Mark, compare_runs, count_marks
 from flows.review.advice import click_advice, clock_advice
+from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
 from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
@@ -219,7 +220,7 @@ def _print_waiting(record: RunRecord) -> None:
     also = f", {rejected} rejected and to be corrected" if rejected else ""
     line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
     for unit in record.waiting[:SHOWN]:
-        line(f"  {unit.request}: {'; '.join(unit.reasons)}")
+        line(f"  {unit.request}: {all_reasons(unit.reasons)}")
     if len(record.waiting) > SHOWN:
         line(f"  and {len(record.waiting) - SHOWN} more")
 

@@ -16,6 +16,8 @@ import socket
 import sys
 import threading
 from collections.abc import Iterable
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flows.orchestration.prefect_environment import SERVER_LOGIN
@@ -47,6 +49,8 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
             found="none: every user who reaches it could start runs",
             todo=f"Set the variable: export {SERVER_LOGIN}=worldpose:$(openssl rand -hex 16).",
         )
+    if not is_embedded:
+        _let_dashboard_be_written()
     # Garbage collection takes a fifth of the import time, although all modules stay.
     gc.disable()
     from prefect.server.api.server import create_app
@@ -56,6 +60,19 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     gc.freeze()
     gc.enable()
     return HostGuard(app, names)
+
+
+def _let_dashboard_be_written() -> None:
+    """Give the dashboard's files a folder of this user where the package is another user's.
+
+    Prefect writes them beside its own code at every start. In a container the code is root's, and
+    Prefect then serves no dashboard.
+    """
+    found = find_spec("prefect")
+    places = [] if found is None else found.submodule_search_locations or []
+    if not all(os.access(Path(place) / "server", os.W_OK) for place in places):
+        home = os.environ.get("PREFECT_HOME") or Path.home() / ".prefect"
+        os.environ.setdefault("PREFECT_SERVER_UI_STATIC_DIRECTORY", str(Path(home) / "ui"))
 
 
 def serve(host: str, port: int, names: Iterable[str]) -> None:

@@ -23,6 +23,7 @@ from pydantic import Field
 
 from data_contracts.review import ReviewDecision
 from data_contracts.run import WaitingUnit
+from flows.review.metric_words import all_reasons
 from worldpose.errors import WorldposeError
 from worldpose.review import Journal, say
 from worldpose.store import Store
@@ -59,7 +60,7 @@ def take_verdict(store: Store, match_id: str, waiting: Sequence[WaitingUnit]) ->
         WorldposeError: resumed with `recorded` though nothing was decided.
         prefect.exceptions.Pause: not answered yet; this ends the process.
     """
-    lines = [f"- `{unit.request}`: {'; '.join(unit.reasons)}" for unit in waiting]
+    lines = [f"- `{unit.request}`: {all_reasons(unit.reasons)}" for unit in waiting]
     text = "\n".join([f"{len(waiting)} results of {match_id} wait for review:", *lines])
     answer = suspend_flow_run(
         wait_for_input=Verdict.with_initial_data(description=text),

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -35,10 +39,17 @@ from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError
 from worldpose.formats import whole_file
-from worldpose.reports import LinkedFile, Section, Table, report_page
+from worldpose.reports import CaptionedImage, LinkedFile, Section, Table, report_page
 from worldpose.reports.data_set import counted_section
+from worldpose.reports.drawing import keep_figures, write_figure
 from worldpose.reports.run_report import camera_table
 from worldpose.store import Run, Store, open_run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURE_NAME: Final = 60
+"""Maximum length of the words in a figure's file name [characters]."""
 
 
 def write_report(
@@ -50,6 +61,7 @@ def write_report(
     reference: str | None = None,
     videos: bool = True,
     camera: str | None = None,
+    figures: Path | None = None,
 ) -> list[Path]:
     """Write the HTML report of one run, and return the videos written next to it.
 
@@ -62,6 +74,7 @@ def write_report(
         videos: write each clip's broadcast video, and that of a static camera, with the results
             overlaid.
         camera: static camera of the video; None = the one with most people.
+        figures: folder for the page's figures as SVG and PDF, with what they show as JSON.
 
     Raises:
         UsageError: there is no such static camera with a video.
@@ -80,7 +93,10 @@ def write_report(
         tuple(beside),
         "With markings and people drawn over them, in the folder of this page.",
     )
-    first, *others = _sections(store, run, match, source)
+    with nullcontext(None) if figures is None else keep_figures() as kept:
+        first, *others = _sections(store, run, match, source)
+    if figures is not None and kept is not None:
+        _write_figures([first, *others], kept, figures)
     page = report_page(
         match.match_id,
         run.record,
@@ -92,6 +108,21 @@ def write_report(
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
     return films
+
+
+def _write_figures(sections: list[Section], kept: Mapping[bytes, Figure], folder: Path) -> None:
+    """Write the figures of the sections, numbered in the order of the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shown = (
+        (section.heading, block.caption, kept[block.png])
+        for section in sections
+        for block in section.blocks
+        if isinstance(block, CaptionedImage) and block.png in kept
+    )
+    for number, (heading, caption, figure) in enumerate(shown, start=1):
+        words = re.sub(r"[^a-z0-9]+", "-", f"{heading} {caption}".lower())
+        stem = folder / f"{number:02d}-{words[:FIGURE_NAME].strip('-')}"
+        write_figure(figure, stem, caption)
 
 
 def _check_film(match: Match, camera: str) -> None:

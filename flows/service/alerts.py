@@ -12,6 +12,7 @@ from threading import Lock
 from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival
+from flows.review.metric_words import all_reasons
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
 from flows.service.plan import ServePlan
@@ -104,7 +105,7 @@ def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
             text = f"{name} has waited for a person for {hours:.1f} h: {unit.why}"
             yield Alert(f"gate_waiting/{name}/{run}", "gate_waiting", text, link, match.match_id)
         if unit.objections:
-            text = f"{name}: {'; '.join(unit.objections)}"
+            text = f"{name}: {all_reasons(unit.objections)}"
             yield Alert(f"quality/{name}/{text}", "quality", text, link, match.match_id)
 
 

@@ -14,7 +14,8 @@ from prefect.artifacts import (
     update_progress_artifact,
 )
 
-from flows.progress import Reporter, in_short, in_time, reporting_to
+from flows.progress import Reporter, in_time, reporting_to
+from flows.review.metric_words import in_short
 from flows.service.match_runs import artifact_key
 from flows.service.overview import Overview
 from worldpose.store import Store

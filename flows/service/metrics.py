@@ -69,9 +69,10 @@ class ProjectMetrics(Collector):
         about = "Bodies fitted by runs that ended within the last hour"
         yield GaugeMetricFamily("worldpose_poses_last_hour", about, value=last_hour)
         yield GaugeMetricFamily("worldpose_store_bytes", "Size of the project", value=size)
-        if "://" not in self.store.url:
-            free = shutil.disk_usage(self.store.url).free
-            yield GaugeMetricFamily("worldpose_disk_free_bytes", "Free on its disk", value=free)
+        folder = self.state.folder if "://" in self.store.url else self.store.url
+        free = shutil.disk_usage(folder).free
+        about = "Free on the disk of the project, or of the state of a project in object storage"
+        yield GaugeMetricFamily("worldpose_disk_free_bytes", about, value=free)
         arrived = Counter(each.state for each in self.state.arrivals().values())
         arrivals = GaugeMetricFamily(
             "worldpose_arrivals", "Entries of the inbox by state", labels=["state"]

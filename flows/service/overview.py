@@ -14,6 +14,7 @@ from data_contracts.run import ResultManifest, RunRecord
 from flows.gates import GATES
 from flows.method import METHOD
 from flows.results.timings import Cost
+from flows.review.metric_words import all_reasons
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
 from worldpose.review import last_decision, read_journal, requests_by_id
@@ -204,7 +205,7 @@ class Overview:
             return done
         request = asked.get(waits.request)
         since = run.finished_at if request is None else request.created_at
-        return replace(done, state="waiting", waiting_since=since, why="; ".join(waits.reasons))
+        return replace(done, state="waiting", waiting_since=since, why=all_reasons(waits.reasons))
 
     def _manifest(self, match_id: str, name: str, key: str) -> ResultManifest:
         stage, _, unit = name.partition("/")

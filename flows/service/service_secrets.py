@@ -18,7 +18,7 @@ from flows.orchestration.prefect_environment import (
     new_login,
 )
 from flows.service.plan import ServePlan
-from flows.web.access import TOKEN_LENGTH
+from flows.web.proxy import TOKEN_LENGTH
 from worldpose.errors import UsageError
 from worldpose.formats import whole_file
 

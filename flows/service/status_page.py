@@ -16,7 +16,7 @@ from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival
 from flows.method import METHOD
-from flows.progress import in_short
+from flows.review.metric_words import in_short, reason_words
 from flows.service.layout import served_state
 from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.web.app_context import PageContext
@@ -83,20 +83,80 @@ small, .soft { color: var(--soft); font-size: .82rem; }
 .blocked { border-color: var(--blocked) !important; }
 .state { font-weight: 600; }
 progress { width: 100%; accent-color: var(--accent); }
+button {
+  font: inherit; color: var(--ink); background: var(--panel); border: 1px solid var(--line);
+  border-radius: 6px; padding: .25rem .7rem; cursor: pointer;
+}
+button:hover { border-color: var(--accent); }
+kbd { font: .82em ui-monospace, "DejaVu Sans Mono", monospace; white-space: nowrap; }
+kbd { border: 1px solid var(--line); border-radius: 4px; padding: 0 .35em; }
+dialog { background: var(--panel); color: var(--ink); border: 1px solid var(--line); }
+dialog { border-radius: 10px; padding: 1.2rem 1.4rem; max-width: min(44rem, 92vw); }
+dialog h2:first-child { margin-top: 0; }
+dialog td:first-child { white-space: nowrap; padding-right: 1rem; }
+dialog form { margin-top: 1rem; }
+#who { color: var(--soft); font-size: .86rem; }
 details { margin: .4rem 0; }
 summary { cursor: pointer; }
 @media (max-width: 48rem) {
   main, body > header { padding-inline: .7rem; flex-wrap: wrap; }
   table, tbody { display: block; }
-  tr { display: flex; flex-wrap: wrap; margin-bottom: .6rem; background: var(--panel); }
-  tr { border: 1px solid var(--line); border-radius: 8px; padding: .4rem .6rem; }
-  tr:has(th), td:empty { display: none; }
-  td { border: 0; flex: 1 1 8rem; }
-  td.cell { flex: 0 0 50%; font-size: .86rem; }
+  #who, #ask { display: none; }
+  dialog table { display: table; }
+  dialog tbody { display: table-row-group; }
+  dialog tr { display: table-row; }
+  main tr { display: flex; flex-wrap: wrap; margin-bottom: .6rem; background: var(--panel); }
+  main tr { border: 1px solid var(--line); border-radius: 8px; padding: .4rem .6rem; }
+  main tr:has(th), td:empty { display: none; }
+  main td { border: 0; flex: 1 1 8rem; }
+  main td.cell { flex: 0 0 50%; font-size: .86rem; }
   td[data-of]::before { content: attr(data-of); display: block; color: var(--soft); }
 }
 """
 """Colours and sizes of the other pages; each state is also given as text."""
+SCRIPT: Final = """"use strict";
+const help = document.getElementById("help");
+const who = document.getElementById("who");
+const leave = document.getElementById("leave");
+let secret = "";
+fetch("/api/session").then(async (answer) => {
+  if (!answer.ok) return location.assign("/login");
+  const session = await answer.json();
+  secret = session.form_secret;
+  who.textContent = `${session.who}, ${session.role}`;
+  leave.hidden = false;
+}).catch(() => {});
+leave.addEventListener("click", async () => {
+  const headers = { "content-type": "application/json", "x-form-secret": secret };
+  const answer = await fetch("/api/logout", { method: "POST", headers, body: "{}" });
+  location.assign(answer.ok ? (await answer.json()).next : "/login");
+});
+document.getElementById("ask").addEventListener("click", () => help.showModal());
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  if (event.key === "?") help.open ? help.close() : help.showModal();
+  else if (help.open) return;
+  else if (event.key === "q" || event.key === "Q") location.assign("/");
+  else if (event.key === "r" || event.key === "R") location.reload();
+});
+setInterval(async () => {
+  if (help.open) return;
+  const isUp = await fetch("/api/health").then((answer) => answer.ok, () => false);
+  if (isUp && !help.open) location.reload();
+}, 1000 * Number(document.body.dataset.refresh));
+"""
+"""Log-out and keys; the page loads again while the service answers and its help is closed."""
+HELP: Final = """<dialog id="help" aria-label="Help"><h2>Keys</h2><table>
+<tr><td><kbd>?</kbd></td><td>this help</td></tr>
+<tr><td><kbd>Q</kbd></td><td>matches with pending reviews</td></tr>
+<tr><td><kbd>R</kbd></td><td>load the page now; it loads by itself every 15 seconds</td></tr>
+<tr><td><kbd>Esc</kbd></td><td>close the help</td></tr></table>
+<h2>States</h2><table>
+<tr><td>done</td><td>computed; 3/4 means three of four results of the stage</td></tr>
+<tr><td>waiting</td><td>a person has to approve the result before later stages use it</td></tr>
+<tr><td>failed</td><td>it ended with an error, which stands below the table</td></tr>
+<tr><td>blocked</td><td>an earlier result is missing: failed, or not yet approved</td></tr></table>
+<form method="dialog"><button>Close</button></form></dialog>"""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -126,6 +186,10 @@ def routes(context: PageContext) -> APIRouter:
     @router.get("/status/page.css")
     def style() -> Response:
         return Response(STYLE, media_type="text/css; charset=utf-8")
+
+    @router.get("/status/page.js")
+    def script() -> Response:
+        return Response(SCRIPT, media_type="text/javascript; charset=utf-8")
 
     return router
 
@@ -186,12 +250,17 @@ def status_html(
     refresh = UNSEEN_SECONDS if any(each.is_unseen for each in shown) else REFRESH_SECONDS
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>worldpose status</title>'
-        f'<meta http-equiv="refresh" content="{refresh}">'
+        f'<noscript><meta http-equiv="refresh" content="{refresh}"></noscript>'
         '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
-        '<link rel="stylesheet" href="/status/page.css"></head><body>'
+        '<link rel="stylesheet" href="/status/page.css">'
+        '<script defer src="/status/page.js"></script>'
+        f'</head><body data-refresh="{refresh}">'
         '<header><nav aria-label="Where you are"><a href="/">worldpose review</a>'
         '<span>&rsaquo;</span><span aria-current="page">Status</span></nav>'
-        f'<div class="right"><a href="/">Pending review</a>{link}</div></header>'
+        f'<div class="right"><a href="/">Pending review</a>{link}'
+        '<button id="ask" title="Keys and states of this page">Help <kbd>?</kbd></button>'
+        '<span id="who" title="Your name, and what you may do here"></span>'
+        f'<button id="leave" hidden>Log out</button></div></header>{HELP}'
         f"<main><h1>Matches <small>{escape(said)}</small></h1>"
         f"{table}{_inbox(arrivals, begun)}{details}</main></body></html>"
     )
@@ -275,7 +344,7 @@ def _details(match: MatchStatus) -> str:
 
 
 def _describe_unit(unit: UnitSummary) -> str:
-    said = [in_browser(unit.why), *unit.objections, in_short(unit.figures)]
+    said = [in_browser(unit.why), *map(reason_words, unit.objections), in_short(unit.figures)]
     return "; ".join(filter(None, said))
 
 

@@ -14,20 +14,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 from pydantic import Field, ValidationError
 
 from data_contracts.records import Record
 from flows.web.host_guard import LOOPBACK as LOOPBACK
+from flows.web.proxy import NAME_LENGTH, TOKEN_LENGTH, Proxy, Role
 from worldpose.errors import UsageError
 
 SESSION_SECONDS: Final = 12 * 3600
 """A working day; after it, people log in again."""
-TOKEN_LENGTH: Final = 16
-"""Minimum length of a chosen token [characters]."""
-NAME_LENGTH: Final = 80
-"""Maximum length of a person's name [characters]."""
 WRONG_TOKENS: Final = 5
 """Wrong tokens from one address within `WRONG_SECONDS`; further ones are refused unchecked."""
 WRONG_SECONDS: Final = 10.0
@@ -35,8 +32,6 @@ MOST_REMEMBERED: Final = 10_000
 """Wrong tokens and ended sessions that are remembered, the latest."""
 
 
-Role = Literal["viewer", "annotator", "approver"]
-"""viewer: sees all; annotator: also corrects; approver: also decides, runs and adds matches."""
 EDITING: Final = ("/corrections", "/withdrawals", "/withdrawal", "/acceptances")
 """Suffixes of the paths by which an annotator changes something."""
 OF_ALL: Final = ("/api/logout", "/preview")
@@ -55,12 +50,14 @@ class User(Record):
 class UserFile(Record):
     """The file users.toml: who may log in. Without the file, the access token admits every user."""
 
-    users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User]
+    users: dict[Annotated[str, Field(min_length=1, max_length=NAME_LENGTH)], User] = {}
     """Name to role and token."""
+    proxy: Proxy | None = None
+    """Proxy that logs further people in; None: people log in with their tokens alone."""
 
 
-def read_users(file: Path) -> Mapping[str, User]:
-    """Return the people of a file, by name.
+def read_users(file: Path) -> UserFile:
+    """Return the people of a file and its proxy.
 
     Raises:
         UsageError: the file is missing or malformed, other users of the machine can read it, or two
@@ -70,8 +67,11 @@ def read_users(file: Path) -> Mapping[str, User]:
     try:
         if stat.S_IMODE(file.stat().st_mode) & 0o077:
             problem = "one that others can read: chmod 600"
-        users = UserFile.model_validate(tomllib.loads(file.read_text(encoding="utf-8"))).users
-        if len({user.token for user in users.values()}) < len(users):
+        found = UserFile.model_validate(tomllib.loads(file.read_text(encoding="utf-8")))
+        users = found.users
+        if not users and found.proxy is None:
+            problem = "neither a user nor a proxy"
+        elif len({user.token for user in users.values()}) < len(users):
             problem = "the same token of two people"
         elif not all(name.isprintable() for name in users):
             problem = "a name with characters that cannot be printed"
@@ -85,11 +85,11 @@ def read_users(file: Path) -> Mapping[str, User]:
     if problem:
         raise UsageError(
             f"--users {file}",
-            expected="tables [users.NAME] with role and token, readable by its owner alone",
+            expected="tables [users.NAME] with role and token, or [proxy], for its owner alone",
             found=problem,
             todo="Correct the file; docs/how-to/review.md has an example.",
         )
-    return users
+    return found
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,14 @@ class Access:
         secure: whether pages are served with TLS.
         users: people with a role and a token of their own, by name; None = all with the login
             token is an approver.
+        proxy: the proxy that logs further people in.
     """
 
     token: str
     hosts: frozenset[str] = LOOPBACK
     secure: bool = False
     users: Mapping[str, User] | None = None
+    proxy: Proxy | None = None
     _ended: dict[str, float] = field(default_factory=dict, init=False, compare=False)
     _wrong: list[tuple[float, str]] = field(default_factory=list, init=False, compare=False)
     _lock: Lock = field(default_factory=Lock, init=False, compare=False)
@@ -122,21 +124,27 @@ class Access:
         """Name of the session cookie: servers on one machine do not end each other's sessions."""
         return f"worldpose_review_{self._sign('cookie')[:8]}"
 
-    def session(self, who: str, now: float | None = None) -> str:
+    def session(self, who: str, now: float | None = None, *, by_proxy: bool = False) -> str:
         """Return a new session for `who`, as the cookie's value."""
         until = (time.time() if now is None else now) + SESSION_SECONDS
-        parts = {"who": who, "own": self._sign_own(who), "until": until}
+        parts = {"who": who, "own": self._sign_own(who, by_proxy), "until": until}
         content = json.dumps({**parts, "nonce": secrets.token_hex(8)})
         packed = base64.urlsafe_b64encode(content.encode()).decode().rstrip("=")
         return f"{packed}.{self._sign('session', packed)}"
 
-    def person(self, session: str | None, now: float | None = None) -> str | None:
-        """Return the person of a session cookie; None if it is forged, expired or missing."""
+    def person(
+        self, session: str | None, now: float | None = None, *, by_proxy: bool = False
+    ) -> str | None:
+        """Return the person of a session cookie; None if it is forged, expired or missing.
+
+        A session that began through the proxy is valid there alone.
+        """
         packed, _, signature = (session or "").partition(".")
         if not self._same(signature, self._sign("session", packed)):
             return None
         content = json.loads(base64.urlsafe_b64decode(packed + "=" * (-len(packed) % 4)))
-        if content.get("own") != self._sign_own(content["who"]):  # also one of an earlier version
+        # Also one of an earlier version.
+        if content.get("own") != self._sign_own(content["who"], by_proxy):
             return None
         if content["until"] < (time.time() if now is None else now) or signature in self._ended:
             return None
@@ -177,19 +185,20 @@ class Access:
         return self._same(given, self.token if user is None else user.token) and user is not None
 
     def role(self, who: str | None) -> Role:
-        """Return the role of a person who has logged in."""
+        """Return the role of a person who has logged in with a token."""
         user = None if self.users is None or who is None else self.users.get(who)
         return "approver" if user is None else user.role
 
-    def may_change(self, who: str | None, path: str) -> bool:
-        """Return whether the person's role allows a request that changes what `path` names."""
-        role = self.role(who)
+    def may_change(self, role: Role, path: str) -> bool:
+        """Return whether the role allows a request that changes what `path` names."""
         if role == "approver" or path.endswith(OF_ALL):
             return True
         return role == "annotator" and path.endswith(EDITING)
 
-    def _sign_own(self, who: str) -> str | None:
+    def _sign_own(self, who: str, by_proxy: bool) -> str | None:
         """Return what a session holds of the person; None if no user of the name may log in."""
+        if by_proxy:
+            return self._sign("proxy")
         if self.users is None:
             return ""
         user = self.users.get(who)
@@ -232,7 +241,8 @@ def access_for(
             found=f"{len(token)}",
             todo="Create a token with: openssl rand -hex 16.",
         )
-    people = None if users is None else read_users(users)
+    read = None if users is None else read_users(users)
+    people, proxy = (None, None) if read is None else (read.users, read.proxy)
     hosts = {name.lower() for name in (*LOOPBACK, *names, host)} - {"0.0.0.0", "::"}
     if host not in LOOPBACK:
         if token is None and people is None:
@@ -249,4 +259,4 @@ def access_for(
                 found="none",
                 todo="Add the name, as in --host-name review.example.org.",
             )
-    return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure, people)
+    return Access(token or secrets.token_urlsafe(24), frozenset(hosts), secure, people, proxy)

@@ -34,12 +34,13 @@ from flows.web import (
     results,
     views,
 )
-from flows.web.access import NAME_LENGTH, SESSION_SECONDS, Access
+from flows.web.access import SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import describe_error
 from flows.web.host_guard import refusal, refuse_foreign
 from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
 from flows.web.intake import routes as routes_of_intake
+from flows.web.proxy import NAME_LENGTH, Role
 from worldpose.errors import InputError, InternalError, WorldposeError
 from worldpose.store import Store
 
@@ -139,30 +140,36 @@ def _sessions(context: PageContext) -> APIRouter:
             return JSONResponse({"error": "this is not the token"}, status_code=401)
         request.state.who = given.who
         answer = JSONResponse({"who": given.who})
-        answer.set_cookie(
-            access.cookie,
-            access.session(given.who),
-            max_age=SESSION_SECONDS,
-            httponly=True,
-            samesite="strict",
-            secure=access.secure,
-        )
+        _set_session(answer, access, access.session(given.who), access.secure)
         return answer
 
     @router.post("/api/logout")
     def logout(request: Request) -> JSONResponse:
         access.end(request.state.session)
-        answer = JSONResponse({})
+        proxy = access.proxy if request.state.is_proxied else None
+        answer = JSONResponse({"next": "/login" if proxy is None else proxy.sign_out})
         answer.delete_cookie(access.cookie, httponly=True, samesite="strict")
         return answer
 
     @router.get("/api/session")
     def session(request: Request, who: Person) -> dict[str, str]:
         secret = access.form_secret(request.state.session)
-        role = access.role(who)
+        role = request.state.role
         return {"who": who, "role": role, "form_secret": secret, "project": context.store.url}
 
     return router
+
+
+def _set_session(answer: Response, access: Access, session: str, secure: bool) -> None:
+    """Set the cookie of a session, out of reach of scripts and other sites."""
+    answer.set_cookie(
+        access.cookie,
+        session,
+        max_age=SESSION_SECONDS,
+        httponly=True,
+        samesite="strict",
+        secure=secure,
+    )
 
 
 def _files() -> APIRouter:
@@ -255,26 +262,37 @@ class Guard:
     """Refuses requests that do not come from a page of this server with a valid session.
 
     Host: a foreign name that points here (DNS rebinding) is refused. Session: all but `OPEN` needs
-        one. Changes: need the session's form secret, and this origin if the browser states one.
-        Size: at most `BODY_BYTES`, or `CHUNK_BYTES` of a chunk of a file. Every login and every
-        requested change is logged with person, request and response.
+        one; a person whom a trusted proxy names gets one. Changes: need the session's form secret,
+        and this origin if the browser states one. Size: at most `BODY_BYTES`, or `CHUNK_BYTES` of
+        a chunk of a file. Every login and every requested change is logged with person, request
+        and response.
     """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app, self.access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the refusal, or pass the request on with `state.who` and `state.session`."""
+        """Send the refusal, or pass the request on with person, role and session in `state`."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
         if scope["type"] != "http":
             raise RuntimeError(f"nothing here speaks {scope['type']}")
         headers = Headers(scope=scope)
-        session = _cookie(headers, self.access.cookie)
-        who = self.access.person(session)
+        access = self.access
+        session = _cookie(headers, access.cookie)
+        visitor = None if access.proxy is None else access.proxy.visitor(scope, headers)
+        begun = Response()  # a session that begins with this request
+        if visitor is None:
+            who = access.person(session)
+            role: Role | None = access.role(who)
+        else:
+            who, role = visitor.who, visitor.role
+            if access.person(session, by_proxy=True) != who:
+                session = access.session(who, by_proxy=True)
+                _set_session(begun, access, session, access.secure or visitor.secure)
         state = scope.setdefault("state", {})
-        state["who"], state["session"] = who, session
+        state |= {"who": who, "role": role, "session": session, "is_proxied": visitor is not None}
 
         is_gone = False
 
@@ -286,7 +304,11 @@ class Guard:
 
         async def send_sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
-                _seal(MutableHeaders(scope=message), scope["path"])
+                sealed = MutableHeaders(scope=message)
+                _seal(sealed, scope["path"])
+                if role is not None and "set-cookie" not in sealed:  # as logging out sets one
+                    for cookie in begun.headers.getlist("set-cookie"):
+                        sealed.append("set-cookie", cookie)
                 is_frequent = scope["path"].endswith((ASKING, CHUNK_SUFFIX))
                 asked = is_frequent and message["status"] < 400
                 # A client that disconnected in the middle of its request requested nothing.
@@ -296,27 +318,30 @@ class Guard:
                     LOG.info("%s: %r: %s", state["who"] or "nobody", place, message["status"])
             await send(message)
 
-        refusal = self._refusal(scope, headers, who, session)
+        refusal = self._refusal(scope, headers)
         if refusal is not None:
             await refusal(scope, receive_noted, send_sealed)
             return
         await self.app(scope, receive_noted, send_sealed)
 
-    def _refusal(
-        self, scope: Scope, headers: Headers, who: str | None, session: str | None
-    ) -> Response | None:
+    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
         foreign = refuse_foreign(scope, headers, self.access.hosts)
         if foreign is not None:
             return foreign
-        path, method = scope["path"], scope["method"]
+        path, method, state = scope["path"], scope["method"], scope["state"]
+        who, role, session = state["who"], state["role"], state["session"]
+        if role is None:
+            return refusal(403, f"none of the groups of {who} has a role here")
+        if state["is_proxied"] and path == "/login":
+            return RedirectResponse("/", status_code=303)
         if path not in OPEN and who is None:
             if method == "GET" and path == "/":
                 return RedirectResponse("/login", status_code=303)
             return refusal(401, "log in first")
         if method in SAFE:
             return None
-        if path not in OPEN and not self.access.may_change(who, path):
-            return refusal(403, f"the role of {who}, {self.access.role(who)}, does not allow this")
+        if path not in OPEN and not self.access.may_change(role, path):
+            return refusal(403, f"the role of {who}, {role}, does not allow this")
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
             return refusal(403, "this comes from a page of another server")
         is_chunk = method == "PUT" and path.endswith(CHUNK_SUFFIX)

@@ -234,6 +234,7 @@ def serve_http(
         loop="asyncio",
         backlog=max(1, connections.limit // ACCEPTED_SHARE),
         access_log=False,
+        proxy_headers=False,  # any account of this machine could name another address as its own
         log_level="error",  # a line per malformed request would fill the disk
         **{"ws": "none", **options},
     )

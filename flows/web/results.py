@@ -14,11 +14,11 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
-from data_contracts.release import EXPORT_FORMATS
+from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
 from flows.reports.viewer import describe_video, viewer_clip
-from flows.results.best_results import Origin, clips_of
+from flows.results.best_results import Origin, clips_of, tracked_people
 from flows.results.comparison import compare_runs
 from flows.results.export import export
 from flows.stage import Match
@@ -86,6 +86,19 @@ def _require_clip(run: Run, clip: str) -> None:
         raise HTTPException(404, "the run has no such clip")
 
 
+def _player_names(match: Match, run: Run) -> dict[str, str]:
+    """Return the names of people whom the roster knows, by the subject of their metrics."""
+    roster = {player.id: player for player in match.folder.spec.roster}
+    found = {}
+    for clip in clips_of(run.record):
+        for person, track in tracked_people(run, clip)[1].items():
+            if track.name:
+                player = roster.get(track.name)
+                name = player.name if player is not None and player.name else track.name
+                found[f"{clip}: person {person}"] = name
+    return found
+
+
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
@@ -105,12 +118,13 @@ def routes(context: PageContext) -> APIRouter:
         return {
             "run": run.record.run_id,
             "formats": list(EXPORT_FORMATS),
+            "purposes": EXPORT_PURPOSES,
             "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
         }
 
     @router.get("/metrics")
     def metrics(match_id: str) -> dict[str, Any]:
-        _, run = open_latest(match_id)
+        match, run = open_latest(match_id)
         record, parent = run.record, run.record.parent
         changes, problem = [], ""
         if parent is not None:
@@ -128,6 +142,7 @@ def routes(context: PageContext) -> APIRouter:
                 }
                 for each in compare_runs(context.store, record, record)
             ],
+            "names": _player_names(match, run),
             "before": parent,
             "problem": problem,
             "changes": [asdict(each) for each in changes if each.mark != "unchanged"],

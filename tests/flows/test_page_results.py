@@ -25,6 +25,7 @@ from worldpose.store import Store, open_run
 def test_a_complete_run_gives_its_report_and_its_exports(ada):
     found = ada.get(f"{MATCH}/results").json()
     assert (found["run"], found["formats"]) == ("0001", list(EXPORT_FORMATS))
+    assert found["purposes"]["bvh"].startswith("a skeleton in motion for Blender")
     assert found["clips"] == [{"id": "clip", "video": None}]  # given keypoints: nothing is filmed
     page = ada.get(f"{MATCH}/results/report")
     assert page.headers["content-type"].startswith("text/html")

@@ -14,7 +14,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from data_contracts.release import EXPORT_FORMATS, BaselineSettings
+from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES, BaselineSettings
 from flows.cli.app import app
 from flows.results import best_results
 from flows.results.best_results import Origin
@@ -119,6 +119,9 @@ def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
     page = (Path(__file__).parents[2] / "docs/reference/formats.md").read_text()
     assert tuple(EXPORTS) == EXPORT_FORMATS
     assert set(EXPORT_FORMATS) >= CLASHING | COUNTED
+    for name, purpose in EXPORT_PURPOSES.items():
+        assert f"{name:15} {purpose}\n" in help_text, name
+        assert f"- `{name}`: {purpose}" in page
     for name in EXPORT_FORMATS:
         assert re.search(rf"\b{name}\b(?!-)", help_text), name
         assert f"| `{name}` |" in page

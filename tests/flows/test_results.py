@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -200,8 +201,8 @@ def _scene(html):
 
 
 def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
-    out = tmp_path / "report.html"
-    succeed("report", tiny, "--out", out, "--project", tiny_run)
+    out, figures = tmp_path / "report.html", tmp_path / "figures"
+    succeed("report", tiny, "--out", out, "--project", tiny_run, "--figures", figures)
     page = out.read_text()
     outside = Outside()
     outside.feed(page)
@@ -215,6 +216,13 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
     assert people[0].count("triangulated</td>") == 5
     assert "top speed m/s" in people[0]
     assert "triangulation/clip" in page
+    for suffix in (".svg", ".pdf", ".json"):
+        assert len(list(figures.glob(f"*{suffix}"))) == 10
+    for number, file in enumerate(sorted(figures.glob("*.json")), start=1):
+        shown = json.loads(file.read_text())
+        assert file.name.startswith(f"{number:02d}-")
+        assert escape(shown["caption"], quote=False).partition("'")[0] in page
+        assert any(panel["series"] for panel in shown["panels"])
 
 
 def test_a_run_without_joints_cannot_be_exported(ingested, tmp_path):

@@ -28,7 +28,7 @@ const survive = () => {
   return () => existsSync(`${task.kills}.${number}.restarted`);
 };
 
-const STEPS = [create, calibrate, answer, correct, complete, mend, watch, download, schedule];
+const STEPS = [create, calibrate, answer, correct, complete, mend, watch, download, schedule, leave];
 
 await page.goto(`${task.pages}/login#token=${task.token}`);
 await shootSizes(page, seen, "login");
@@ -202,6 +202,7 @@ async function schedule() {
   await page.goto(`${task.pages}/status`);
   await page.waitForSelector(`text=${task.match}`);
   await shootSizes(page, seen, "status");
+  await readHelp();
   const prefect = await open({ errors: [], outside: seen.outside }, 900);
   await prefect.goto(`${task.prefect}/deployments`);
   await prefect.getByPlaceholder("admin:pass").fill(task.login);
@@ -219,4 +220,22 @@ async function schedule() {
   await prefect.getByRole("button", { name: "Save", exact: true }).click();
   await prefect.waitForSelector("text=/At 03:00/");
   await shoot(prefect, "scheduled");
+}
+
+// The status page explains its keys and states, and stays while they are read.
+async function readHelp() {
+  await page.waitForSelector("#leave:visible");
+  await page.keyboard.press("?");
+  await page.waitForSelector("dialog[open] >> text=blocked");
+  await shoot(page, "status_help");
+  await page.keyboard.press("Escape");
+  await page.waitForSelector("dialog[open]", { state: "hidden" });
+}
+
+// Whoever logs out sees nothing more.
+async function leave() {
+  await page.goto(`${task.pages}/status`);
+  await page.click("#leave");
+  await page.waitForURL(/\/login$/);
+  seen.left = (await page.request.get(`${task.pages}/status`, { maxRedirects: 0 })).status();
 }

@@ -187,7 +187,9 @@ def test_a_question_is_no_alert_before_its_time(plan):
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     unit = UnitSummary("clip", "done", objections=("offset_rms_m is 0.05, at most 0.03 passes",))
     match = MatchStatus("m", stages={"body_fitting": (unit,)})
-    assert kinds(alerts_now(plan, [match], [], [])) == ["quality"]
+    (poor,) = alerts_now(plan, [match], [], [])
+    assert poor.alert == "quality"
+    assert poor.text == "m/body_fitting/clip: offset rms: 0.05 m, limit 0.03 m"
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
         for state in ("arriving", "incomplete", "refused", "taken")

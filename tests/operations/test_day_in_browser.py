@@ -82,6 +82,7 @@ def test_a_match_of_videos_becomes_results_by_clicks_alone(seed, served, recorde
     assert seen["blank"] == 0
     assert seen["states"][-1] == "complete"
     assert seen["named"] == 1
+    assert seen["left"] == 401
     store = Store.open(str(served.project))
     record = store.run("derby")
     assert (record.state, record.failed, record.waiting) == ("complete", (), ())

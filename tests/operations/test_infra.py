@@ -300,8 +300,28 @@ def test_compose_takes_its_set_up_and_refuses_one_without_secrets():
 
 @needs("promtool")
 def test_promtool_takes_scrapes_and_rules():
-    for kind, name in (("config", "prometheus.yml"), ("rules", "alerts.yml")):
-        subprocess.run(["promtool", "check", kind, INFRA / "prometheus" / name], check=True)
+    # Only the syntax of scrapes: the files of their secrets are the deployment's.
+    folder = INFRA / "prometheus"
+    for command in (
+        ["check", "config", "--syntax-only", folder / "prometheus.yml"],
+        ["check", "rules", folder / "alerts.yml"],
+        ["test", "rules", folder / "alerts_test.yml"],
+    ):
+        subprocess.run(["promtool", *command], check=True)
+
+
+def test_each_rule_has_a_case_that_alerts_and_one_that_does_not():
+    folder = INFRA / "prometheus"
+    (group,) = yaml.safe_load((folder / "alerts.yml").read_text())["groups"]
+    tests = yaml.safe_load((folder / "alerts_test.yml").read_text())["tests"]
+    for rule in group["rules"]:
+        cases = [
+            bool(case.get("exp_alerts"))
+            for test in tests
+            for case in test["alert_rule_test"]
+            if case["alertname"] == rule["alert"]
+        ]
+        assert set(cases) == {True, False}, rule["alert"]
 
 
 def test_the_batch_script_is_a_shell_script_that_asks_for_its_arguments():

@@ -16,6 +16,7 @@ CONTENT, OTHER = "c" * 64, "d" * 64
 ASKED = datetime(2026, 5, 1, 12, tzinfo=UTC)
 ENDED = ASKED + timedelta(minutes=5)
 WRONG = "clicks_wrong is 1, at most 0 passes"
+IN_WORDS = "clicks wrong: 1, limit 0"
 FIGURES = {
     "expected_ground_error_median_m": 0.01,
     "expected_ground_error_p95_m": 0.04,
@@ -111,7 +112,7 @@ def test_a_result_waits_until_it_is_approved_itself(glance, journal, state, obje
     ((stage, unit),) = glance(record(), journal).units
     assert (stage, unit.unit, unit.state) == ("static_calibration", "cam03", state)
     assert (unit.objections, unit.waiting_since) == (objections, since)
-    assert unit.why == (WRONG if state == "waiting" else "")
+    assert unit.why == (IN_WORDS if state == "waiting" else "")
 
 
 def test_where_nobody_is_asked_a_figure_beyond_its_limit_is_said_all_the_same(glance):

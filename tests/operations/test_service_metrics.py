@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Thread
@@ -92,7 +93,7 @@ def test_a_scrape_says_what_the_store_says_and_all_that_the_dashboard_asks_for(
     names = {name for name, *_ in found}
     asked = [target["expr"] for panel in panels() for target in panel["targets"]]
     rules = (INFRA / "prometheus" / "alerts.yml").read_text()
-    asked += re.findall(r"expr: (.*)", rules)
+    asked += re.findall(r"expr: (.*worldpose_.*)", rules)
     for expression in asked:
         used = set(re.findall(r"worldpose_\w+", expression))
         assert used
@@ -153,3 +154,11 @@ def test_what_is_scraped_again_is_looked_at_anew(project_copy):
     assert after["worldpose_poses_total",] == before["worldpose_poses_total",]
     (match,) = Overview(store).look()
     assert {unit.state for _, unit in match.units} == {"done"}
+
+
+def test_a_project_in_object_storage_is_told_of_the_disk_of_its_state(bucket, tmp_path):
+    store = Store.create(f"{bucket}/disk")
+    found = scraped(exposition(ProjectMetrics(store, StateFolder(tmp_path))).decode())
+    assert found["worldpose_disk_free_bytes",] == pytest.approx(
+        shutil.disk_usage(tmp_path).free, rel=0.05
+    )

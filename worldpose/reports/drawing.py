@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection, PathCollection
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
+from matplotlib.quiver import Quiver
+from matplotlib.text import Annotation
+from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
@@ -41,6 +51,7 @@ TEMPLATE: Final = "#ffd54a"
 HALO: Final = [withStroke(linewidth=2.5, foreground="white")]
 HIPS: Final = (11, 12)
 """Indices of the hips in COCO-17; their middle is a person's position from above."""
+_kept: ContextVar[dict[bytes, Figure] | None] = ContextVar("kept", default=None)
 
 
 def draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
@@ -113,7 +124,99 @@ def png(figure: Figure) -> bytes:
     FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
         picture, metadata={"Software": None}, pil_kwargs={"compress_level": 1}
     )
+    kept = _kept.get()
+    if kept is not None:
+        kept[picture.getvalue()] = figure
     return picture.getvalue()
+
+
+@contextmanager
+def keep_figures() -> Iterator[dict[bytes, Figure]]:
+    """Keep the figures that `png` draws meanwhile, by their PNG, in the order of drawing."""
+    kept: dict[bytes, Figure] = {}
+    token = _kept.set(kept)
+    try:
+        yield kept
+    finally:
+        _kept.reset(token)
+
+
+def write_figure(figure: Figure, stem: Path, caption: str) -> list[Path]:
+    """Write a figure as `stem.svg` and `stem.pdf`, and what it shows as `stem.json`.
+
+    Equal figures have equal files. Text stays text, which drawing programs can change.
+    """
+    written = [stem.with_name(f"{stem.name}{suffix}") for suffix in (".svg", ".pdf", ".json")]
+    with rc_context({"svg.hashsalt": "worldpose", "svg.fonttype": "none", "pdf.fonttype": 42}):
+        for path, dated in zip(written[:2], ("Date", "CreationDate"), strict=True):
+            with whole_file(path) as draft:
+                figure.savefig(draft, format=path.suffix[1:], metadata={dated: None})
+    with whole_file(written[2]) as draft:
+        shown = {"caption": caption, "panels": figure_data(figure)}
+        draft.write_text(json.dumps(shown, ensure_ascii=False) + "\n", encoding="utf-8")
+    return written
+
+
+def figure_data(figure: Figure) -> list[dict[str, Any]]:
+    """Return what each panel of a figure shows: title, labels of its axes, and its series.
+
+    A series has a kind, a label if the figure shows one, and columns of numbers in the units that
+    the axes state: lines and points `x`, `y`; bars `x`, `y`, `width`, `height`; arrows `x`, `y`,
+    `dx`, `dy`; areas and segments `x`, `y`, each with the `value` of its colour, and None after it.
+    An image is named with its size alone: its pixels are in the SVG. None = missing.
+    """
+    return [
+        {
+            "title": axes.get_title(),
+            "x": axes.get_xlabel(),
+            "y": axes.get_ylabel(),
+            "series": [series for artist in axes.get_children() for series in _series(artist)],
+        }
+        for axes in figure.axes
+    ]
+
+
+def _series(artist: Artist) -> Iterator[dict[str, Any]]:
+    """Yield what an artist shows, unless it is a part of the panel, such as its frame."""
+    label = str(artist.get_label())
+    named = {} if not label or label.startswith("_") else {"label": label}
+    if isinstance(artist, Line2D):
+        yield {"kind": "line", **named, **_columns(("x", "y"), artist.get_xydata())}
+    elif isinstance(artist, Quiver):
+        moved = np.stack([artist.X, artist.Y, artist.U, artist.V], axis=-1)
+        yield {"kind": "arrows", **named, **_columns(("x", "y", "dx", "dy"), moved)}
+    elif isinstance(artist, PathCollection):
+        yield {"kind": "points", **named, **_columns(("x", "y"), artist.get_offsets())}
+    elif isinstance(artist, Collection):
+        paths = artist.get_paths()
+        colours = artist.get_array()
+        given = np.empty(0) if colours is None else np.asarray(colours).ravel()
+        values = given if len(given) == len(paths) else np.full(len(paths), np.nan)
+        parts = [np.empty((0, 3))]
+        for path, value in zip(paths, values, strict=True):
+            corners = np.asarray(path.vertices, dtype=np.float64)
+            parts.append(np.insert(corners, 2, value, axis=1))
+            parts.append(np.full((1, 3), np.nan))
+        found = _columns(("x", "y", "value"), np.concatenate(parts))
+        if paths:
+            yield {"kind": "areas", **named, **found}
+    elif isinstance(artist, Rectangle) and artist.axes is not None:
+        if artist is not artist.axes.patch:
+            sides = [*artist.get_xy(), artist.get_width(), artist.get_height()]
+            yield {"kind": "bar", **named, **_columns(("x", "y", "width", "height"), [sides])}
+    elif isinstance(artist, AxesImage):
+        height, width = np.asarray(artist.get_array()).shape[:2]
+        yield {"kind": "image", **named, "width": width, "height": height}
+    elif isinstance(artist, Annotation):
+        yield {"kind": "text", "text": artist.get_text(), **_columns(("x", "y"), [artist.xy])}
+
+
+def _columns(names: Sequence[str], rows: ArrayLike) -> dict[str, list[float | None]]:
+    values = np.ma.filled(np.ma.asarray(rows, dtype=np.float64), np.nan)
+    return {
+        name: [float(f"{each:.7g}") if np.isfinite(each) else None for each in column]
+        for name, column in zip(names, values.T, strict=True)
+    }
 
 
 def require_plot(path: Path) -> None:

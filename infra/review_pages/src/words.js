@@ -18,10 +18,12 @@ export const metric = (name) => (unitOf(name) ? `${withoutUnit(name)} [${unitOf(
 
 // Why a gate holds a result, `offset_rms_m is 0.05, at most 0.03 passes`, as a person reads it: `offset rms: 0.05 m, limit 0.03 m`.
 export const reason = (text) =>
-  text.replace(/^(\w+) is (\S+), at most (\S+) passes$/, (_, name, value, limit) => {
-    const behind = unitOf(name) ? ` ${unitOf(name)}` : "";
-    return `${withoutUnit(name)}: ${value}${behind}, limit ${limit}${behind}`;
-  });
+  text
+    .replace(/^(\w+) is (\S+?)( \(.*\))?, at most (\S+) passes$/, (_, name, value, parts, limit) => {
+      const behind = unitOf(name) ? ` ${unitOf(name)}` : "";
+      return `${withoutUnit(name)}: ${value}${behind}${parts ?? ""}, limit ${limit}${behind}`;
+    })
+    .replace(/^(\w+)(?= could not be computed$)/, (name) => withoutUnit(name));
 
 // An expected error on the ground, in the unit that a person thinks in.
 export function ground(metres) {

@@ -1,0 +1,52 @@
+"""Metrics and reasons of gates read as words, alike in terminals, alerts and pages."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from flows.gates import GATES
+from flows.review.metric_words import UNITS, all_reasons, in_short, metric_words, reason_words
+
+PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js"
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        ("offset_rms_m is 0.05, at most 0.03 passes", "offset rms: 0.05 m, limit 0.03 m"),
+        ("clicks_wrong is 1, at most 0 passes", "clicks wrong: 1, limit 0"),
+        (
+            "held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes",
+            "held out certain excess: 0.03 m (knee, ankle), limit 0.01 m",
+        ),
+        ("residual_px could not be computed", "residual could not be computed"),
+        ("every result is asked about", "every result is asked about"),
+        ("Ada rejected it: the_click is 1", "Ada rejected it: the_click is 1"),
+        ("camera a is 3, at most wrong", "camera a is 3, at most wrong"),
+    ],
+)
+def test_reasons_of_gates_are_words(reason, words):
+    assert reason_words(reason) == words
+
+
+def test_every_metric_of_a_gate_is_put_into_words():
+    names = [name for gate in GATES for name, _ in gate.limits]
+    assert len(names) > 10
+    for name in names:
+        for reason in (f"{name} is 1, at most 0.5 passes", f"{name} could not be computed"):
+            said = reason_words(reason)
+            assert said != reason or "_" not in name
+            assert "_" not in said
+
+
+def test_metrics_have_their_unit_behind_the_value():
+    figures = {"offset_rms_m": 0.0512345, "m": 2.0, "undecided": 0.0, "offset_rms_m.knee": 1.0}
+    assert in_short(figures) == "offset rms 0.05123 m, m 2, undecided 0"
+    assert metric_words("expected_error_median_px") == ("expected error median", "px")
+    assert all_reasons(["a_m is 2, at most 1 passes", "b"]) == "a: 2 m, limit 1 m; b"
+
+
+def test_the_pages_know_the_same_units():
+    (listed,) = re.findall(r"const UNITS = \{(.*?)\};", PAGES.read_text())
+    assert dict(re.findall(r'(\w+): "([^"]+)"', listed)) == UNITS
