@@ -219,7 +219,12 @@ def _adjust_with_noise(
         adjusted = adjust(cameras, observed, lenses, noise)
         observed = observed._replace(points=adjusted.points)
         noise = estimate_noise(adjusted.cameras, adjusted.points, observed, LOSS_SCALE)
-    return adjust(cameras, observed, lenses, noise), observed, noise
+    try:
+        adjusted = adjust(cameras, observed, lenses, noise, covariance=True)
+    except InputError as error:
+        names = [lens.id for lens in lenses]
+        raise refusal(names, "people who determine the cameras", error.found) from error
+    return adjusted, observed, noise
 
 
 def _relative_std(adjusted: Solution, observed: Observations, noise: KeypointNoise) -> Floats:
@@ -238,11 +243,8 @@ def _relative_std(adjusted: Solution, observed: Observations, noise: KeypointNoi
     origin = np.median(adjusted.points, axis=0)
     own, _ = relative_covariance(adjusted.camera_covariance, adjusted.cameras, information, origin)
     variance = np.diagonal(own, axis1=1, axis2=2)
-    return np.sqrt(
-        np.stack(
-            [variance[:, 3:6].sum(axis=1), variance[:, :3].sum(axis=1), variance[:, 6]], axis=1
-        )
-    )
+    parts = [variance[:, 3:6].sum(axis=1), variance[:, :3].sum(axis=1), variance[:, 6]]
+    return np.asarray(np.sqrt(np.stack(parts, axis=1)))
 
 
 def _distances(cameras: Camera, observed: Observations) -> Floats:

@@ -12,6 +12,7 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.cameras import LensCalibration
@@ -158,6 +159,13 @@ def _walked(track: Floats) -> float:
     return float(np.linalg.norm(high - low) / usual)
 
 
+def _rigid(rotation: ArrayLike, translation: ArrayLike) -> Rigid:
+    """Return the motion of OpenCV's arrays."""
+    return Rigid(
+        np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64).ravel()
+    )
+
+
 class Start(NamedTuple):
     """Cameras, and the joints that they see."""
 
@@ -244,7 +252,7 @@ class Views:
             )
             share = 0.0 if inlier is None else float(inlier.mean())
             if share >= MIN_AGREEMENT and share * len(one) > best[0]:
-                best = int(share * len(one)), matrix[:3]
+                best = int(share * len(one)), np.asarray(matrix[:3], dtype=np.float64)
         if not best[0]:
             return None
         people, ones, others = [], [], []
@@ -262,7 +270,7 @@ class Views:
             np.eye(3),
             distanceThresh=1e3,
         )
-        pose = Rigid(rotation, way.ravel())
+        pose = _rigid(rotation, way)
         with np.errstate(divide="ignore", invalid="ignore"):
             points = (space[:3] / space[3]).T
         back = points - pose.inverse().translation
@@ -385,10 +393,10 @@ class Views:
             )
             share = len(inlier) / len(some) if good and inlier is not None else 0.0
             if share >= MIN_AGREEMENT and share * len(at) > best[0]:
-                best = int(share * len(at)), Rigid(cv2.Rodrigues(turn)[0], way.ravel())
+                best = int(share * len(at)), _rigid(cv2.Rodrigues(turn)[0], way)
         if best[1] is None:
             return 0, None, {}
-        share, total = np.zeros(shape), np.zeros(shape)
+        near_share, total = np.zeros(shape), np.zeros(shape)
         for person, track in np.ndindex(shape):
             at, places = self._meet(camera, track, joints[person])
             if len(at) < len(JOINTS):
@@ -396,11 +404,11 @@ class Views:
             there = places @ best[1].rotation.T + best[1].translation
             off = np.linalg.norm(there[:, :2] / there[:, 2:] - at, axis=1)
             near = (off < 2.0 * self.limits[camera][track]) & (there[:, 2] > 0.0)
-            share[person, track], total[person, track] = near.mean(), near.sum()
+            near_share[person, track], total[person, track] = near.mean(), near.sum()
         chosen = [
             (int(p), int(t))
-            for p, t in zip(*linear_sum_assignment(-share), strict=True)
-            if share[p, t] >= MIN_AGREEMENT
+            for p, t in zip(*linear_sum_assignment(-near_share), strict=True)
+            if near_share[p, t] >= MIN_AGREEMENT
         ]
         return int(sum(total[pair] for pair in chosen)), best[1], dict(chosen)
 
@@ -440,15 +448,15 @@ class Views:
                 image[:, p, :, k] = np.where(near[..., None], track, np.nan)
         seen = np.isfinite(image[..., 0])
         seen &= (seen.sum(axis=-1) >= 2)[..., None]
-        frame, person, joint, camera = np.nonzero(seen)
+        frame, person_of, joint, camera_of = np.nonzero(seen)
         used = seen.any(axis=-1)
         number = np.cumsum(used).reshape(used.shape) - 1
         return Observations(
             points=joints[used],
-            point_of=number[frame, person, joint],
-            camera_of=camera,
+            point_of=number[frame, person_of, joint],
+            camera_of=camera_of,
             frame_of=self.rows[frame],
-            person_of=person,
+            person_of=person_of,
             joint_of=joint,
             image=image[seen],
             noise=noise[seen],
@@ -460,7 +468,9 @@ def adjust(
     observed: Observations,
     lenses: Sequence[LensCalibration],
     noise: KeypointNoise,
+    *,
     fixed: bool = False,
+    covariance: bool = False,
 ) -> Solution:
     """Return cameras and joints adjusted to the keypoints.
 
@@ -473,6 +483,10 @@ def adjust(
         lenses: prior of focal lengths and principal points.
         noise: scale and correlation of the keypoints' errors.
         fixed: adjust the joints alone.
+        covariance: compute the covariance of the cameras.
+
+    Raises:
+        InputError: the keypoints do not determine the cameras.
     """
     count = len(lenses)
     free = np.zeros((count, 12), dtype=np.bool_)
@@ -507,4 +521,4 @@ def adjust(
         scale=np.full(len(variance), LOSS_SCALE / np.sqrt(noise.correlation)),
         names=tuple(lens.id for lens in lenses),
     )
-    return solve(problem, SOLVER, covariance=not fixed)
+    return solve(problem, SOLVER, covariance=covariance)
