@@ -262,7 +262,10 @@ def _estimate_fractions(
         groups = len(parts)
         stated = np.diagonal(rows @ information.sum(axis=0) @ rows.T)
         scatter = (left**2).sum(axis=0) * groups / max(1, groups - 1)
-        error = np.where(told, np.sqrt(np.maximum(scatter, stated)), np.inf)
+        # A rotation or a focal length that the people do not tell is as uncertain as its prior, and
+        # where all of them run one way it looks like a clock offset.
+        assumed = np.einsum("ci,i,ci->c", rows, prior, rows)
+        error = np.where(told, np.sqrt(np.maximum(scatter, stated) + assumed), np.inf)
         change = np.where(told, step[clock], 0.0)
         change = np.clip(change - np.median(change[told]) if told.any() else change, -3.0, 3.0)
         late += np.where(told, change, 0.0)
