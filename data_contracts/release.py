@@ -34,6 +34,7 @@ EXPORT_FORMATS: Final = (
     "bvh",
     "mot",
     "gltf",
+    "usd",
     "csv",
     "parquet",
     "viewer",

@@ -156,7 +156,7 @@ def test_who_stands_still_tells_nothing(walkers, cameras):
     first = walkers[:1, :1]
     place = np.array([*first[0, 0, 11, :2], 0.0])
     still = np.repeat(first - place, len(walkers), axis=0)
-    with pytest.raises(InputError, match="people who stand still: they move by 0.0"):
+    with pytest.raises(InputError, match="found people who stand still"):
         locate_cameras(lenses(cameras), seen(cameras, still), FPS, KnownLength(1.8))
 
 
@@ -185,5 +185,5 @@ def test_a_camera_that_shows_another_person_is_named(walkers, cameras):
     given = seen(cameras, walkers[:, :1])
     keypoints = given.keypoints.copy()
     keypoints[:, 1] = keypoints[::-1, 1] * [-1.0, 1.0] + [1280.0, 0.0]
-    with pytest.raises(InputError, match="east: expected a person .* whom the others show"):
+    with pytest.raises(InputError, match="east: expected a person for 20 frames whom"):
         locate_cameras(lenses(cameras), replace(given, keypoints=keypoints), FPS, KnownLength(1.8))
