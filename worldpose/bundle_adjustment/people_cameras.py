@@ -369,7 +369,7 @@ class _People(NamedTuple):
         upright = upright[np.isfinite(upright).all(axis=-1)]
         up = np.median(upright / np.linalg.norm(upright, axis=1, keepdims=True), axis=0)
         lean = up / np.linalg.norm(up)
-        feet = self._standing(ankles)
+        feet = self._standing_feet(ankles)
         for _ in range(5):
             spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
             off = spread @ up
@@ -396,7 +396,7 @@ class _People(NamedTuple):
             bool(values.min() > 2.0 / LEAN_STD**2),
         )
 
-    def _standing(self, ankles: Floats) -> Floats:
+    def _standing_feet(self, ankles: Floats) -> Floats:
         """Return the mean ankle (n, 3) [m] of each time that a foot stands.
 
         Args:

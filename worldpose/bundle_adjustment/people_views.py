@@ -109,7 +109,7 @@ def find_walkers(
         if not tracks:
             raise refusal([name], f"a person for {MIN_FRAMES} frames or more", "none")
         every.append(tracks[:MAX_TRACKS])
-    farthest = max(_walked(track) for tracks in every for track in tracks)
+    farthest = max(_walking_distance(track) for tracks in every for track in tracks)
     if farthest < MIN_MOTION:
         raise refusal(
             names,
@@ -146,7 +146,7 @@ def _height(track: Floats) -> float:
     return float(np.median(np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1)))
 
 
-def _walked(track: Floats) -> float:
+def _walking_distance(track: Floats) -> float:
     """Return how far a person moves in the image, in heights of the person [1].
 
     A change of size counts as motion: that person walks towards the camera.
@@ -243,7 +243,7 @@ class Views:
 
         best: tuple[int, Floats] = (0, np.empty((0, 3)))
         for i, j in np.ndindex(len(self.planes[a]), len(self.planes[b])):
-            one, other, limit = self._shared(a, i, b, j)
+            one, other, limit = self._shared_joints(a, i, b, j)
             if len(one) < MIN_FRAMES * len(JOINTS) // 2:
                 continue
             some = np.arange(0, len(one), -(-len(one) // SAMPLE))
@@ -256,8 +256,8 @@ class Views:
         if not best[0]:
             return None
         people, ones, others = [], [], []
-        for i, j in self._same(a, b, best[1]):
-            one, other, _ = self._shared(a, i, b, j)
+        for i, j in self._same_people(a, b, best[1]):
+            one, other, _ = self._shared_joints(a, i, b, j)
             people.append((i, j))
             ones.append(one)
             others.append(other)
@@ -280,20 +280,20 @@ class Views:
         parallel = float(np.nanmedian(np.abs(cosine)))
         return _Pair((a, b), pose, tuple(people), count * float(np.sqrt(1.0 - parallel**2)))
 
-    def _shared(self, a: int, i: int, b: int, j: int) -> tuple[Floats, Floats, float]:
+    def _shared_joints(self, a: int, i: int, b: int, j: int) -> tuple[Floats, Floats, float]:
         """Return joints (n, 2) that two tracks both show, and how far they may be apart."""
         one, other = self.planes[a][i], self.planes[b][j]
         both = np.isfinite(one[..., 0]) & np.isfinite(other[..., 0])
         limit = 0.5 * (self.limits[a][i] + self.limits[b][j])
         return one[both], other[both], limit
 
-    def _same(self, a: int, b: int, matrix: Floats) -> list[tuple[int, int]]:
+    def _same_people(self, a: int, b: int, matrix: Floats) -> list[tuple[int, int]]:
         """Return the tracks of two cameras that agree, each with at most one."""
         from scipy.optimize import linear_sum_assignment
 
         share = np.zeros((len(self.planes[a]), len(self.planes[b])))
         for i, j in np.ndindex(share.shape):
-            one, other, limit = self._shared(a, i, b, j)
+            one, other, limit = self._shared_joints(a, i, b, j)
             if len(one) < len(JOINTS):
                 continue
             left = np.column_stack([one, np.ones(len(one))]) @ matrix.T
