@@ -23,7 +23,7 @@ FPS = 50.0
 def write(folder: Path, clips: int, frames: int, people: int) -> None:
     """Write clips of people who run in circles at 2.4 m/s before a panning, zooming camera."""
     from worldpose.body import OPEN_BODY, BodyParameters, find_body
-    from worldpose.formats.camera_file import write_moving_camera
+    from worldpose.formats.challenge import write_moving_camera
     from worldpose.formats.joints_file import write_poses
     from worldpose.geometry import Camera, Rigid
 

@@ -35,6 +35,7 @@ EXPORT_PURPOSES: Final[Mapping[str, str]] = {
     "bvh": "a skeleton in motion for Blender and game engines",
     "mot": "joint angles for OpenSim",
     "gltf": "a 3D scene of bodies and cameras for Blender and the web",
+    "usd": "a 3D scene for Omniverse, Houdini and Unreal",
     "csv": "tables of joints, people and strides for spreadsheets and R",
     "parquet": "the tables of csv with types, for pandas and databases",
     "viewer": "a 3D view in one file, for any browser without a network",

@@ -25,7 +25,7 @@ from data_contracts.work import Work
 from flows.orchestration.cluster_errors import require_workers
 from flows.orchestration.time_limits import TimeLimits, seconds_of
 from flows.progress import reporter
-from flows.registering import open_match
+from flows.registering import open_for_review, open_match
 from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
@@ -33,6 +33,8 @@ from flows.stage import Stage
 from worldpose.errors import WorldposeError
 from worldpose.store import Store
 
+WITHOUT_CAMERAS: Final = ("ingest", "detection")
+"""Last stages of runs that need no calibrated camera."""
 MOST_TASKS: Final = 200
 """Tasks per stage; more units share tasks. Prefect needs 0.05 s of CPU time per task."""
 TASKS_EACH: Final = 20
@@ -98,7 +100,9 @@ def process_match(
     logging.getLogger("worldpose").setLevel(logging.INFO)
     store = Store.open(project)
     stages = selected_stages(from_stage, until_stage)
-    match = open_match(store, match_id)
+    # 2D poses can locate cameras that nothing else tells.
+    opening = open_for_review if until_stage in WITHOUT_CAMERAS else open_match
+    match = opening(store, match_id)
     log = RunLog.begin(store, match, stages, settings, gates or "never", iteration)
     return require_complete(run_stages(log, time_limits or {}))
 

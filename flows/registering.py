@@ -97,12 +97,18 @@ def find_registration(store: Store, name: str) -> Registration:
     return registration
 
 
-def find_match(store: Store, name: str) -> Match:
-    """Open a match given by folder or id; a folder is registered first."""
+def find_match(store: Store, name: str, *, unfinished: bool = False) -> Match:
+    """Open a match given by folder or id; a folder is registered first.
+
+    Args:
+        store: the project.
+        name: folder or id.
+        unfinished: accept it without all cameras known.
+    """
     folder = Path(name)
     if (folder / "match.yaml").is_file() or (folder.is_dir() and name not in store.matches()):
-        return register(store, folder)[0]
-    return open_match(store, name)
+        return register(store, folder, unfinished=unfinished)[0]
+    return open_for_review(store, name) if unfinished else open_match(store, name)
 
 
 def _refuse_duplicate(store: Store, registration: Registration) -> None:

@@ -28,6 +28,7 @@ GROUPS: Final = {
         "clips": "programme:clips",
         "ingest": "matches:ingest",
         "calibrate": "calibrate:calibrate",
+        "locate-cameras": "locate:locate_cameras",
         "synchronize": "synchronize:synchronize",
     },
     "Process matches": {

@@ -296,7 +296,7 @@ def import_command(
             )
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
         return
-    if calibration is not None and videos is not None and detections is None:
+    if videos is not None and detections is None:
         spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 from data_contracts.keypoints import KeypointDetections
+from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
 from flows.cli.computing import WorkersOption
 from flows.cli.console import (
@@ -27,7 +28,7 @@ from flows.run_record import latest_run, require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
-from flows.stages.detection import seen_by_cameras
+from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, UsageError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -92,17 +93,10 @@ def synchronize(
     with progress(verbose=False):
         opened = find_match(store, match)
         spec = opened.folder.spec
-        chosen = clip or max(spec.clips, key=lambda each: each.frame_count).id
-        if chosen not in {each.id for each in spec.clips}:
-            raise UsageError(
-                f"--clip {chosen}",
-                expected=f"a clip of the match: {', '.join(each.id for each in spec.clips)}",
-                found=repr(chosen),
-                todo="Correct the name.",
-            )
+        chosen = choose_clip(spec, clip)
         require_no_other_run(store, opened.match_id)
         latest = latest_run(store, opened.match_id)
-        settings = {} if latest is None else _until_detection(latest)
+        settings = {} if latest is None else until_detection(latest)
         request = RunRequest(settings, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
     cameras, names, detections = load_clip(Run(store, record), opened, chosen)
@@ -147,7 +141,24 @@ def synchronize(
     raise typer.Exit(0 if known.all() else 4)
 
 
-def _until_detection(latest: RunRecord) -> Overrides:
+def choose_clip(spec: MatchSpec, clip: str | None) -> str:
+    """Return the clip that was asked for; the longest if none was.
+
+    Raises:
+        UsageError: the match has no such clip.
+    """
+    names = [each.id for each in spec.clips]
+    if clip is not None and clip not in names:
+        raise UsageError(
+            f"--clip {clip}",
+            expected=f"a clip of the match: {', '.join(names)}",
+            found=repr(clip),
+            todo="Correct the name.",
+        )
+    return clip or max(spec.clips, key=lambda each: each.frame_count).id
+
+
+def until_detection(latest: RunRecord) -> Overrides:
     """Return the settings of an earlier run that this command's stages have."""
     stages = {stage.name for stage in selected_stages(None, "detection")}
     return {name: given for name, given in latest.overrides.items() if name in stages}
@@ -160,14 +171,12 @@ def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], Key
         InputError: fewer than two cameras have a calibration and 2D poses.
     """
     spec = match.folder.spec
-    span = spec.clip(clip)
-    where = slice(span.first_frame, span.first_frame + span.frame_count - 1)
     known = static_cameras(run, spec)
-    seen = {
-        camera.id: unit
+    seen = [
+        camera.id
         for camera, unit in zip(spec.static_cameras, seen_by_cameras(match, clip), strict=True)
         if camera.id in known and unit in run
-    }
+    ]
     if len(seen) < 2:
         raise InputError(
             f"{match.match_id}: static cameras",
@@ -175,13 +184,32 @@ def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], Key
             found=", ".join(seen) or "none",
             todo="Calibrate the cameras first; worldpose status tells what is missing.",
         )
-    frames = np.arange(span.first_frame, span.first_frame + span.frame_count)
-    parts = [
-        KeypointDetections.from_arrays(run[unit].sel(frame=where)).reindex(frames)
-        for unit in seen.values()
-    ]
     cameras = Camera.stack([known[name] for name in seen])
-    return cameras, list(seen), KeypointDetections.stack(parts)
+    return cameras, seen, load_detections(run, match, clip, seen)
+
+
+def load_detections(run: Run, match: Match, clip: str, names: list[str]) -> KeypointDetections:
+    """Return the detections (frames, cameras, detections) of some static cameras in a clip.
+
+    Raises:
+        InputError: a camera has no 2D poses.
+    """
+    span = match.folder.spec.clip(clip)
+    where = slice(span.first_frame, span.first_frame + span.frame_count - 1)
+    frames = np.arange(span.first_frame, span.first_frame + span.frame_count)
+    parts = []
+    for name in names:
+        unit = seen_by(match, name, clip)
+        if unit not in run:
+            raise InputError(
+                f"{match.match_id}: {name}",
+                expected="2D poses of the camera",
+                found="none",
+                todo="worldpose status tells what failed.",
+            )
+        found = KeypointDetections.from_arrays(run[unit].sel(frame=where))
+        parts.append(found.reindex(frames))
+    return KeypointDetections.stack(parts)
 
 
 def _print(

@@ -18,7 +18,7 @@ from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.formats.baselines import MethodResult, find_method, resample_result
-from worldpose.formats.camera_file import RELEASE_SIZE
+from worldpose.formats.challenge import RELEASE_SIZE
 from worldpose.geometry import Camera
 
 

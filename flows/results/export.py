@@ -44,14 +44,15 @@ from worldpose.formats.baselines.result import (
     write_slahmr_cameras,
     write_tracks,
 )
-from worldpose.formats.camera_file import write_moving_camera, write_static_camera
 from worldpose.formats.challenge import (
     ChallengeClip,
     Edition,
     challenge_truth,
     write_challenge,
     write_challenge_camera,
+    write_moving_camera,
     write_pitch_points,
+    write_static_camera,
     write_submission,
 )
 from worldpose.formats.joints_file import write_poses

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
+from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.run import BODY_STAGES, JOINT_STAGES
 from flows.results.best_results import (
@@ -22,6 +23,7 @@ from flows.results.best_results import (
     person_kinds,
     static_cameras,
 )
+from worldpose.body import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
@@ -40,6 +42,8 @@ from worldpose.formats.tables import (
     write_csv,
     write_parquet,
 )
+from worldpose.formats.usd_file import write_usd
+from worldpose.geometry import Camera
 from worldpose.ingest import read_match
 from worldpose.store import Run
 
@@ -180,7 +184,34 @@ def export_opensim(origin: Origin, out: Path) -> list[Path]:
 
 
 def export_gltf(origin: Origin, out: Path) -> list[Path]:
-    """Write `scenes/<clip>.glb`: bodies, cameras and the pitch.
+    """Write `scenes/<clip>.glb`: bodies, cameras and the pitch."""
+    return _write_scenes(origin, out, "glb", write_gltf)
+
+
+def export_usd(origin: Origin, out: Path) -> list[Path]:
+    """Write `scenes/<clip>.usdc` with the same content."""
+    return _write_scenes(origin, out, "usdc", write_usd)
+
+
+class _SceneWriter(Protocol):
+    """`write_gltf` and `write_usd`."""
+
+    def __call__(
+        self,
+        path: Path,
+        model: BodyModel,
+        people: Sequence[AnimatedBody],
+        fps: float,
+        *,
+        cameras: Mapping[str, Camera],
+        markings: Sequence[Floats],
+        notes: Mapping[str, str],
+        surface: bool = True,
+    ) -> None: ...
+
+
+def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -> list[Path]:
+    """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch.
 
     Raises:
         UsageError: a body model with terms of its own needs them for its surface.
@@ -217,8 +248,8 @@ def export_gltf(origin: Origin, out: Path) -> list[Path]:
         notes = describe_clip(origin, clip)
         notes["joints"] = f"the 24 joints of body model {model.name}, named as SMPL's"
         notes |= {"units": "metres, seconds", "first_match_frame": f"{frames[0]}"}
-        written.append(out / "scenes" / f"{clip}.glb")
-        write_gltf(
+        written.append(out / "scenes" / f"{clip}.{suffix}")
+        write(
             written[-1],
             model,
             people,
@@ -271,6 +302,7 @@ TOOL_EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "bvh": export_motion,
     "mot": export_opensim,
     "gltf": export_gltf,
+    "usd": export_usd,
     "csv": export_csv,
     "parquet": export_parquet,
 }

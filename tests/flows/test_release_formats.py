@@ -277,6 +277,20 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
 
 
+def test_a_usd_scene_has_the_people_and_the_notes(match_folder, tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
+    (path,) = EXPORTS["usd"](run, tmp_path)
+    assert path.relative_to(tmp_path).as_posix() == "scenes/A_1.usdc"
+    stage = Usd.Stage.Open(str(path))
+    notes = stage.GetRootLayer().customLayerData
+    assert notes["licence"] == "For tests alone." and notes["clip"] == "A_1"
+    assert stage.GetPrimAtPath("/world/person_008").GetCustomDataByKey("kind") == "mixed"
+    assert stage.GetPrimAtPath("/world/pitch").IsValid()
+
+
 def test_filled_joints_are_flagged(match_folder, tmp_path):
     run = origin(match_folder, **tracked())
     assert not [path for path in export(run, ["csv"], tmp_path / "a") if "origins" in path.parts]

@@ -33,7 +33,7 @@ from worldpose.static_calibration import (
     calibrate_camera,
     propose_camera,
 )
-from worldpose.static_calibration.residuals import nearest_on_markings
+from worldpose.static_calibration.parameters import nearest_on_markings
 
 _ROUNDS = 3
 """Iterations that match drawn markings and painted lines again [1]."""

@@ -31,7 +31,7 @@ from worldpose.dataset.plausibility import (
     visibility_findings,
     world_fault,
 )
-from worldpose.formats.camera_file import CameraRows
+from worldpose.formats.challenge import CameraRows
 from worldpose.geometry.boxes import box_iou
 
 _BODIES: Final = 400

@@ -17,9 +17,10 @@ from data_contracts.release import Finding, ReleaseManifest
 from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
 from worldpose.errors import InputError
 from worldpose.formats.archives import wrong
-from worldpose.formats.camera_file import CameraRows, read_camera_rows
 from worldpose.formats.challenge import (
+    CameraRows,
     ChallengeClip,
+    read_camera_rows,
     read_challenge,
     read_submission,
     submission_clips,

@@ -19,7 +19,7 @@ from worldpose.dataset.faults import (
     frame_faults,
     point_faults,
 )
-from worldpose.formats.camera_file import CameraRows
+from worldpose.formats.challenge import CameraRows
 
 FEET = ("left_big_toe", "right_big_toe", "left_heel", "right_heel", "left_ankle", "right_ankle")
 ANKLE = 0.09

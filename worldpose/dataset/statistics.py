@@ -12,8 +12,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import ClipStatistics, DataSetStatistics
 from worldpose.errors import InputError
-from worldpose.formats.camera_file import read_camera_rows
-from worldpose.formats.challenge import read_submission
+from worldpose.formats.challenge import read_camera_rows, read_submission
 from worldpose.formats.joints_file import read_joints, read_poses
 
 CameraKind = Literal["S", "M", "M+Z"]

@@ -21,8 +21,11 @@ from worldpose.detection.bundled_nets import (
     placed_net,
 )
 from worldpose.detection.enlargement import (
+    CLOSE_UP_GAIN,
+    CLOSE_UPS,
     SIZING_ZOOM,
     STEPS,
+    SURE_SCORE,
     Part,
     choose_reduction,
     find_groups,
@@ -43,9 +46,10 @@ class BundledDetector:
     """A net that detects the centres of people and the sides of their boxes.
 
     Without a camera, a pass over the reduced frame tells the size of its people: a frame of large
-    people is seen reduced. The detector runs again on enlarged tiles where people are small and, if
-    the camera tells so, on the reduced frame where they are large, then on enlarged crops of groups
-    of people who occlude one another.
+    people is seen reduced. A frame without sure people may be a close-up: it is seen at the size at
+    which its surest person is surest. The detector runs again on enlarged tiles where people are
+    small and, if the camera tells so, on the reduced frame where they are large, then on enlarged
+    crops of groups of people who occlude one another.
     """
 
     def __init__(
@@ -71,9 +75,29 @@ class BundledDetector:
             size = (image.shape[1], image.shape[0])
             sized = self._detect(resize(image, SIZING_ZOOM))
             zoom = choose_reduction(restore_size(sized, size, SIZING_ZOOM))
+            close = self._close_up(image, float(sized.scores.max(initial=0.0)))
+            if close < 1.0:
+                people = suppress(self._detect(resize(image, close)), NMS_IOU)
+                return restore_size(people, size, close)
             if zoom < 1.0:
                 return restore_size(self._find_all(resize(image, zoom), None), size, zoom)
         return self._find_all(image, parts)
+
+    def _close_up(self, image: Image, usual: float) -> float:
+        """Return the reduction of a frame that people fill; 1 for other frames [1].
+
+        Args:
+            image: the frame.
+            usual: the best score at `SIZING_ZOOM` [1].
+        """
+        if usual >= SURE_SCORE:
+            return 1.0
+        best, chosen = usual + CLOSE_UP_GAIN, 1.0
+        for zoom in CLOSE_UPS:
+            score = float(self._detect(resize(image, zoom)).scores.max(initial=0.0))
+            if score > best:
+                best, chosen = score, zoom
+        return chosen
 
     def _find_all(self, image: Image, parts: Sequence[Part] | None) -> People:
         """Return the people in an image, with passes over its parts."""

@@ -31,6 +31,13 @@ REDUCTIONS: Final = ((200.0, 0.25), (100.0, 0.5))
 SIZING_ZOOM: Final = 0.5
 """Reduction at which the size of a frame's people is estimated [1]: it shows both people of full
 height in the training and those of twice that height."""
+CLOSE_UPS: Final = (0.25, 0.125, 0.0884, 0.0625)
+"""Reductions at which a frame without sure people is sized, too: people who fill it are as high
+there as in the training [1]."""
+SURE_SCORE: Final = 0.6
+"""Best score of a box at `SIZING_ZOOM` from which on the frame shows people of usual size [1]."""
+CLOSE_UP_GAIN: Final = 0.05
+"""Least gain of the best score for which a frame is a close-up [1]."""
 TILE: Final = 1024
 """Longest side of an enlarged tile without its margin [px]: bounds memory."""
 BLEND: Final = 1.25

@@ -10,7 +10,7 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.formats.archives import Member, read_archive, write_archive
-    from worldpose.formats.camera_file import read_camera, write_moving_camera, write_static_camera
+    from worldpose.formats.challenge import read_camera, write_moving_camera, write_static_camera
     from worldpose.formats.files import whole_file
     from worldpose.formats.joints_file import JointTracks, read_joints, write_joints
     from worldpose.formats.motion_capture import coco_dataset, write_coco
@@ -38,7 +38,7 @@ __getattr__ = import_on_use(
             "read_archive",
             "write_archive",
         ),
-        "worldpose.formats.camera_file": (
+        "worldpose.formats.challenge": (
             "read_camera",
             "write_moving_camera",
             "write_static_camera",

@@ -137,7 +137,7 @@ def write_gltf(
     Raises:
         InputError: no person has a body.
     """
-    present = [person for person in people if _there(person.poses).any()]
+    present = [person for person in people if body_frames(person.poses).any()]
     if not present:
         raise InputError(
             str(path),
@@ -234,7 +234,7 @@ class _Writer:
 
     def add_person(self, person: AnimatedBody, number: int) -> int:
         """Add a person's joints, motion and surface; return the node."""
-        there = _there(person.poses)
+        there = body_frames(person.poses)
         rows = np.flatnonzero(there)
         poses = person.poses[rows]
         betas = poses.betas[0]
@@ -270,7 +270,7 @@ class _Writer:
 
     def _add_surface(self, person: AnimatedBody, number: int, rest: Floats, first: int) -> None:
         """Add a surface to the nodes without a parent: its joints alone place it."""
-        betas = person.poses.betas[np.flatnonzero(_there(person.poses))[0]]
+        betas = person.poses.betas[np.flatnonzero(body_frames(person.poses))[0]]
         surface = (self.model.template + self.model.shape_directions @ betas).astype(np.float32)
         colour = colorsys.hsv_to_rgb(number * 0.618 % 1.0, 0.45, 0.85)
         material = {
@@ -385,7 +385,7 @@ class _Writer:
         return self.file.add("nodes", {"name": "pitch", "mesh": mesh})
 
 
-def _there(poses: BodyParameters) -> Flags:
+def body_frames(poses: BodyParameters) -> Flags:
     """Return the frames (frames,) that have a body."""
     parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
     there: Flags = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)

@@ -158,7 +158,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
 
 
 def import_videos(
-    calibration: Path,
+    calibration: Path | None,
     videos: Path,
     out: Path,
     fps: float | None = None,
@@ -166,11 +166,13 @@ def import_videos(
 ) -> MatchSpec:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
+    Without a calibration each video is a camera, to be located by clicks or by people.
+
     The only clip, `clip`, is as long as the shortest video. Videos begin together: `offset_frames`
     in match.yaml can shift them afterwards.
 
     Args:
-        calibration: a file that `read_calibration` reads.
+        calibration: a file that `read_calibration` reads; None = not known.
         videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
         out: the match folder, absent or empty.
         fps: frame rate of all videos [1/s]; None = from the videos.
@@ -183,9 +185,14 @@ def import_videos(
         InputError: a file is invalid, names or rates do not match, or `out` is not empty; nothing
             is written then.
     """
-    cameras = read_calibration(calibration)
-    files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES)
-    indices = {name: _index_video(file, cameras[name]) for name, file in files.items()}
+    cameras: dict[str, CameraCalibration] = {}
+    if calibration is None:
+        files = {file.stem: file for file in _films(videos)}
+        indices = {name: index_frames(file) for name, file in files.items()}
+    else:
+        cameras = read_calibration(calibration)
+        files = files_by_camera(videos, list(cameras), calibration, VIDEO_SUFFIXES)
+        indices = {name: _index_video(file, cameras[name]) for name, file in files.items()}
     rate = round(next(iter(indices.values())).fps, 3) if fps is None else fps
     counts = {name: len(index.on_clock(rate, str(files[name]))) for name, index in indices.items()}
     content = {
@@ -194,11 +201,11 @@ def import_videos(
         "cameras": [
             {
                 "id": name,
-                "width": camera.image_size[0],
-                "height": camera.image_size[1],
+                "width": index.size[0],
+                "height": index.size[1],
                 "video": f"videos/{files[name].name}",
             }
-            for name, camera in cameras.items()
+            for name, index in indices.items()
         ],
         "clips": [{"id": "clip", "frame_count": min(counts.values())}],
         "pitch": "none",
@@ -212,6 +219,27 @@ def import_videos(
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec
+
+
+def _films(folder: Path) -> list[Path]:
+    """Return the videos of a folder, each of which is a camera.
+
+    Raises:
+        InputError: there are fewer than two, or two of one name.
+    """
+    files = [
+        file
+        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
+        if file.suffix.lower() in VIDEO_SUFFIXES and not file.name.startswith(".")
+    ]
+    if len({file.stem for file in files}) != len(files) or len(files) < 2:
+        raise InputError(
+            str(folder),
+            expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)})",
+            found=", ".join(file.name for file in files) or "no video",
+            todo="Name each video after its camera.",
+        )
+    return files
 
 
 def _index_video(file: Path, camera: CameraCalibration) -> FrameIndex:
@@ -288,12 +316,13 @@ def import_pose2sim(
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
     The calibration is the one file `Calib*.toml` or `*.qca.txt` in `calibration/`, of the trial or
-    of the folder above it, as in Pose2Sim's batches. 2D poses are in `pose-sync/`, or else `pose/`,
-    in a folder `<camera>_json` for each camera; without them people are detected in the videos of
-    `videos/`. Poses and videos belong to the cameras of their names, or, as in Pose2Sim, in
-    alphabetical order to the cameras in the calibration's order. `frame_rate` and `frame_range`
-    of Config.toml hold. Where a video is smaller or larger than the calibrated images, with or
-    without black bars, its camera is in the video's pixels, as the 2D poses are.
+    of the folder above it, as in Pose2Sim's batches; without it each video is a camera. 2D poses
+    are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each camera; without them
+    people are detected in the videos of `videos/`. Poses and videos belong to the cameras of their
+    names, or, as in Pose2Sim, in alphabetical order to the cameras in the calibration's order.
+    `frame_rate` and `frame_range` of Config.toml hold. Where a video is smaller or larger than the
+    calibrated images, with or without black bars, its camera is in the video's pixels, as the 2D
+    poses are.
 
     Args:
         project: folder of a trial.
@@ -310,7 +339,7 @@ def import_pose2sim(
     """
     settings, config = _read_pose2sim_settings(project)
     calibration = _find_pose2sim_calibration(project)
-    cameras = read_calibration(calibration)
+    cameras = {} if calibration is None else read_calibration(calibration)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
     films = [
@@ -325,12 +354,24 @@ def import_pose2sim(
             found="neither",
             todo="Run Pose2Sim.poseEstimation() first, or add the videos.",
         )
-    notes = [f"cameras: {calibration}"]
-    poses = _assign(places, list(cameras), calibration, notes) if places else {}
-    videos = _assign(films, list(cameras), calibration, notes) if films else {}
+    if calibration is None:
+        notes = [
+            "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
+            "poses from people who walk"
+        ]
+        names = [file.stem for file in _films(project / "videos")]
+        source = project / "videos"
+    else:
+        notes = [f"cameras: {calibration}"]
+        names, source = list(cameras), calibration
+    poses = _assign(places, names, source, notes) if places else {}
+    videos = _assign(films, names, source, notes) if films else {}
     indices = {name: index_frames(file) for name, file in videos.items()}
     for name, file in videos.items():
-        cameras[name] = _fit_to_video(file, cameras[name], indices[name], notes)
+        if name in cameras:
+            cameras[name] = _fit_to_video(file, cameras[name], indices[name], notes)
+    sizes = {name: index.size for name, index in indices.items()}
+    sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
     if rate is None and not indices:
         raise InputError(
@@ -356,9 +397,9 @@ def import_pose2sim(
         "match_id": match_id if match_id is not None else name_of(out),
         "fps": rate,
         "cameras": [
-            {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
+            {"id": name, "width": sizes[name][0], "height": sizes[name][1]}
             | ({"video": f"videos/{videos[name].name}"} if name in videos else {})
-            for name, camera in cameras.items()
+            for name in names
         ],
         "clips": [{"id": "clip", "first_frame": first, "frame_count": stop - first}],
         "pitch": "none",
@@ -434,8 +475,11 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
     return settings, files[0]
 
 
-def _find_pose2sim_calibration(project: Path) -> Path:
-    """Return the calibration of a trial, or else of the folder above it."""
+def _find_pose2sim_calibration(project: Path) -> Path | None:
+    """Return the calibration of a trial, or else of the folder above it.
+
+    None if there is no calibration but videos, whose cameras are then to be located.
+    """
     folders = [
         folder
         for place in (project, project.resolve().parent)
@@ -454,9 +498,11 @@ def _find_pose2sim_calibration(project: Path) -> Path:
                 )
             if files:
                 return files[0]
+    if (project / "videos").is_dir():
+        return None
     raise InputError(
         str(project),
-        expected="calibration/Calib.toml or calibration/Calib.qca.txt",
+        expected="calibration/Calib.toml or calibration/Calib.qca.txt, or videos",
         found=", ".join(map(str, folders)) or "no folder called calibration",
         todo="Run Pose2Sim.calibration() first.",
     )

@@ -13,8 +13,8 @@ from data_contracts.cameras import LensCalibration
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Camera, Rigid
 from worldpose.static_calibration.evidence import Evidence, count_neighbors
-from worldpose.static_calibration.parameters import PARAMETERS
-from worldpose.static_calibration.residuals import (
+from worldpose.static_calibration.parameters import (
+    PARAMETERS,
     PRIORS,
     SIZE,
     drawn_residuals,

@@ -18,10 +18,10 @@ from worldpose.static_calibration.adjustment import (
     camera_row,
 )
 from worldpose.static_calibration.curvature_correction import add_curvature
-from worldpose.static_calibration.parameters import CameraEstimate
-from worldpose.static_calibration.residuals import (
+from worldpose.static_calibration.parameters import (
     PRIORS,
     SIZE,
+    CameraEstimate,
     drawn_residuals,
     point_residuals,
     prior_residuals,

@@ -26,16 +26,14 @@ from worldpose.static_calibration.adjustment import (
 )
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import (
-    CameraOnPitch,
-    step_camera,
-    step_jacobian,
-)
-from worldpose.static_calibration.residuals import (
     PRIORS,
     SIZE,
+    CameraOnPitch,
     drawn_residuals,
     point_residuals,
     prior_residuals,
+    step_camera,
+    step_jacobian,
 )
 
 _POSE_SPREAD: Final = np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6)

@@ -20,8 +20,12 @@ from worldpose.static_calibration.ground_error import (
     propose_clicks,
 )
 from worldpose.static_calibration.line_refinement import LineRefinement
-from worldpose.static_calibration.parameters import PARAMETERS, CameraEstimate
-from worldpose.static_calibration.residuals import SIZE, drawn_residuals
+from worldpose.static_calibration.parameters import (
+    PARAMETERS,
+    SIZE,
+    CameraEstimate,
+    drawn_residuals,
+)
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 

@@ -23,8 +23,7 @@ from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, weight_residuals
 from worldpose.static_calibration.line_samples import FIRST_KNOT
-from worldpose.static_calibration.parameters import CameraOnPitch, step_camera
-from worldpose.static_calibration.residuals import SIZE
+from worldpose.static_calibration.parameters import SIZE, CameraOnPitch, step_camera
 
 SURFACE: Final = (-2_000_000_000, -2_000_000_001)
 """Numbers of the unknown crown and end fall."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         reconstruct_joints,
     )
     from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
-    from worldpose.triangulation.left_right_swaps import undo_swaps
+    from worldpose.triangulation.limb_lengths import undo_swaps
     from worldpose.triangulation.passes import Triangulation, triangulate_joints
     from worldpose.triangulation.reports import TriangulationReport
     from worldpose.triangulation.settings import TriangulationSettings
@@ -59,7 +59,7 @@ __getattr__ = import_on_use(
             "estimate_clocks",
             "shift_in_time",
         ),
-        "worldpose.triangulation.left_right_swaps": ("undo_swaps",),
+        "worldpose.triangulation.limb_lengths": ("undo_swaps",),
         "worldpose.triangulation.passes": (
             "Triangulation",
             "triangulate_joints",

@@ -19,7 +19,7 @@ from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, read_frames
-from worldpose.triangulation.left_right_swaps import undo_swaps
+from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.observations import PersonTrack, Rig, observe_person
 from worldpose.triangulation.passes import (
     DetectorModel,

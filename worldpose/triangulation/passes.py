@@ -20,8 +20,12 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
-from worldpose.triangulation.left_right_swaps import find_swaps, undo_swaps
-from worldpose.triangulation.limb_lengths import limb_lengths, repair_limb_lengths
+from worldpose.triangulation.limb_lengths import (
+    find_swaps,
+    limb_lengths,
+    repair_limb_lengths,
+    undo_swaps,
+)
 from worldpose.triangulation.noise_model import BY_JOINT, NoiseModel, learn_common_bias, learn_noise
 from worldpose.triangulation.observations import Observations, Rig, no_shift
 from worldpose.triangulation.person_offsets import (

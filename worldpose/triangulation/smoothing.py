@@ -35,7 +35,7 @@ from worldpose.triangulation.batched_gauss_newton import (
     accumulate,
     clear,
 )
-from worldpose.triangulation.left_right_swaps import undo_swaps
+from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.observations import (
     Observations,
     PersonTrack,

@@ -33,6 +33,7 @@ from worldpose.tracking import (
 )
 from worldpose.tracking.plane_clocks import MIN_RUNNERS
 from worldpose.triangulation.clocks import (
+    ALIKE,
     GATES,
     SETTLED,
     VELOCITY_TIME,
@@ -61,7 +62,7 @@ LIKELY: Final = 2.0
 """A shift is excluded if it is worse than the best by this many standard errors."""
 MIN_CONTRAST: Final = 3.0
 """Least peak of a camera's matches above the median shift, in standard errors [1]."""
-MAX_SPAN: Final = 30
+MAX_SPAN: Final = 40
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
 MAX_ERROR: Final = 0.25
@@ -242,11 +243,10 @@ def _estimate_fractions(
     for gate in GATES:
         loose = settings.model_copy(update={"max_deviation": gate})
         common = shift_in_time(people, late)
-        parts = [
-            each
-            for part in choose_intervals((frames, count, people.detection_index.shape[2]), length)
-            for each in _sum_part(Rig.from_cameras(cameras), common[part], fps, loose)
-        ]
+        rig = Rig.from_cameras(cameras)
+        intervals = choose_intervals((frames, count, people.detection_index.shape[2]), length)
+        sums = [_sum_part(rig, common[part], fps, loose) for part in intervals]
+        parts = [each for found, _ in sums for each in found]
         if not parts:
             break
         prior = np.tile([1.0 / UNKNOWN_CLOCK**2, *PRIOR], count)
@@ -262,7 +262,14 @@ def _estimate_fractions(
         groups = len(parts)
         stated = np.diagonal(rows @ information.sum(axis=0) @ rows.T)
         scatter = (left**2).sum(axis=0) * groups / max(1, groups - 1)
-        error = np.where(told, np.sqrt(np.maximum(scatter, stated)), np.inf)
+        # What all people of a camera have in common does not show in their scatter.
+        along, misses, scale = np.sum([each for _, each in sums], axis=0)
+        usual = np.sqrt(np.divide(misses, 2.0 * scale, out=np.zeros(count), where=scale > 0.0))
+        alike = rows[:, clock] ** 2 @ (ALIKE * along * usual) ** 2
+        # A rotation that the people do not tell is as uncertain as its prior.
+        assumed = rows**2 @ prior
+        error = np.sqrt(np.maximum(scatter, stated) + alike + assumed)
+        error = np.where(told, error, np.inf)
         change = np.where(told, step[clock], 0.0)
         change = np.clip(change - np.median(change[told]) if told.any() else change, -3.0, 3.0)
         late += np.where(told, change, 0.0)
@@ -273,27 +280,33 @@ def _estimate_fractions(
 
 def _sum_part(
     rig: Rig, people: KeypointDetections, fps: float, settings: TriangulationSettings
-) -> list[tuple[Floats, Floats]]:
+) -> tuple[list[tuple[Floats, Floats]], Floats]:
     """Return the normal equations of clocks and cameras from each person in an interval.
 
     The unknowns of a camera are its clock offset [frame], its rotation [rad] and the logarithm of
     its focal length.
+
+    Returns:
+        The equations, and (3, cameras) sums of weight x image motion x image scale, of weighted
+        squared residuals, and of weight x squared image scale, as `estimate_clocks` has them.
     """
     pixels, index = people.keypoints, people.detection_index
     precision = NoiseModel.nominal(pixels.shape[-2]).precision(people.confidence)
     joints = solve_joints(Observations.from_rig(rig, pixels, precision, index), settings).joints
     half = max(1, round(VELOCITY_TIME * fps))
+    count = len(rig.cameras)
+    shared = np.zeros((3, count))
     if len(joints) <= 2 * half:
-        return []
+        return [], shared
     here = slice(half, len(joints) - half)
     velocity = (joints[2 * half :] - joints[: -2 * half]) / (2.0 * half)
     at = joints[here]
     known = np.isfinite(at + velocity).all(axis=-1)
     person = np.nonzero(known)[1]
     at, velocity = at[known], velocity[known]
-    count, n = len(rig.cameras), len(at)
+    n = len(at)
     if not n:
-        return []
+        return [], shared
     point, columns = np.zeros((n, count, 2, 3)), np.zeros((n, count, 2, COLUMNS))
     miss, weight = np.zeros((n, count, 2)), np.zeros((n, count))
     for camera in range(count):
@@ -319,6 +332,11 @@ def _sum_part(
         columns[:, camera, :, 4] = (derivatives[..., 9:11] * row[0, :2]).sum(axis=-1)
         miss[:, camera] = np.where(usable[:, None], off, 0.0)
         weight[:, camera] = np.where(usable, own, 0.0)
+        size = np.where(usable, size, 0.0)
+        motion = np.linalg.norm(columns[:, camera, :, 0], axis=-1)
+        shared[0, camera] = (weight[:, camera] * motion * size).sum()
+        shared[1, camera] = (weight[:, camera, None] * miss[:, camera] ** 2).sum()
+        shared[2, camera] = (weight[:, camera] * size**2).sum()
     weighed = weight[..., None, None] * columns
     matrix = np.einsum("ncij,nc,ncik->njk", point, weight, point) + 1e-9 * np.eye(3)
     right = np.einsum("ncij,nc,nci->nj", point, weight, miss)
@@ -334,7 +352,7 @@ def _sum_part(
         blocks = whole.reshape(count, COLUMNS, count, COLUMNS)
         blocks[np.arange(count), :, np.arange(count)] += own[its].sum(axis=0)
         found.append((whole, score[its].sum(axis=0)))
-    return found
+    return found, shared
 
 
 def shift_frames(

@@ -9,8 +9,13 @@ from faulty_data_sets import FPS, FRAMES, PERSONS, looking
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyParameters, fold_keypoints, load_open_body
 from worldpose.formats import JointTracks, coco_dataset, write_coco, write_joints
-from worldpose.formats.camera_file import write_moving_camera, write_static_camera
-from worldpose.formats.challenge import challenge_truth, write_challenge, write_submission
+from worldpose.formats.challenge import (
+    challenge_truth,
+    write_challenge,
+    write_moving_camera,
+    write_static_camera,
+    write_submission,
+)
 from worldpose.formats.joints_file import write_poses
 from worldpose.geometry import Camera, Rigid
 

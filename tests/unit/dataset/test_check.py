@@ -24,8 +24,7 @@ from faulty_data_sets import (
 
 from worldpose.dataset.contents import list_clips
 from worldpose.errors import InputError
-from worldpose.formats.camera_file import write_static_camera
-from worldpose.formats.challenge import read_submission, write_submission
+from worldpose.formats.challenge import read_submission, write_static_camera, write_submission
 
 
 def test_a_sound_data_set_passes(written, model):

@@ -9,9 +9,9 @@ import pytest
 
 from worldpose.body import BODY25, CHALLENGE15, BodyParameters, fold_keypoints, load_open_body
 from worldpose.errors import InputError
-from worldpose.formats.camera_file import read_camera_rows
 from worldpose.formats.challenge import (
     challenge_truth,
+    read_camera_rows,
     read_challenge,
     read_submission,
     submission_clips,

@@ -9,8 +9,8 @@ from worldpose.static_calibration import step_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row, step_row
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.ground_error import surface_motion
-from worldpose.static_calibration.parameters import PARAMETERS
-from worldpose.static_calibration.residuals import (
+from worldpose.static_calibration.parameters import (
+    PARAMETERS,
     drawn_residuals,
     point_residuals,
     prior_residuals,

@@ -12,7 +12,7 @@ from worldpose.triangulation import (
     triangulate_joints,
     undo_swaps,
 )
-from worldpose.triangulation.left_right_swaps import find_swaps
+from worldpose.triangulation.limb_lengths import find_swaps
 from worldpose.triangulation.observations import Observations, Rig
 from worldpose.triangulation.solving import Solution
 

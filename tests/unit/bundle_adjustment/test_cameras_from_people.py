@@ -1,0 +1,189 @@
+"""Cameras of a known scene are found from a walking person, or refused where nothing tells them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_contracts.cameras import LensCalibration
+from data_contracts.keypoints import KeypointDetections
+from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, align
+from worldpose.simulation import SCENARIOS
+from worldpose.simulation.scene import look_at, simulate_scene
+
+FPS = 50.0
+SIZE = (1280, 960)
+FOCAL = 900.0
+NAMES = ("north", "east", "south", "west")
+
+
+@pytest.fixture(scope="module")
+def walkers():
+    """Joints (frames, 2, 17, 3) of the two people who walk farthest, near the origin."""
+    tiny = SCENARIOS["tiny"]
+    scene = simulate_scene(tiny.model_copy(update={"duration": 10.0, "broadcast": None}), 3)
+    joints = scene.truth.joints
+    middle = joints[:, :, [11, 12]].mean(axis=2)
+    way = np.linalg.norm(np.ptp(middle, axis=0)[:, :2], axis=1)
+    chosen = np.argsort(-way)[:2]
+    found = joints[:, chosen]
+    return found - np.array([*found[:, 0, :, :2].reshape(-1, 2).mean(axis=0), 0.0])
+
+
+@pytest.fixture(scope="module")
+def cameras(walkers):
+    """Four cameras around the first person's way, all in front of it."""
+    reach = float(np.abs(walkers[:, 0, :, :2]).max())
+    found = []
+    for n, angle in enumerate(np.radians([20.0, 110.0, 215.0, 300.0])):
+        far = reach + 5.0 + 0.7 * n
+        center = np.array([far * np.cos(angle), far * np.sin(angle), 1.5 + 0.5 * n])
+        found.append(
+            Camera(
+                focal=np.array([FOCAL, FOCAL]),
+                principal_point=np.array([640.0, 470.0]) + n,
+                distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
+                cam_from_world=look_at(center, np.array([0.0, 0.0, 0.9]), 0.02 * n),
+                image_size=np.array(SIZE),
+            )
+        )
+    return Camera.stack(found)
+
+
+def lens(camera, name, focal_std=2.0, focal=None):
+    return LensCalibration(
+        id=name,
+        image_size=SIZE,
+        focal_px=float(camera.focal[0]) if focal is None else focal,
+        principal_point_px=tuple(camera.principal_point.tolist()),
+        distortion=tuple(camera.distortion.tolist()),
+        focal_std_px=focal_std,
+        principal_point_std_px=2.0,
+        distortion_std=0.005,
+    )
+
+
+def lenses(cameras, **about):
+    return [lens(cameras[c], name, **about) for c, name in enumerate(NAMES[: len(cameras.focal)])]
+
+
+def seen(cameras, joints, noise=1.5):
+    """Detections of people (frames, persons, 17, 3) with Gaussian noise [px]."""
+    rng = np.random.default_rng(4)
+    views = []
+    for c in range(len(cameras.focal)):
+        pixels = cameras[c].project(joints.reshape(-1, 3)).reshape(*joints.shape[:-1], 2)
+        inside = ((pixels >= 0) & (pixels < SIZE)).all(axis=-1)
+        pixels = pixels + rng.normal(0.0, noise, pixels.shape)
+        views.append(np.where(inside[..., None], pixels, np.nan))
+    keypoints = np.stack(views, axis=1)
+    confidence = np.where(np.isfinite(keypoints[..., 0]), 0.9, np.nan)
+    return KeypointDetections.from_keypoints(keypoints, confidence)
+
+
+def test_a_walking_person_locates_four_cameras_in_metres(walkers, cameras):
+    apart = float(np.linalg.norm(cameras.center[0] - cameras.center[2]))
+    found = locate_cameras(
+        lenses(cameras), seen(cameras, walkers[:, :1]), FPS, KnownLength(apart, (0, 2), 0.005)
+    )
+    motion = align(found.cameras.center, cameras.center, with_scale=False)
+    off = np.linalg.norm(motion.apply(found.cameras.center) - cameras.center, axis=1)
+    assert off.max() < 0.05
+    assert (off < 4.0 * found.std[:, 0] + 0.02).all()
+    turned = found.cameras.cam_from_world.rotation @ motion.rotation.T
+    angle = np.arccos(
+        np.clip(
+            0.5 * (np.einsum("cij,cij->c", turned, cameras.cam_from_world.rotation) - 1.0),
+            -1.0,
+            1.0,
+        )
+    )
+    assert np.degrees(angle).max() < 0.5
+    # The world's z is up, its origin on the ground.
+    tilt = np.arccos(np.clip((motion.rotation @ [0.0, 0.0, 1.0])[2], -1.0, 1.0))
+    assert tilt < max(3.0 * found.up_std, np.radians(1.0))
+    assert abs(motion.apply(np.zeros((1, 3)))[0, 2]) < 0.08
+    assert found.people == 1
+    assert found.residual_px.max() < 3.0
+    assert found.held_out_px.max() < 4.0
+    assert 0.0 < found.coverage.min() <= found.coverage.max() <= 1.0
+
+
+def test_stature_gives_the_scale_within_its_deviation(walkers, cameras):
+    top = walkers[:, 0, :5, 2].max(axis=1) - walkers[:, 0, 15:, 2].min(axis=1)
+    # Eyes are 0.11 m below the top of the head, ankles 0.08 m above the ground.
+    stature = float(np.median(top)) + 0.19
+    found = locate_cameras(
+        lenses(cameras), seen(cameras, walkers[:, :1]), FPS, KnownLength(stature)
+    )
+    scale = float(align(found.cameras.center, cameras.center, with_scale=True).scale)
+    assert abs(np.log(scale)) < 3.0 * found.scale_std
+    assert found.stature_m == pytest.approx(stature)
+
+
+def test_two_people_are_told_apart(walkers, cameras):
+    both = seen(cameras, walkers)
+    # Each camera lists the people in another order.
+    order = [[0, 1], [1, 0], [0, 1], [1, 0]]
+    mixed = np.stack([both.keypoints[:, c, order[c]] for c in range(4)], axis=1)
+    sure = np.stack([both.confidence[:, c, order[c]] for c in range(4)], axis=1)
+    found = locate_cameras(
+        lenses(cameras), KeypointDetections.from_keypoints(mixed, sure), FPS, KnownLength(1.8)
+    )
+    motion = align(found.cameras.center, cameras.center, with_scale=True)
+    off = np.linalg.norm(motion.apply(found.cameras.center) - cameras.center, axis=1)
+    assert off.max() < 0.08
+
+
+def test_an_unknown_focal_length_is_found_where_all_cameras_have_it(walkers, cameras):
+    free = lenses(cameras, focal=1280.0, focal_std=400.0)
+    found = locate_cameras(free, seen(cameras, walkers[:, :1]), FPS, KnownLength(1.8))
+    error = np.abs(np.log(found.cameras.focal[:, 0] / FOCAL))
+    assert error.max() < 0.05
+    assert (error < 4.0 * found.std[:, 2] + 0.01).all()
+
+
+def without(detections, camera, frames):
+    """The detections without those of a camera in some frames."""
+    confidence = detections.confidence.copy()
+    confidence[frames, camera] = np.nan
+    return replace(detections, confidence=confidence)
+
+
+def test_who_stands_still_tells_nothing(walkers, cameras):
+    first = walkers[:1, :1]
+    place = np.array([*first[0, 0, 11, :2], 0.0])
+    still = np.repeat(first - place, len(walkers), axis=0)
+    with pytest.raises(InputError, match="found people who stand still"):
+        locate_cameras(lenses(cameras), seen(cameras, still), FPS, KnownLength(1.8))
+
+
+def test_one_camera_is_refused(walkers, cameras):
+    with pytest.raises(InputError, match="north: expected two cameras or more"):
+        locate_cameras(
+            lenses(cameras)[:1], seen(cameras[:1], walkers[:, :1]), FPS, KnownLength(1.8)
+        )
+
+
+def test_too_few_common_frames_are_refused(walkers, cameras):
+    given = seen(cameras[:2], walkers[:, :1])
+    half = len(walkers) // 2
+    apart = without(without(given, 0, slice(half, None)), 1, slice(None, half - 5))
+    with pytest.raises(InputError, match="in two cameras at once for 20 frames, found 5"):
+        locate_cameras(lenses(cameras)[:2], apart, FPS, KnownLength(1.8))
+
+
+def test_a_camera_that_shows_nobody_is_named(walkers, cameras):
+    given = without(seen(cameras, walkers[:, :1]), 2, slice(None))
+    with pytest.raises(InputError, match="south: expected a person for 20 frames or more"):
+        locate_cameras(lenses(cameras), given, FPS, KnownLength(1.8))
+
+
+def test_a_camera_that_shows_another_person_is_named(walkers, cameras):
+    given = seen(cameras, walkers[:, :1])
+    keypoints = given.keypoints.copy()
+    keypoints[:, 1] = keypoints[::-1, 1] * [-1.0, 1.0] + [1280.0, 0.0]
+    with pytest.raises(InputError, match="east: expected a person for 20 frames whom"):
+        locate_cameras(lenses(cameras), replace(given, keypoints=keypoints), FPS, KnownLength(1.8))

@@ -1,0 +1,135 @@
+"""USD's own library poses bodies as the model does, and sees cameras where they are."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from worldpose.body import BodyParameters, load_open_body
+from worldpose.errors import InputError, UsageError
+from worldpose.formats.gltf_file import AnimatedBody
+from worldpose.formats.usd_file import write_usd
+from worldpose.geometry import Camera
+
+FPS, FRAMES = 50.0, 30
+NOTES = {"software": "worldpose", "licence": "For tests alone.", "clip": "a"}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_open_body()
+
+
+def motion(seed):
+    """A person with a random pose that changes from frame to frame."""
+    rng = np.random.default_rng(seed)
+
+    def wander(size, step):
+        return np.cumsum(rng.normal(0.0, step, (FRAMES, size)), axis=0)
+
+    return BodyParameters(
+        rng.standard_normal((1, 10)),
+        rng.uniform(-3.0, 3.0, 3) + wander(3, 0.05),
+        rng.uniform(-1.0, 1.0, 69) + wander(69, 0.02),
+        rng.uniform(-50.0, 50.0, 3) + wander(3, 0.1),
+    )
+
+
+def people():
+    second = motion(1)
+    transl = second.transl.copy()
+    transl[:5] = transl[20:25] = np.nan
+    gappy = BodyParameters(second.betas, second.global_orient, second.body_pose, transl)
+    return [
+        AnimatedBody("person_003", motion(0), {"person": 3, "kind": "triangulated"}),
+        AnimatedBody("person_007", gappy, {"person": 7, "kind": "mixed"}),
+    ]
+
+
+def cameras():
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks along +y
+    turns = Rotation.from_rotvec(np.outer(np.linspace(0, 0.5, FRAMES), [0, 1, 0])).as_matrix()
+    matrix = np.array([[2000.0, 0, 940.0], [0, 2000.0, 560.0], [0, 0, 1.0]])
+    size = np.array([1920, 1080])
+
+    def camera(rotation):
+        place = -rotation @ np.array([1.0, -70.0, 12.0])
+        matrices = np.broadcast_to(matrix, (*rotation.shape[:-2], 3, 3))
+        return Camera.from_matrices(
+            matrices, np.zeros((*rotation.shape[:-2], 5)), rotation, place, size
+        )
+
+    return {"1 north": camera(turn), "main": camera(turns @ turn)}
+
+
+LINE = np.array([[-52.5, -34.0, 0.0], [52.5, -34.0, 0.1], [52.5, 34.0, 0.0]])
+
+
+def test_bodies_cameras_and_units_are_read_back(model, tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Gf, Usd, UsdGeom, UsdSkel
+
+    path = tmp_path / "a.usdc"
+    write_usd(path, model, people(), FPS, cameras=cameras(), markings=[LINE], notes=NOTES)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (FPS, FRAMES - 1)
+    assert stage.GetRootLayer().customLayerData["licence"] == "For tests alone."
+    cache, checked = UsdSkel.Cache(), 0
+    for body in people():
+        root = UsdSkel.Root(stage.GetPrimAtPath(f"/world/{body.name}"))
+        assert root.GetPrim().GetCustomDataByKey("person") == body.about["person"]
+        cache.Populate(root, Usd.TraverseInstanceProxies())
+        skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath(f"/world/{body.name}/skeleton"))
+        query = cache.GetSkelQuery(skeleton)
+        skinning = cache.GetSkinningQuery(stage.GetPrimAtPath(f"/world/{body.name}/surface"))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/world/{body.name}/surface"))
+        for frame in range(FRAMES):
+            poses = body.poses[frame]
+            seen = UsdGeom.Imageable(root.GetPrim()).ComputeVisibility(frame)
+            if np.isnan(poses.transl).any():
+                assert seen == "invisible"
+                continue
+            assert seen == "inherited"
+            found = np.array(query.ComputeJointSkelTransforms(frame))
+            assert np.abs(found[:, 3, :3] - model.joints(poses)).max() < 1e-4
+            truth = model.articulate(poses).rotations
+            turned = Rotation.from_matrix(found[:, :3, :3].swapaxes(1, 2))
+            off = (turned * Rotation.from_matrix(truth).inv()).magnitude()
+            assert np.degrees(off).max() < 0.01
+            checked += 1
+        points = mesh.GetPointsAttr().Get()
+        assert skinning.ComputeSkinnedPoints(
+            query.ComputeSkinningTransforms(FRAMES - 1), points, FRAMES - 1
+        )
+        # The surface stands where the joints do, without the correctives of the pose.
+        away = np.asarray(points) - model.vertices(body.poses[FRAMES - 1])
+        assert np.linalg.norm(away, axis=1).max() < 0.2
+    assert checked == 2 * FRAMES - 10
+    for name, camera in cameras().items():
+        prim = UsdGeom.Camera(stage.GetPrimAtPath(f"/world/{name.replace('1 ', 'camera_1_')}"))
+        for frame in (0, FRAMES - 1):
+            one = camera[frame] if camera.batch_shape else camera
+            lens = prim.GetCamera(frame)
+            place = np.array([3.0, 5.0, 1.0])
+            window = lens.frustum.ComputeViewMatrix() * lens.frustum.ComputeProjectionMatrix()
+            x, y, _ = window.Transform(Gf.Vec3d(*place))
+            shown = [960.0 * (1.0 + x) - 0.5, 540.0 * (1.0 - y) - 0.5]
+            np.testing.assert_allclose(shown, one.project(place[None])[0], atol=0.02)
+    curve = UsdGeom.BasisCurves(stage.GetPrimAtPath("/world/pitch/marking_00"))
+    np.testing.assert_allclose(np.array(curve.GetPointsAttr().Get()), LINE, atol=1e-5)
+
+
+def test_a_clip_without_bodies_is_refused(model, tmp_path):
+    with pytest.raises(InputError, match="expected a person with a fitted body, found none"):
+        write_usd(tmp_path / "a.usdc", model, [], FPS, cameras={}, markings=[], notes=NOTES)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_library_is_told(model, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(UsageError, match="expected worldpose with the extra usd, found no usd"):
+        write_usd(tmp_path / "a.usdc", model, people(), FPS, cameras={}, markings=[], notes=NOTES)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,420 @@
+"""Static cameras from the people who walk through their views, without any marking.
+
+The first poses are those of `people_views`; bundle adjustment with free joints follows. A person's
+stature or the distance of two cameras gives the scale, and the feet and the bodies of those who
+walk give the vertical.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.cameras import LensCalibration
+from data_contracts.keypoints import KeypointDetections
+from worldpose.bundle_adjustment.clip import Observations
+from worldpose.bundle_adjustment.people_views import (
+    JOINTS,
+    LOSS_SCALE,
+    Start,
+    Views,
+    adjust,
+    find_walkers,
+    refusal,
+)
+from worldpose.bundle_adjustment.problems import KeypointNoise, estimate_noise
+from worldpose.bundle_adjustment.solver import Solution
+from worldpose.bundle_adjustment.uncertainty import Similarity, relative_covariance
+from worldpose.errors import InputError
+from worldpose.geometry import Camera
+from worldpose.static_calibration import project_with_jacobian
+from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
+
+UNKNOWN_FOCAL: Final = 0.1
+"""Relative deviation of a focal length from which several are tried [1]."""
+FOCAL_FACTORS: Final = (1.0, 0.7, 1.4, 2.0, 0.5)
+"""Factors on such a focal length [1]."""
+PASSES: Final = 3
+"""Alternations of adjustment and estimation of noise [1]."""
+MIN_SHARE: Final = 0.8
+"""Least keypoints that a result explains, by the most of all results [1]."""
+MAX_POSITION_STD: Final = 0.1
+"""Largest standard deviation of a camera's position, by its distance from the people [1]."""
+STEP_S: Final = 0.2
+"""Time over which the speed of an ankle is measured [s]."""
+STILL_M_S: Final = 0.4
+"""Speed of an ankle below which its foot stands [m/s]."""
+ANKLE: Final = 0.045
+"""Height of a standing foot's ankle above the ground, by the stature [1]."""
+FOOT_STD_M: Final = 0.03
+"""Its standard deviation [m]; a foot that rolls off lifts its ankle."""
+LEAN_STD: Final = 0.07
+"""Standard deviation of the mean lean of people who walk, about each axis [rad]."""
+MAX_SPREAD: Final = 0.06
+"""Largest deviation of a proportion that tells the stature [1]: detectors place hips and shoulders
+at various breadths."""
+OFFSET_M: Final = 0.024
+"""Distance of a detector's joint from the joint's centre, per axis [m]."""
+HELD_OUT: Final = 2
+"""Intervals of time, each of which is held out once [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasFromPeople:
+    """Cameras by the people in their views, with what tells how good they are.
+
+    The world has its origin on the ground below the people, z up, and x along the way that most of
+    them walk.
+
+    Attributes:
+        cameras: (cameras,) batch.
+        std: (cameras, 3) standard deviation of position [m], orientation [rad] and the logarithm
+            of the focal length [1], relative to the other cameras and the people.
+        scale_std: relative standard deviation of all lengths [1].
+        up_std: standard deviation of the vertical, the larger of two axes [rad].
+        on_feet: whether standing feet determine the vertical; else people are assumed upright.
+        stature_m: stature of the people by the limbs, median [m].
+        people: number of people [1].
+        keypoints: (cameras,) keypoints used [1].
+        residual_px: (cameras,) median distance of a keypoint from its joint [px].
+        held_out_px: (cameras,) the same in frames that are left out of the adjustment; NaN where
+            half of the frames do not determine the cameras.
+        coverage: (cameras,) share of a grid of 8 x 8 fields of the image that has keypoints [1].
+        noise: scale and correlation of the keypoints' errors, relative to `NOISE`.
+    """
+
+    cameras: Camera
+    std: Floats
+    scale_std: float
+    up_std: float
+    on_feet: bool
+    stature_m: float
+    people: int
+    keypoints: Integers
+    residual_px: Floats
+    held_out_px: Floats
+    coverage: Floats
+    noise: KeypointNoise
+
+
+class KnownLength(NamedTuple):
+    """What gives the scale."""
+
+    length_m: float
+    """Stature of the people, or distance of the two cameras [m]."""
+    cameras: tuple[int, int] | None = None
+    """The two cameras; None = stature."""
+    std_m: float = 0.01
+    """Standard deviation of the length [m]."""
+
+
+def locate_cameras(
+    lenses: Sequence[LensCalibration],
+    detections: KeypointDetections,
+    fps: float,
+    known: KnownLength,
+) -> CamerasFromPeople:
+    """Return static cameras by the 2D poses of people who walk, all in one metric world.
+
+    Args:
+        lenses: lens of each camera. Focal length and principal point are adjusted within their
+            deviations; where the focal length is known to 10 % or less, several are tried.
+        detections: (frames, cameras, detections) in memory, before tracking, on a common clock.
+        fps: frames per second [1/s].
+        known: length that gives the scale.
+
+    Raises:
+        InputError: fewer than two cameras, people stand still, two cameras show no person together
+            for long enough, or the people do not determine a camera; the error names it.
+
+    Note:
+        Five-point algorithm: Nister, IEEE PAMI 26(6), 2004.
+    """
+    names = [lens.id for lens in lenses]
+    if len(names) < 2 or detections.confidence.shape[1:2] != (len(names),):
+        raise refusal(names, "two cameras or more, each with 2D poses", f"{len(names)} with a lens")
+    tracks = find_walkers(detections, fps, names)
+    start = _search(lenses, tracks)
+    frames = start.observed.frame_of
+    adjusted, observed, noise = _adjust_with_noise(start, lenses)
+    relative = _relative_std(adjusted, observed, noise)
+    distance = np.linalg.norm(adjusted.cameras.center - np.median(observed.points, axis=0), axis=1)
+    for name, std, far in zip(names, relative[:, 0], distance, strict=True):
+        if not std <= MAX_POSITION_STD * far:
+            raise refusal(
+                [name],
+                f"people who determine its position within {100 * MAX_POSITION_STD:.0f} % of "
+                "their distance",
+                f"{100 * std / far:.0f} %",
+            )
+    people = _People.of(observed, detections.frame if len(detections.frame) else None, fps)
+    scale, scale_std = people.scale(adjusted.cameras, known)
+    world = people.orient(scale)
+    share = np.array([1.0 / 64.0] * len(names))
+    size = adjusted.cameras.image_size
+    for c in range(len(names)):
+        fields = np.clip((8 * observed.image[observed.camera_of == c] / size[c]).astype(int), 0, 7)
+        share[c] *= len(np.unique(fields, axis=0))
+    std = relative.copy()
+    std[:, 0] *= scale
+    off = _distances(adjusted.cameras, observed)
+    return CamerasFromPeople(
+        cameras=world.similarity.move_cameras(adjusted.cameras),
+        std=std,
+        scale_std=scale_std,
+        # A rig that is bent tilts the vertical, too.
+        up_std=float(np.hypot(world.std, np.median(std[:, 1]))),
+        on_feet=world.on_feet,
+        stature_m=scale * people.stature(),
+        people=len(np.unique(observed.person_of)),
+        keypoints=np.bincount(observed.camera_of, minlength=len(names)),
+        residual_px=_by_camera(off, observed.camera_of, len(names)),
+        held_out_px=_held_out(adjusted, observed, lenses, noise, frames),
+        coverage=share,
+        noise=noise,
+    )
+
+
+def _search(lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> Start:
+    """Return the first poses that explain most keypoints best.
+
+    Raises:
+        InputError: none does.
+    """
+    unknown = [one.focal_std_px > UNKNOWN_FOCAL * one.focal_px for one in lenses]
+    found: list[tuple[float, int, Start]] = []
+    errors: list[InputError] = []
+    for factor in FOCAL_FACTORS if any(unknown) else (1.0,):
+        tried = [
+            one.model_copy(update={"focal_px": factor * one.focal_px}) if free else one
+            for one, free in zip(lenses, unknown, strict=True)
+        ]
+        try:
+            starts = Views(tried, tracks).starts()
+        except InputError as error:
+            errors.append(error)
+            continue
+        for start in starts:
+            rough = adjust(start.cameras, start.observed, tried, KeypointNoise())
+            count = len(start.observed.image)
+            adjusted = start.observed._replace(points=rough.points)
+            found.append((rough.cost / count, count, Start(rough.cameras, adjusted)))
+    if not found:
+        raise errors[0]
+    most = max(count for _, count, _ in found)
+    enough = [one for one in found if one[1] >= MIN_SHARE * most]
+    return min(enough, key=lambda one: one[0])[2]
+
+
+def _adjust_with_noise(
+    start: Start, lenses: Sequence[LensCalibration]
+) -> tuple[Solution, Observations, KeypointNoise]:
+    """Return the adjustment with the noise that the keypoints have."""
+    cameras, observed, noise = start.cameras, start.observed, KeypointNoise()
+    for _ in range(PASSES):
+        adjusted = adjust(cameras, observed, lenses, noise)
+        observed = observed._replace(points=adjusted.points)
+        noise = estimate_noise(adjusted.cameras, adjusted.points, observed, LOSS_SCALE)
+    try:
+        adjusted = adjust(cameras, observed, lenses, noise, covariance=True)
+    except InputError as error:
+        names = [lens.id for lens in lenses]
+        raise refusal(names, "people who determine the cameras", error.found) from error
+    return adjusted, observed, noise
+
+
+def _relative_std(adjusted: Solution, observed: Observations, noise: KeypointNoise) -> Floats:
+    """Return the deviations (cameras, 3) of position, orientation and focal length.
+
+    Relative to all cameras and people together: no keypoint tells their common place and size.
+    """
+    count = len(adjusted.cameras.focal)
+    information = np.zeros((count, 12, 12))
+    for c in range(count):
+        rows = observed.camera_of == c
+        points = adjusted.points[observed.point_of[rows]]
+        _, by_step = project_with_jacobian(adjusted.cameras[c], points)
+        by_step = by_step / observed.noise[rows][:, None, None]
+        information[c] = np.einsum("nai,naj->ij", by_step, by_step)
+    origin = np.median(adjusted.points, axis=0)
+    own, _ = relative_covariance(adjusted.camera_covariance, adjusted.cameras, information, origin)
+    variance = np.diagonal(own, axis1=1, axis2=2)
+    parts = [variance[:, 3:6].sum(axis=1), variance[:, :3].sum(axis=1), variance[:, 6]]
+    return np.asarray(np.sqrt(np.stack(parts, axis=1)))
+
+
+def _distances(cameras: Camera, observed: Observations) -> Floats:
+    """Return the distance of each keypoint from its joint (n,) [px]."""
+    off = np.empty(len(observed.image))
+    for c in range(len(cameras.focal)):
+        rows = observed.camera_of == c
+        shown = cameras[c].project(observed.points[observed.point_of[rows]])
+        off[rows] = np.linalg.norm(shown - observed.image[rows], axis=1)
+    return off
+
+
+def _by_camera(off: Floats, camera_of: Integers, count: int) -> Floats:
+    """Return the median of each camera (cameras,); NaN without any."""
+    parts = [off[camera_of == c] for c in range(count)]
+    return np.array([np.median(part) if len(part) else np.nan for part in parts])
+
+
+def _held_out(
+    adjusted: Solution,
+    observed: Observations,
+    lenses: Sequence[LensCalibration],
+    noise: KeypointNoise,
+    frames: Integers,
+) -> Floats:
+    """Return median distances (cameras,) in frames by cameras of the other frames [px].
+
+    Joints of the held-out frames come from all cameras, which are not adjusted to them.
+    """
+    count = len(lenses)
+    edges = np.quantile(np.unique(frames), np.linspace(0.0, 1.0, HELD_OUT + 1)[1:-1])
+    group = np.searchsorted(edges, frames, side="right")
+    off, camera_of = [], []
+    observed = observed._replace(points=adjusted.points)
+    for held in range(HELD_OUT):
+        try:
+            other = _part(observed, group != held)
+            judged = _part(observed, group == held)
+            cameras = adjust(adjusted.cameras, other, lenses, noise).cameras
+            joints = adjust(cameras, judged, lenses, noise, fixed=True)
+        except InputError:
+            return np.full(count, np.nan)
+        off.append(_distances(joints.cameras, judged._replace(points=joints.points)))
+        camera_of.append(judged.camera_of)
+    return _by_camera(np.concatenate(off), np.concatenate(camera_of), count)
+
+
+def _part(observed: Observations, kept: Flags) -> Observations:
+    """Return the observations of some frames; a joint's are kept or left out together."""
+    used, number = np.unique(observed.point_of[kept], return_inverse=True)
+    rows = {
+        name: getattr(observed, name)[kept] for name in Observations._fields if name != "points"
+    }
+    return Observations(points=observed.points[used], **(rows | {"point_of": number}))
+
+
+class _World(NamedTuple):
+    similarity: Similarity
+    std: float
+    on_feet: bool
+
+
+class _People(NamedTuple):
+    """Joints of people in units of the adjustment; NaN where missing."""
+
+    joints: Floats
+    """(frames, persons, 17, 3)"""
+    frames: Integers
+    """(frames,) rows of the clip."""
+    fps: float
+
+    @classmethod
+    def of(cls, observed: Observations, frame: Integers | None, fps: float) -> _People:
+        """Return the people of adjusted observations."""
+        rows, row_of = np.unique(observed.frame_of, return_inverse=True)
+        persons = int(observed.person_of.max()) + 1
+        joints = np.full((len(rows), persons, 17, 3), np.nan)
+        joints[row_of, observed.person_of, JOINTS[observed.joint_of]] = observed.points[
+            observed.point_of
+        ]
+        return cls(joints, rows if frame is None else frame[rows], fps)
+
+    def stature(self) -> float:
+        """Return the people's stature by limbs and trunk, the median of all."""
+        return float(np.median([self._stature(p) for p in range(self.joints.shape[1])]))
+
+    def _stature(self, person: int) -> float:
+        found, weight = [], []
+        for each in PROPORTIONS:
+            if each.spread > MAX_SPREAD:
+                continue
+            lengths = []
+            for ends in each.ends:
+                first, second = (self.joints[:, person, list(end)].mean(axis=1) for end in ends)
+                lengths.append(np.linalg.norm(first - second, axis=1))
+            known = np.concatenate(lengths)
+            known = known[np.isfinite(known)]
+            if len(known):
+                found.append(float(np.median(known)) / each.share)
+                # A detector's label is not the joint's centre.
+                offset = (OFFSET_M / (each.share * STATURE[0])) ** 2 * each.offsets
+                weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
+        return float(np.average(found, weights=weight))
+
+    def scale(self, cameras: Camera, known: KnownLength) -> tuple[float, float]:
+        """Return metres per unit and their relative deviation."""
+        if known.cameras is not None:
+            a, b = known.cameras
+            apart = float(np.linalg.norm(cameras.center[a] - cameras.center[b]))
+            return known.length_m / apart, known.std_m / known.length_m
+        statures = np.array([self._stature(p) for p in range(self.joints.shape[1])])
+        return known.length_m / float(np.median(statures)), float(
+            np.hypot(PERSONAL, known.std_m / known.length_m) / np.sqrt(len(statures))
+        )
+
+    def orient(self, scale: float) -> _World:
+        """Return the transform to the world, with the vertical's deviation [rad]."""
+        joints = scale * self.joints
+        shoulders, hips = joints[:, :, [5, 6]].mean(axis=2), joints[:, :, [11, 12]].mean(axis=2)
+        ankles = joints[:, :, [15, 16]]
+        upright = (shoulders - hips) + (hips - ankles.mean(axis=2))
+        upright = upright[np.isfinite(upright).all(axis=-1)]
+        up = np.median(upright / np.linalg.norm(upright, axis=1, keepdims=True), axis=0)
+        lean = up / np.linalg.norm(up)
+        feet = self._standing_feet(ankles)
+        for _ in range(5):
+            spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
+            off = spread @ up
+            weight = 1.0 / (FOOT_STD_M**2 + (off / 3.0) ** 2)
+            level = np.eye(3) - np.outer(up, up)
+            information = level @ (weight * spread.T) @ spread @ level + level / LEAN_STD**2
+            slope = level @ (spread.T @ (weight * off) + (up - lean) / LEAN_STD**2)
+            up = up - np.linalg.lstsq(information, slope, rcond=1e-9)[0]
+            up = up / np.linalg.norm(up)
+        values = np.linalg.eigvalsh(information)[1:]
+        places = hips.reshape(-1, 3)[np.isfinite(hips.reshape(-1, 3)).all(axis=1)]
+        middle = np.median(places, axis=0)
+        lowest = ankles.reshape(-1, 3) @ up
+        ground = np.median(feet @ up) if len(feet) else np.nanquantile(lowest, 0.05)
+        height = ANKLE * scale * self.stature()
+        origin = middle + (ground - height - middle @ up) * up
+        x = np.linalg.svd((places - middle) @ (np.eye(3) - np.outer(up, up)))[2][0]
+        x = x - (x @ up) * up
+        x = x / np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(up, x), up])
+        return _World(
+            Similarity(scale, rotation, -rotation @ origin),
+            float(1.0 / np.sqrt(values.min())),
+            bool(values.min() > 2.0 / LEAN_STD**2),
+        )
+
+    def _standing_feet(self, ankles: Floats) -> Floats:
+        """Return the mean ankle (n, 3) [m] of each time that a foot stands.
+
+        Args:
+            ankles: (frames, persons, 2, 3) [m].
+        """
+        time = self.frames / self.fps
+        half = max(1, round(0.5 * STEP_S / float(np.median(np.diff(time)))))
+        if len(time) <= 2 * half:
+            return np.empty((0, 3))
+        gap = (time[2 * half :] - time[: -2 * half])[:, None, None]
+        moved = np.linalg.norm(ankles[2 * half :] - ankles[: -2 * half], axis=-1)
+        still = np.nan_to_num(moved / gap, nan=np.inf) < STILL_M_S
+        found = []
+        for person, side in np.ndindex(still.shape[1:]):
+            rows = np.flatnonzero(still[:, person, side]) + half
+            for part in np.split(rows, np.flatnonzero(np.diff(rows) > half) + 1):
+                there = ankles[part, person, side]
+                there = there[np.isfinite(there[:, 0])]
+                if len(there):
+                    found.append(there.mean(axis=0))
+        return np.array(found).reshape(-1, 3)

@@ -1,0 +1,524 @@
+"""People in the views of cameras whose poses are unknown: tracks, and first poses by them.
+
+Two cameras start from the essential matrix of one person's joints, and each further camera from
+these joints in 3D. All are adjusted after each step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from data_contracts.arrays import Flags, Floats
+from data_contracts.cameras import LensCalibration
+from data_contracts.keypoints import KeypointDetections
+from worldpose.bundle_adjustment.clip import Observations
+from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.settings import SolverSettings
+from worldpose.bundle_adjustment.solver import Problem, Solution, solve
+from worldpose.detection.box_tracking import BoxTracker
+from worldpose.errors import InputError
+from worldpose.geometry import Camera, Rigid
+from worldpose.triangulation.noise_model import STATURE
+
+JOINTS: Final = np.arange(5, 17)
+"""Joints of COCO-17 that are used: those of the face are labelled differently by every detector."""
+MIN_CONFIDENCE: Final = 0.3
+"""Least confidence of a keypoint that is used [1]."""
+MAX_FRAMES: Final = 120
+"""Most frames that are used, evenly spread; more add time and little information [frame]."""
+MIN_FRAMES: Final = 20
+"""Least frames in which two cameras show a person [frame]."""
+BUFFER_S: Final = 0.5
+"""Longest time for which a camera loses a person whom it shows again [s]."""
+MAX_TRACKS: Final = 5
+"""Most people of a camera who are compared; the longest seen [1]."""
+MIN_MOTION: Final = 0.25
+"""Least distance that a person walks in a camera's images, in heights of the person there [1]."""
+START_NOISE_M: Final = 0.05
+"""Distance of a joint from where another camera sees it up to which both agree, at the start [m]:
+two standard deviations of a detector."""
+MIN_AGREEMENT: Final = 0.5
+"""Least share of joints that agree for two views to be of one person [1]."""
+SAMPLE: Final = 400
+"""Most joints of a person in the random search for a pose [1]."""
+DRAWS: Final = 300
+"""Draws of this search [1]; half of the joints being right, 150 of 5 have none wrong in 99 %."""
+STARTS: Final = 3
+"""Pairs of cameras from which the search starts; the best result counts [1]."""
+NOISE: Final = (1.5, 0.02)
+"""Assumed standard deviation of a keypoint per axis: [px], and [m] on the person."""
+GROSS: Final = 20.0
+"""Standard deviations from which a keypoint is another person's [1]."""
+LOSS_SCALE: Final = 3.0
+"""Standard deviations beyond which a keypoint counts less (Cauchy's loss) [1]."""
+SOLVER: Final = SolverSettings(max_iterations=100, min_cost_change=1e-6)
+FIXED: Final = 1e12
+"""Information that fixes a number: a step of a micrometre costs one [1/m^2]."""
+
+
+def refusal(names: Sequence[str], expected: str, found: str) -> InputError:
+    """Return the error of people who do not determine cameras.
+
+    Args:
+        names: the cameras.
+        expected: what would determine them.
+        found: what is there.
+    """
+    return InputError(
+        f"cameras from people: {', '.join(names) or 'none'}",
+        expected=expected,
+        found=found,
+        todo="Film one person, seen as a whole, who walks through the whole scene for half a "
+        "minute in front of all cameras at once, or click markings.",
+    )
+
+
+def _camera(lens: LensCalibration) -> Camera:
+    """Return a camera with this lens at the origin."""
+    return Camera(
+        focal=np.array([lens.focal_px, lens.focal_px]),
+        principal_point=np.array(lens.principal_point_px),
+        distortion=np.array(lens.distortion),
+        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
+        image_size=np.array(lens.image_size, dtype=np.int64),
+    )
+
+
+def find_walkers(
+    detections: KeypointDetections, fps: float, names: Sequence[str]
+) -> list[list[Floats]]:
+    """Return the keypoints (frames, 12, 2) [px] of the people in each camera's images.
+
+    Raises:
+        InputError: a camera shows nobody for long, or nobody walks.
+    """
+    every = []
+    for c, name in enumerate(names):
+        points = np.where(
+            (detections.confidence[:, c] > MIN_CONFIDENCE)[..., None],
+            detections.keypoints[:, c],
+            np.nan,
+        ).astype(np.float64)[:, :, JOINTS]
+        tracks = _track(points, fps)
+        if not tracks:
+            raise refusal([name], f"a person for {MIN_FRAMES} frames or more", "none")
+        every.append(tracks[:MAX_TRACKS])
+    farthest = max(_walking_distance(track) for tracks in every for track in tracks)
+    if farthest < MIN_MOTION:
+        raise refusal(
+            names,
+            f"a person who walks for {MIN_MOTION:g} heights of the person in an image",
+            f"people who stand still: they move by {farthest:.2f} heights at most",
+        )
+    return every
+
+
+def _track(points: Floats, fps: float) -> list[Floats]:
+    """Return people (frames, 12, 2) of points (frames, detections, 12, 2), the longest first."""
+    tracker = BoxTracker(0.0, round(BUFFER_S * fps))
+    tracks: dict[int, Floats] = {}
+    for frame, people in enumerate(points):
+        there = np.flatnonzero(np.isfinite(people[..., 0]).sum(axis=1) >= len(JOINTS) // 2)
+        seen = people[there]
+        boxes = np.concatenate([np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)], axis=1)
+        boxes = boxes.reshape(-1, 4)
+        for person, track in zip(seen, tracker.update(boxes, np.ones(len(boxes))), strict=True):
+            whole = tracks.setdefault(int(track), np.full((len(points), *points.shape[2:]), np.nan))
+            whole[frame] = person
+    shown = [track for track in tracks.values() if _frames(track).sum() >= MIN_FRAMES]
+    return sorted(shown, key=lambda track: -int(_frames(track).sum()))
+
+
+def _frames(track: Floats) -> Flags:
+    """Return the frames (frames,) with a person."""
+    return np.asarray(np.isfinite(track[..., 0]).any(axis=1))
+
+
+def _height(track: Floats) -> float:
+    """Return the usual height of a person in the image, from shoulders to ankles [px]."""
+    seen = track[_frames(track), :, 1]
+    return float(np.median(np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1)))
+
+
+def _walking_distance(track: Floats) -> float:
+    """Return how far a person moves in the image, in heights of the person [1].
+
+    A change of size counts as motion: that person walks towards the camera.
+    """
+    seen = track[_frames(track)]
+    middle = np.nanmean(seen, axis=1)
+    tall = np.nanmax(seen[..., 1], axis=1) - np.nanmin(seen[..., 1], axis=1)
+    usual = max(float(np.median(tall)), 1e-6)
+    low, high = np.quantile(np.column_stack([middle, tall]), [0.05, 0.95], axis=0)
+    return float(np.linalg.norm(high - low) / usual)
+
+
+def _rigid(rotation: ArrayLike, translation: ArrayLike) -> Rigid:
+    """Return the motion of OpenCV's arrays."""
+    return Rigid(
+        np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64).ravel()
+    )
+
+
+class Start(NamedTuple):
+    """Cameras, and the joints that they see."""
+
+    cameras: Camera
+    observed: Observations
+
+
+class _Pair(NamedTuple):
+    """The second camera's pose in the first one's axes, by the people whom both show."""
+
+    cameras: tuple[int, int]
+    pose: Rigid
+    people: tuple[tuple[int, int], ...]
+    """Tracks of the first and the second camera that show one person."""
+    worth: float
+    """Joints that agree, less where both cameras look along one line."""
+
+
+class Views:
+    """People in all images, on the plane at depth one."""
+
+    def __init__(self, lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> None:
+        self.records, self.names = lenses, [lens.id for lens in lenses]
+        self.lenses = Camera.stack([_camera(lens) for lens in lenses])
+        frames = tracks[0][0].shape[0]
+        some = sum(np.stack([_frames(one) for one in each]).any(axis=0) for each in tracks) >= 2
+        rows = np.flatnonzero(some)
+        if len(rows) < MIN_FRAMES:
+            raise refusal(
+                self.names, f"people in two cameras at once for {MIN_FRAMES} frames", f"{len(rows)}"
+            )
+        take = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_FRAMES)).round())
+        self.rows = rows[take.astype(np.int64)]
+        self.frames = frames
+        self.pixels = [[one[self.rows] for one in each] for each in tracks]
+        self.planes = [
+            [self.lenses[c].normalize(one) for one in each] for c, each in enumerate(self.pixels)
+        ]
+        self.limits = [
+            [
+                START_NOISE_M / STATURE[0] * _height(one) / float(self.lenses.focal[c, 0])
+                for one in each
+            ]
+            for c, each in enumerate(self.pixels)
+        ]
+
+    def starts(self) -> list[Start]:
+        """Return the cameras from the best pairs.
+
+        Raises:
+            InputError: no two cameras show one person, or a camera shows nobody of the others.
+        """
+        pairs = [self._pair(a, b) for a, b in combinations(range(len(self.names)), 2)]
+        good = sorted((one for one in pairs if one is not None), key=lambda one: -one.worth)
+        if not good:
+            raise refusal(
+                self.names,
+                f"two cameras that show one person for {MIN_FRAMES} frames",
+                "none whose joints agree",
+            )
+        errors: list[InputError] = []
+        found = []
+        for pair in good[:STARTS]:
+            try:
+                found.append(self._grow(pair))
+            except InputError as error:
+                errors.append(error)
+        if not found:
+            raise errors[0]
+        return found
+
+    def _pair(self, a: int, b: int) -> _Pair | None:
+        """Return the pose of b by its people; None if no person is in both cameras."""
+        import cv2  # late: it takes 0.2 s, and few commands need it
+
+        best: tuple[int, Floats] = (0, np.empty((0, 3)))
+        for i, j in np.ndindex(len(self.planes[a]), len(self.planes[b])):
+            one, other, limit = self._shared_joints(a, i, b, j)
+            if len(one) < MIN_FRAMES * len(JOINTS) // 2:
+                continue
+            some = np.arange(0, len(one), -(-len(one) // SAMPLE))
+            matrix, inlier = cv2.findEssentialMat(
+                one[some], other[some], np.eye(3), cv2.RANSAC, 0.9999, 2.0 * limit, DRAWS
+            )
+            share = 0.0 if inlier is None else float(inlier.mean())
+            if share >= MIN_AGREEMENT and share * len(one) > best[0]:
+                best = int(share * len(one)), np.asarray(matrix[:3], dtype=np.float64)
+        if not best[0]:
+            return None
+        people, ones, others = [], [], []
+        for i, j in self._same_people(a, b, best[1]):
+            one, other, _ = self._shared_joints(a, i, b, j)
+            people.append((i, j))
+            ones.append(one)
+            others.append(other)
+        if not people:
+            return None
+        count, rotation, way, _, space = cv2.recoverPose(
+            best[1],
+            np.concatenate(ones),
+            np.concatenate(others),
+            np.eye(3),
+            distanceThresh=1e3,
+        )
+        pose = _rigid(rotation, way)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points = (space[:3] / space[3]).T
+        back = points - pose.inverse().translation
+        cosine = (points * back).sum(axis=1) / (
+            np.linalg.norm(points, axis=1) * np.linalg.norm(back, axis=1)
+        )
+        parallel = float(np.nanmedian(np.abs(cosine)))
+        return _Pair((a, b), pose, tuple(people), count * float(np.sqrt(1.0 - parallel**2)))
+
+    def _shared_joints(self, a: int, i: int, b: int, j: int) -> tuple[Floats, Floats, float]:
+        """Return joints (n, 2) that two tracks both show, and how far they may be apart."""
+        one, other = self.planes[a][i], self.planes[b][j]
+        both = np.isfinite(one[..., 0]) & np.isfinite(other[..., 0])
+        limit = 0.5 * (self.limits[a][i] + self.limits[b][j])
+        return one[both], other[both], limit
+
+    def _same_people(self, a: int, b: int, matrix: Floats) -> list[tuple[int, int]]:
+        """Return the tracks of two cameras that agree, each with at most one."""
+        from scipy.optimize import linear_sum_assignment
+
+        share = np.zeros((len(self.planes[a]), len(self.planes[b])))
+        for i, j in np.ndindex(share.shape):
+            one, other, limit = self._shared_joints(a, i, b, j)
+            if len(one) < len(JOINTS):
+                continue
+            left = np.column_stack([one, np.ones(len(one))]) @ matrix.T
+            right = np.column_stack([other, np.ones(len(other))]) @ matrix
+            product = (left[:, :2] * other).sum(axis=1) + left[:, 2]
+            slope = (left[:, :2] ** 2).sum(axis=1) + (right[:, :2] ** 2).sum(axis=1)
+            share[i, j] = float((np.abs(product) < 2.0 * limit * np.sqrt(slope)).mean())
+        chosen = zip(*linear_sum_assignment(-share), strict=True)
+        return [(int(i), int(j)) for i, j in chosen if share[i, j] >= MIN_AGREEMENT]
+
+    def _grow(self, pair: _Pair) -> Start:
+        """Return all cameras, added to a pair one by one, the one with the most joints first.
+
+        Raises:
+            InputError: a camera shows nobody of the others.
+        """
+        a, b = pair.cameras
+        poses = {a: Rigid(np.eye(3), np.zeros(3)), b: pair.pose}
+        shown = [{a: i, b: j} for i, j in pair.people]
+        poses = self._refine(poses, shown)
+        while len(poses) < len(self.names):
+            joints = [self._joints(person, poses) for person in shown]
+            rest = [c for c in range(len(self.names)) if c not in poses]
+            candidates = {c: self._resect(c, joints) for c in rest}
+            chosen = max(rest, key=lambda c: candidates[c][0])
+            agree, pose, tracks = candidates[chosen]
+            if not agree or pose is None:
+                raise refusal(
+                    [self.names[c] for c in rest],
+                    f"a person for {MIN_FRAMES} frames whom the others show at the same time",
+                    "none whose joints agree",
+                )
+            poses[chosen] = pose
+            for person, track in tracks.items():
+                shown[person][chosen] = track
+            poses = self._refine(poses, shown)
+        order = list(range(len(self.names)))
+        cameras = self._place(order, poses)
+        return Start(cameras, self._observe(order, cameras, shown, poses))
+
+    def _place(self, order: list[int], poses: dict[int, Rigid]) -> Camera:
+        """Return the batch of some cameras with their poses."""
+        rotation = np.stack([poses[c].rotation for c in order])
+        translation = np.stack([poses[c].translation for c in order])
+        return replace(self.lenses[np.array(order)], cam_from_world=Rigid(rotation, translation))
+
+    def _refine(self, poses: dict[int, Rigid], shown: list[dict[int, int]]) -> dict[int, Rigid]:
+        """Return the poses adjusted to all people that these cameras show."""
+        order = list(poses)
+        cameras = self._place(order, poses)
+        lenses = [self.records[c] for c in order]
+        observed = self._observe(order, cameras, shown, poses)
+        adjusted = adjust(cameras, observed, lenses, KeypointNoise()).cameras.cam_from_world
+        return {c: adjusted[k] for k, c in enumerate(order)}
+
+    def _joints(self, person: dict[int, int], poses: dict[int, Rigid]) -> Floats:
+        """Return a person's joints (frames, 12, 3) from all cameras; NaN with fewer than two."""
+        rows = []
+        for camera, track in person.items():
+            at = self.planes[camera][track]
+            matrix = np.column_stack([poses[camera].rotation, poses[camera].translation])
+            both = at[..., None] * matrix[2] - matrix[:2]
+            rows.append(np.where(np.isfinite(at[..., :1, None]), both, 0.0))
+        system = np.concatenate(rows, axis=2)
+        seen = (np.abs(system).sum(axis=-1) > 0.0).sum(axis=-1)
+        last = np.linalg.svd(system, full_matrices=True)[2][..., -1, :]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            joints = last[..., :3] / last[..., 3:]
+            front = seen >= 4
+            for camera in person:
+                depth = joints @ poses[camera].rotation[2] + poses[camera].translation[2]
+                front &= depth > 0.0
+        return np.where(front[..., None], joints, np.nan)
+
+    def _resect(
+        self, camera: int, joints: list[Floats]
+    ) -> tuple[int, Rigid | None, dict[int, int]]:
+        """Return agreeing joints, a camera's pose by people in space, and the people's tracks."""
+        import cv2
+        from scipy.optimize import linear_sum_assignment
+
+        best: tuple[int, Rigid | None] = (0, None)
+        shape = (len(joints), len(self.planes[camera]))
+        for person, track in np.ndindex(shape):
+            at, places = self._meet(camera, track, joints[person])
+            if len(at) < MIN_FRAMES * len(JOINTS) // 2:
+                continue
+            limit = 2.0 * self.limits[camera][track]
+            some = np.arange(0, len(at), -(-len(at) // SAMPLE))
+            good, turn, way, inlier = cv2.solvePnPRansac(
+                places[some],
+                at[some],
+                np.eye(3),
+                np.zeros(5),
+                iterationsCount=DRAWS,
+                reprojectionError=limit,
+            )
+            share = len(inlier) / len(some) if good and inlier is not None else 0.0
+            if share >= MIN_AGREEMENT and share * len(at) > best[0]:
+                best = int(share * len(at)), _rigid(cv2.Rodrigues(turn)[0], way)
+        if best[1] is None:
+            return 0, None, {}
+        near_share, total = np.zeros(shape), np.zeros(shape)
+        for person, track in np.ndindex(shape):
+            at, places = self._meet(camera, track, joints[person])
+            if len(at) < len(JOINTS):
+                continue
+            there = places @ best[1].rotation.T + best[1].translation
+            off = np.linalg.norm(there[:, :2] / there[:, 2:] - at, axis=1)
+            near = (off < 2.0 * self.limits[camera][track]) & (there[:, 2] > 0.0)
+            near_share[person, track], total[person, track] = near.mean(), near.sum()
+        chosen = [
+            (int(p), int(t))
+            for p, t in zip(*linear_sum_assignment(-near_share), strict=True)
+            if near_share[p, t] >= MIN_AGREEMENT
+        ]
+        return int(sum(total[pair] for pair in chosen)), best[1], dict(chosen)
+
+    def _meet(self, camera: int, track: int, joints: Floats) -> tuple[Floats, Floats]:
+        """Return where a track shows joints (n, 2), and their places (n, 3)."""
+        at = self.planes[camera][track]
+        both = np.isfinite(at[..., 0]) & np.isfinite(joints[..., 0])
+        return at[both], joints[both]
+
+    def _observe(
+        self,
+        order: list[int],
+        cameras: Camera,
+        shown: list[dict[int, int]],
+        poses: dict[int, Rigid],
+    ) -> Observations:
+        """Return the keypoints of all joints that two cameras show, without gross errors.
+
+        Args:
+            order: numbers of the cameras; an observation's camera is its place here.
+            cameras: these cameras.
+            shown: each person's track by camera.
+            poses: the cameras' poses.
+        """
+        joints = np.stack([self._joints(person, poses) for person in shown], axis=1)
+        image = np.full((*joints.shape[:-1], len(order), 2), np.nan)
+        noise = np.full(image.shape[:-1], np.nan)
+        for k, camera in enumerate(order):
+            places = cameras[k].project(joints.reshape(-1, 3)).reshape(*joints.shape[:-1], 2)
+            for p, person in enumerate(shown):
+                if camera not in person:
+                    continue
+                track = self.pixels[camera][person[camera]]
+                noise[:, p, :, k] = np.hypot(NOISE[0], NOISE[1] * _height(track) / STATURE[0])
+                off = np.linalg.norm(places[:, p] - track, axis=-1)
+                near = off < GROSS * noise[:, p, :, k]
+                image[:, p, :, k] = np.where(near[..., None], track, np.nan)
+        seen = np.isfinite(image[..., 0])
+        seen &= (seen.sum(axis=-1) >= 2)[..., None]
+        frame, person_of, joint, camera_of = np.nonzero(seen)
+        used = seen.any(axis=-1)
+        number = np.cumsum(used).reshape(used.shape) - 1
+        return Observations(
+            points=joints[used],
+            point_of=number[frame, person_of, joint],
+            camera_of=camera_of,
+            frame_of=self.rows[frame],
+            person_of=person_of,
+            joint_of=joint,
+            image=image[seen],
+            noise=noise[seen],
+        )
+
+
+def adjust(
+    cameras: Camera,
+    observed: Observations,
+    lenses: Sequence[LensCalibration],
+    noise: KeypointNoise,
+    *,
+    fixed: bool = False,
+    covariance: bool = False,
+) -> Solution:
+    """Return cameras and joints adjusted to the keypoints.
+
+    The first camera stays where it is, and the second one at its distance: no keypoint tells the
+    world frame.
+
+    Args:
+        cameras: (cameras,) batch at the start.
+        observed: keypoints.
+        lenses: prior of focal lengths and principal points.
+        noise: scale and correlation of the keypoints' errors.
+        fixed: adjust the joints alone.
+        covariance: compute the covariance of the cameras.
+
+    Raises:
+        InputError: the keypoints do not determine the cameras.
+    """
+    count = len(lenses)
+    free = np.zeros((count, 12), dtype=np.bool_)
+    information = np.zeros((count, 12, 12))
+    for c, lens in enumerate(lenses):
+        free[c, :9] = True
+        # Offsets count from the lens, also where the start has another focal length.
+        known = np.diag(
+            [1e-9] * 6
+            + [(lens.focal_px / lens.focal_std_px) ** 2]
+            + [lens.principal_point_std_px**-2.0] * 2
+            + [1.0] * 3
+        )
+        information[c] = known
+    free[0, :6] = False
+    away = cameras[1].cam_from_world.rotation @ (cameras.center[0] - cameras.center[1])
+    away = away / np.linalg.norm(away)
+    information[1, 3:6, 3:6] += FIXED * np.outer(away, away)
+    if fixed:
+        information += FIXED * FIXED * np.eye(12)
+    variance = (observed.noise * noise.scale) ** 2 * noise.correlation
+    problem = Problem(
+        cameras=cameras,
+        free=free,
+        camera_information=information,
+        points=observed.points,
+        point_information=np.zeros(len(observed.points)),
+        point_of=observed.point_of,
+        camera_of=observed.camera_of,
+        image=observed.image,
+        weight=1.0 / variance,
+        scale=np.full(len(variance), LOSS_SCALE / np.sqrt(noise.correlation)),
+        names=tuple(lens.id for lens in lenses),
+    )
+    return solve(problem, SOLVER, covariance=covariance)

@@ -1,0 +1,243 @@
+"""USD file (.usdc) of a clip: skinned bodies that move, cameras and the pitch (extra `usd`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from data_contracts.arrays import Floats
+from worldpose.body import SKELETONS, BodyModel
+from worldpose.errors import InputError, UsageError
+from worldpose.formats.files import whole_file
+from worldpose.formats.gltf_file import FACING, INFLUENCES, AnimatedBody, body_frames
+from worldpose.geometry import Camera
+
+APERTURE_MM: Final = 36.0
+"""Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length counts."""
+
+
+def write_usd(
+    path: Path,
+    model: BodyModel,
+    people: Sequence[AnimatedBody],
+    fps: float,
+    *,
+    cameras: Mapping[str, Camera],
+    markings: Sequence[Floats],
+    notes: Mapping[str, str],
+    surface: bool = True,
+) -> None:
+    """Write a clip as one .usdc file, whole or not at all.
+
+    The stage is in metres, z up, as the world is; a time code is a frame. Each person is a SkelRoot
+    with a skeleton of 24 joints, its animation, and a mesh with the person's shape and the model's
+    skinning weights, without pose correctives. A person who is missing is invisible. Cameras have
+    focal length, principal point and pose, and their distortion as custom data.
+
+    Args:
+        path: the file.
+        model: body model of the poses.
+        people: bodies over the same frames.
+        fps: frames per second.
+        cameras: cameras by name, single or one per frame, with NaN where unknown.
+        markings: lines on the pitch (points, 3) [m], world.
+        notes: texts for the stage's custom data; `licence` is among them.
+        surface: write the surface of bodies, not only their joints.
+
+    Raises:
+        InputError: no person has a body.
+        UsageError: the library is not installed.
+    """
+    present = [person for person in people if body_frames(person.poses).any()]
+    if not present:
+        raise InputError(
+            str(path),
+            expected="a person with a fitted body",
+            found="none",
+            todo="Run the match up to body_fitting, or export joints: --format c3d or csv.",
+        )
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+    except ImportError as error:
+        raise UsageError(
+            "--format usd",
+            expected="worldpose with the extra usd",
+            found="no usd-core",
+            todo="Install it: pip install 'worldpose[usd]'.",
+        ) from error
+    pxr = (Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt)
+    with whole_file(path) as draft:
+        stage = Usd.Stage.CreateNew(str(draft))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(max(int(person.poses.batch_shape[0]) for person in present) - 1)
+        world = UsdGeom.Xform.Define(stage, "/world")
+        stage.SetDefaultPrim(world.GetPrim())
+        stage.GetRootLayer().customLayerData = dict(notes)
+        writer = _Writer(stage, pxr, model)
+        for number, person in enumerate(present):
+            writer.add_person(person, number, surface=surface)
+        for name, camera in cameras.items():
+            writer.add_camera(name, camera)
+        for number, line in enumerate(markings):
+            writer.add_line(number, line)
+        stage.GetRootLayer().Save()
+
+
+class _Writer:
+    """Prims of people, cameras and pitch below `/world`."""
+
+    def __init__(self, stage: Any, pxr: tuple[Any, ...], model: BodyModel) -> None:  # noqa: ANN401
+        self.stage, self.model = stage, model
+        self.Gf, self.Sdf, self.Usd, self.UsdGeom, self.UsdSkel, self.Vt = pxr
+        names = SKELETONS["smpl24"]
+        self.joints = [names[0]]
+        for joint in range(1, len(names)):
+            self.joints.append(f"{self.joints[model.parents[joint]]}/{names[joint]}")
+
+    def _matrix(self, place: Floats, rotation: Floats | None = None) -> Any:  # noqa: ANN401
+        """Return a matrix for row vectors, as USD has them."""
+        matrix = np.eye(4)
+        if rotation is not None:
+            matrix[:3, :3] = rotation.T
+        matrix[3, :3] = place
+        return self.Gf.Matrix4d(matrix.tolist())
+
+    def add_person(self, person: AnimatedBody, number: int, *, surface: bool) -> None:
+        """Add a person's skeleton, motion and surface."""
+        model = self.model
+        there = body_frames(person.poses)
+        rows = np.flatnonzero(there)
+        poses = person.poses[rows]
+        betas = poses.betas[0]
+        rest = model.joint_template + model.joint_directions @ betas
+        place = f"/world/{person.name}"
+        root = self.UsdSkel.Root.Define(self.stage, place)
+        root.GetPrim().SetCustomData(dict(person.about))
+        skeleton = self.UsdSkel.Skeleton.Define(self.stage, f"{place}/skeleton")
+        skeleton.CreateJointsAttr(self.joints)
+        skeleton.CreateBindTransformsAttr([self._matrix(one) for one in rest])
+        parents = model.parents
+        local = np.array([rest[j] - rest[parents[j]] if j else rest[0] for j in range(len(rest))])
+        skeleton.CreateRestTransformsAttr([self._matrix(one) for one in local])
+        motion = self.UsdSkel.Animation.Define(self.stage, f"{place}/motion")
+        motion.CreateJointsAttr(self.joints)
+        self._animate(motion, rows, local, rest[0] + poses.transl, model.articulate(poses))
+        self.UsdSkel.BindingAPI.Apply(root.GetPrim())
+        binding = self.UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
+        binding.CreateAnimationSourceRel().SetTargets([motion.GetPrim().GetPath()])
+        if not there.all():
+            seen = self.UsdGeom.Imageable(root.GetPrim()).CreateVisibilityAttr()
+            for frame in (0, *(np.flatnonzero(np.diff(there)) + 1).tolist()):
+                shown = self.UsdGeom.Tokens.inherited if there[frame] else "invisible"
+                seen.Set(shown, int(frame))
+        if surface:
+            self._add_surface(place, betas, number)
+
+    def _animate(
+        self,
+        motion: Any,  # noqa: ANN401
+        rows: np.ndarray[Any, Any],
+        local: Floats,
+        pelvis: Floats,
+        posed: Any,  # noqa: ANN401
+    ) -> None:
+        """Write translations, rotations and scales of all joints at each frame."""
+        shape = posed.local_rotations.shape[:2]
+        turns = Rotation.from_matrix(posed.local_rotations.reshape(-1, 3, 3)).as_quat()
+        turns = turns.reshape(*shape, 4)[..., [3, 0, 1, 2]].astype(np.float32)
+        scales = self.Vt.Vec3hArray([self.Gf.Vec3h(1.0, 1.0, 1.0)] * shape[1])
+        motion.CreateScalesAttr(scales)
+        translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
+        for row, frame in enumerate(rows.tolist()):
+            moved = local.astype(np.float32)
+            moved[0] = pelvis[row]
+            translations.Set(self.Vt.Vec3fArray.FromNumpy(moved), frame)
+            quats = [self.Gf.Quatf(*(float(n) for n in quat)) for quat in turns[row]]
+            rotations.Set(self.Vt.QuatfArray(quats), frame)
+
+    def _add_surface(self, place: str, betas: Floats, number: int) -> None:
+        """Add the mesh of a person in the pose in which the skeleton is bound."""
+        model = self.model
+        points = (model.template + model.shape_directions @ betas).astype(np.float32)
+        mesh = self.UsdGeom.Mesh.Define(self.stage, f"{place}/surface")
+        mesh.CreatePointsAttr(self.Vt.Vec3fArray.FromNumpy(points))
+        faces = model.faces.astype(np.int32)
+        mesh.CreateFaceVertexCountsAttr(
+            self.Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32))
+        )
+        mesh.CreateFaceVertexIndicesAttr(self.Vt.IntArray.FromNumpy(faces.ravel()))
+        mesh.CreateSubdivisionSchemeAttr(self.UsdGeom.Tokens.none)
+        hue = number * 0.618 % 1.0
+        colour = 0.65 + 0.2 * np.cos(2.0 * np.pi * (hue - np.array([0.0, 1.0, 2.0]) / 3.0))
+        mesh.CreateDisplayColorAttr([self.Gf.Vec3f(*(float(n) for n in colour))])
+        order = np.argsort(-model.weights, axis=1, kind="stable")[:, :INFLUENCES]
+        weights = np.take_along_axis(model.weights, order, axis=1)
+        weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+        binding = self.UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+        binding.CreateSkeletonRel().SetTargets([self.Sdf.Path(f"{place}/skeleton")])
+        binding.CreateJointIndicesPrimvar(False, INFLUENCES).Set(
+            self.Vt.IntArray.FromNumpy(order.astype(np.int32).ravel())
+        )
+        binding.CreateJointWeightsPrimvar(False, INFLUENCES).Set(
+            self.Vt.FloatArray.FromNumpy(weights.ravel())
+        )
+        binding.CreateGeomBindTransformAttr(self.Gf.Matrix4d(1.0))
+
+    def add_camera(self, name: str, camera: Camera) -> None:
+        """Add a single or a moving camera."""
+        prim = self.UsdGeom.Camera.Define(self.stage, f"/world/{_prim_name(name)}")
+        if not camera.batch_shape:
+            camera = Camera.stack([camera])
+        pose = camera.cam_from_world
+        numbers = [camera.focal, pose.rotation.reshape(-1, 9), pose.translation]
+        rows = np.flatnonzero(np.isfinite(np.concatenate(numbers, axis=-1)).all(axis=-1))
+        if not len(rows):
+            return
+        known = camera[rows]
+        width, height = (float(n) for n in known.image_size[0])
+        per_pixel = APERTURE_MM / width
+        prim.CreateHorizontalApertureAttr(APERTURE_MM)
+        # Pixels may be oblong: USD has one focal length and two apertures.
+        tall = float(np.median(known.focal[:, 0] / known.focal[:, 1]))
+        prim.CreateVerticalApertureAttr(per_pixel * height * tall)
+        center = (known.principal_point[0] + 0.5 - 0.5 * np.array([width, height])) * per_pixel
+        prim.CreateHorizontalApertureOffsetAttr(-float(center[0]))
+        prim.CreateVerticalApertureOffsetAttr(float(center[1]) * tall)
+        prim.CreateClippingRangeAttr(self.Gf.Vec2f(0.1, 1000.0))
+        prim.GetPrim().SetCustomData(
+            {
+                "image_size_px": self.Gf.Vec2i(int(width), int(height)),
+                "principal_point_px": self.Gf.Vec2d(*known.principal_point[0].tolist()),
+                "distortion_k1_k2_p1_p2_k3": self.Vt.DoubleArray(known.distortion[0].tolist()),
+            }
+        )
+        placed = self.UsdGeom.Xformable(prim).AddTransformOp()
+        focal = prim.CreateFocalLengthAttr()
+        turns = known.cam_from_world.rotation.swapaxes(-1, -2) @ FACING
+        for row, frame in enumerate(rows.tolist()):
+            time = frame if len(camera.focal) > 1 else self.Usd.TimeCode.Default()
+            placed.Set(self._matrix(known.center[row], turns[row]), time)
+            focal.Set(float(known.focal[row, 0]) * per_pixel, time)
+
+    def add_line(self, number: int, line: Floats) -> None:
+        """Add a marking of the pitch as a line 0.12 m wide."""
+        curve = self.UsdGeom.BasisCurves.Define(self.stage, f"/world/pitch/marking_{number:02d}")
+        curve.CreateTypeAttr(self.UsdGeom.Tokens.linear)
+        curve.CreatePointsAttr(self.Vt.Vec3fArray.FromNumpy(line.astype(np.float32)))
+        curve.CreateCurveVertexCountsAttr([len(line)])
+        curve.CreateWidthsAttr([0.12])
+        curve.SetWidthsInterpolation(self.UsdGeom.Tokens.constant)
+
+
+def _prim_name(name: str) -> str:
+    """Return a name that USD allows: letters, digits and underscores, not a digit first."""
+    allowed = "".join(one if one.isalnum() and one.isascii() else "_" for one in name)
+    return f"camera_{allowed}" if not allowed or allowed[0].isdigit() else allowed
