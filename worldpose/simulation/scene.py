@@ -314,7 +314,8 @@ def detect_feet(scene: Scene, scenario: Scenario, seed: int) -> Scene:
     observations = dict(scene.observations)
     for name, camera in scene.cameras.items():
         people, person = scene.observations[name], scene.identities[name].person
-        times = (people.frame + scene.clocks[name]) / scenario.fps
+        times = people.frame.astype(np.float64) / scenario.fps
+        times += scene.clocks[name] / scenario.fps
         poses = scene.crowd.poses(times)
         places = feet(poses)
         turned = model.articulate(poses).rotations[..., segment, :, :]
