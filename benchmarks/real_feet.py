@@ -84,7 +84,7 @@ def fit(placed: Triangulation, fps: float) -> BodyFit:
     return fit_bodies(MODEL, evidence, BodyFittingSettings())
 
 
-def perceived(bodies: BodyFit) -> Floats:
+def perceived_body(bodies: BodyFit) -> Floats:
     """Return joints and feet (frames, 23, 3) [m] of the only person, as the detector sees them."""
     joints = perceived_joints(bodies.joints, bodies.offsets)
     points = fold_keypoints(MODEL, FEET)(bodies.parameters)
@@ -118,8 +118,8 @@ def main() -> None:
         placed = reconstruct_joints(cameras, seen.assign_people(index), fps, settings).triangulation
         assert placed.extra is not None
         points = np.concatenate([placed.joints, placed.extra.joints], axis=2)[:, 0]
-        without = perceived(fit(replace(placed, extra=None), fps))
-        sides = (points, without, perceived(fit(placed, fps)))
+        without = perceived_body(fit(replace(placed, extra=None), fps))
+        sides = (points, without, perceived_body(fit(placed, fps)))
         for name, side in zip(names, sides, strict=True):
             found[name].append(distances(cameras[c], side, seen, c))
     print("\nleft-out cameras: median [px] and [mm], 90 % [mm]")
@@ -138,8 +138,8 @@ def main() -> None:
     points = np.concatenate([placed.joints, placed.extra.joints], axis=2)[:, 0]
     both = {
         "triangulated": points,
-        "bodies without feet": perceived(fit(replace(placed, extra=None), fps)),
-        "bodies with feet": perceived(fit(placed, fps)),
+        "bodies without feet": perceived_body(fit(replace(placed, extra=None), fps)),
+        "bodies with feet": perceived_body(fit(placed, fps)),
     }
     pairs = {"shank": (13, 15), "ankle to heel": (15, 19), "heel to big toe": (19, 17)}
     print("\nlengths, mean and standard deviation over time [mm], left and right")

@@ -1,4 +1,4 @@
-"""Points besides COCO-17 as evidence about bodies: heels and toes.
+"""Points besides COCO-17 as evidence about bodies: heels, toes and landmarks of the surface.
 
 A point is a vertex of the body model. A detector's point lies beside it, by an offset that is fixed
 to the segment of the body, the same for all persons and mirrored left to right: shoes, and another
@@ -18,7 +18,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.keypoints import JOINT_NAMES, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_NAMES, VERTEX_OF_POINT, point_segments
 from worldpose.body.model import SMPL_VERTICES
 from worldpose.body_fitting.objective import Evidence
 from worldpose.body_fitting.solver import Shapes, Solver
@@ -79,12 +79,6 @@ def known_points(model: BodyModel, extra: ExtraJoints | None) -> ExtraJoints | N
     )
 
 
-def segments(model: BodyModel, points: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the joint that moves each point most (points,)."""
-    vertices = [VERTEX_OF_POINT[point] for point in points]
-    return np.asarray(model.weights[vertices].argmax(axis=-1), dtype=np.int64)
-
-
 def with_points(solver: Solver, points: tuple[str, ...]) -> Solver:
     """Return the solver of poses that also knows these points, and bends ankles and toes."""
     chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
@@ -93,7 +87,7 @@ def with_points(solver: Solver, points: tuple[str, ...]) -> Solver:
 
 def move_points(solver: Solver, points: tuple[str, ...], offsets: Floats) -> Solver:
     """Return the solver of `with_points` with the points where the detector has them."""
-    its = segments(solver.chained.model, points)
+    its = point_segments(solver.chained.model, points)
     return replace(solver, chained=solver.chained.move_points(len(COCO17), its, offsets))
 
 
@@ -108,7 +102,7 @@ def perceived_points(
         parameters: bodies (...).
         offsets: (points, 3) [m], as in `ExtraFit`.
     """
-    turned = model.articulate(parameters).rotations[..., segments(model, points), :, :]
+    turned = model.articulate(parameters).rotations[..., point_segments(model, points), :, :]
     moved: Floats = np.einsum("...pab,pb->...pa", turned, offsets)
     return moved
 
@@ -141,7 +135,7 @@ def learn_point_offsets(
         pose, _ = moved.solve_poses(part, shapes.people[person], shapes.offsets, fps)
         parameters = pose.parameters()
         places = solver.chained.differentiate(parameters).keypoints[:, len(COCO17) :]
-        turned = model.articulate(parameters).rotations[:, segments(model, points)]
+        turned = model.articulate(parameters).rotations[:, point_segments(model, points)]
         away: Floats = part.joints[:, len(COCO17) :] - places
         return np.asarray(np.einsum("fpba,fpb->fpa", turned, away))
 
@@ -157,7 +151,7 @@ def learn_point_offsets(
         each = np.array(medians)
         for place in range(len(points)):
             values = each[:, place]
-            other = _mirrored(points, place)
+            other = _mirror_place(points, place)
             if other is not None:
                 values = np.concatenate([values, each[:, other] * MIRROR])
             values = values[np.isfinite(values[:, 0])]
@@ -167,11 +161,11 @@ def learn_point_offsets(
     return offsets, variance
 
 
-def _mirrored(points: tuple[str, ...], place: int) -> int | None:
+def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
     """Return the place of a point's mirror image among the points."""
     name = points[place]
-    sides = ("left_", "right_") if name.startswith("left_") else ("right_", "left_")
-    other = name.replace(*sides, 1)
+    one, two = ("left_", "right_") if name.startswith("left_") else ("right_", "left_")
+    other = name.replace(one, two, 1)
     return points.index(other) if other != name and other in points else None
 
 
@@ -189,7 +183,7 @@ def feet_determined(
     model: BodyModel, points: tuple[str, ...], evidence: Evidence, fps: float
 ) -> NDArray[np.bool_]:
     """Return the frames in which points determine the left and right foot (frames, 2)."""
-    its = segments(model, points)
+    its = point_segments(model, points)
     known = evidence.known[:, len(COCO17) :]
     reach = round(FOOT_TIME_S * fps)
     determined = np.zeros((len(known), 2), dtype=np.bool_)

@@ -122,6 +122,21 @@ def test_feet_are_swapped_back_with_the_legs(clip):
     assert np.argwhere(changed).tolist() == [[10, 3, 1]]
 
 
+def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip):
+    _, plain, _, _ = clip
+    names = ("left_thigh_1", "right_thigh_1", "left_trunk_1", "right_trunk_1", "left_forearm_1")
+    rng = np.random.default_rng(2)
+    shape = (*plain.score.shape, len(names))
+    given = plain.add_points(names, rng.normal(size=(*shape, 2)), rng.uniform(0.1, 1.0, shape))
+    exchanged = np.zeros((60, 6, 2, 3), dtype=bool)
+    exchanged[4, 0, 0, 2] = True
+    exchanged[5, 0, 0] = True
+    found = undo_swaps(given, exchanged).extra_keypoints
+    one, all_ = given.extra_keypoints[4, 0, 0], given.extra_keypoints[5, 0, 0]
+    np.testing.assert_array_equal(found[4, 0, 0], one[[1, 0, 2, 3, 4]])
+    np.testing.assert_array_equal(found[5, 0, 0], all_[[1, 0, 3, 2, 4]])  # a lone point stays
+
+
 def test_they_follow_the_clock_correction_of_their_camera(clip):
     _, _, with_feet, _ = clip
     late = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
