@@ -1,6 +1,6 @@
 """Points besides COCO-17 as evidence about bodies: heels, toes and landmarks of the surface.
 
-A point is a vertex of the body model. A detector's point lies beside it, by an offset that is fixed
+A point is a vertex of the body model. A detector's point lies near it, at an offset that is fixed
 to the segment of the body, the same for all persons and mirrored left to right: shoes, and another
 definition. The offsets are learned from residuals, like those of joints.
 """
