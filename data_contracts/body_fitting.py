@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import FRAME
+from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
 from data_contracts.tracking import PERSON
+from data_contracts.triangulation import EXTRA_JOINTS
 
 
 def _pose_array(name: str, length: str, unit: str, about: str) -> ArrayLayout:
@@ -19,6 +20,20 @@ def _pose_array(name: str, length: str, unit: str, about: str) -> ArrayLayout:
         chunk_dim="frame",
     )
 
+
+EXTRA_BODIES = (
+    *EXTRA_JOINTS,
+    ArrayLayout(
+        name="extra_offsets",
+        dims=("point", "segment_axis"),
+        dtype="float64",
+        unit="m",
+        missing="none",
+        about="offset from the body's point to the detector's, in the axes of the point's segment, "
+        "the same for all persons",
+    ),
+)
+"""Points besides COCO-17 of the bodies; absent where no detector gave any."""
 
 BODY_FITTING = GroupLayout(
     stage="body_fitting",
@@ -89,6 +104,7 @@ BODY_FITTING = GroupLayout(
             missing="none",
             about="offset from the body's joint to the detector's joint, the same for all persons",
         ),
+        *EXTRA_BODIES,
     ),
     labels={
         "joint": COCO17,
@@ -96,5 +112,9 @@ BODY_FITTING = GroupLayout(
         "coordinate_": ("x", "y", "z"),
         "body_axis": ("forward", "left", "up"),
     },
-    attributes={"body_model": "name and version of the body model, such as open-neutral/2"},
+    attributes={
+        "body_model": "name and version of the body model, such as open-neutral/2",
+        **POINT_ATTRIBUTE,
+    },
+    optional=(*(array.name for array in EXTRA_BODIES), *POINT_ATTRIBUTE),
 )

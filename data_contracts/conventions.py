@@ -80,6 +80,17 @@ JOINT_GROUPS = {
 }
 """Parts of the names in `COCO17`, by group of joints."""
 
+FEET = (
+    "left_big_toe",
+    "left_small_toe",
+    "left_heel",
+    "right_big_toe",
+    "right_small_toe",
+    "right_heel",
+)
+"""Points of the feet, in the order of COCO-WholeBody: tips of the big toes, outer ends of the small
+toes, backs of the heels."""
+
 COCO17_SIGMAS = (
     0.026,
     0.025,

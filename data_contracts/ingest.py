@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
+from data_contracts.keypoints import (
+    EXTRA_ARRAYS,
+    FRAME,
+    KEYPOINT_ARRAYS,
+    KEYPOINT_LABELS,
+    OPTIONAL_POINTS,
+    POINT_ATTRIBUTE,
+)
 
 VIDEO_ARRAYS = (
     ArrayLayout(
@@ -37,11 +44,12 @@ INGEST = GroupLayout(
     stage="ingest",
     about="Given 2D poses of one camera, or the index of its video, by match frame.",
     coordinates=(FRAME,),
-    arrays=(*KEYPOINT_ARRAYS, *VIDEO_ARRAYS),
+    arrays=(*KEYPOINT_ARRAYS, *EXTRA_ARRAYS, *VIDEO_ARRAYS),
     labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or clip of its broadcast camera",
         "video": "null, or a video's time_base [1, units per second], size [px], missing_frames",
+        **POINT_ATTRIBUTE,
     },
-    optional=tuple(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)),
+    optional=(*(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)), *OPTIONAL_POINTS),
 )

@@ -44,6 +44,10 @@ class KeypointDetections(Generic[Array]):
             and for one image.
         detection_index: (frames, cameras, persons), each tracked person's detection; -1 = not seen.
             No frames before tracking.
+        points: names of points that the detector gave besides COCO-17, such as `FEET`.
+        extra_keypoints: (..., points, 2) [px], these points; NaN where not found. None without
+            points.
+        extra_confidence: (..., points) in (0, 1]; NaN where not found. None without points.
     """
 
     keypoints: Array
@@ -52,6 +56,9 @@ class KeypointDetections(Generic[Array]):
     score: Array
     frame: Integers = field(default_factory=_no_frames)
     detection_index: NDArray[np.integer] = field(default_factory=_no_people)
+    points: tuple[str, ...] = ()
+    extra_keypoints: Array | None = None
+    extra_confidence: Array | None = None
 
     @staticmethod
     def from_keypoints(
@@ -82,26 +89,30 @@ class KeypointDetections(Generic[Array]):
         """Return stored detections.
 
         Args:
-            stored: arrays by name, those of `KEYPOINT_ARRAYS` and `frame`.
+            stored: arrays by name, those of `KEYPOINT_ARRAYS` and `frame`; those of
+                `EXTRA_ARRAYS` with the names `point` if there are any.
         """
+        extra: dict[str, Any] = {}
+        if EXTRA_ARRAYS[0].name in stored:
+            extra = {each.name: np.asarray(stored[each.name]) for each in EXTRA_ARRAYS}
+            extra["points"] = tuple(map(str, np.asarray(stored["point"]).tolist()))
         return KeypointDetections(
             keypoints=np.asarray(stored["keypoints"]),
             confidence=np.asarray(stored["confidence"]),
             boxes=np.asarray(stored["boxes"]),
             score=np.asarray(stored["score"]),
             frame=np.asarray(stored["frame"]),
+            **extra,
         )
 
     @staticmethod
     def concatenate(parts: Sequence[KeypointDetections]) -> KeypointDetections:
-        """Return the detections of all parts, which have the same frames (and cameras)."""
+        """Return the detections of all parts, which have the same frames, cameras and points."""
         axis = parts[0].score.ndim - 1
-        return KeypointDetections(
-            keypoints=np.concatenate([part.keypoints for part in parts], axis=axis),
-            confidence=np.concatenate([part.confidence for part in parts], axis=axis),
-            boxes=np.concatenate([part.boxes for part in parts], axis=axis),
-            score=np.concatenate([part.score for part in parts], axis=axis),
-            frame=parts[0].frame,
+        each = [part.arrays() for part in parts]
+        return parts[0].with_arrays(
+            {name: np.concatenate([part[name] for part in each], axis=axis) for name in each[0]},
+            parts[0].frame,
         )
 
     @staticmethod
@@ -110,8 +121,10 @@ class KeypointDetections(Generic[Array]):
 
         Args:
             cameras: (frames, detections) for each camera. The result has every frame that a camera
-                has; a camera's missing frames and detections are NaN.
+                has; a camera's missing frames, detections and points are NaN.
         """
+        points = tuple(dict.fromkeys(point for each in cameras for point in each.points))
+        cameras = [each.with_points(points) for each in cameras]
         frame = np.unique(np.concatenate([each.frame for each in cameras]))
         most = max(each.score.shape[1] for each in cameras)
         stacked = {}
@@ -121,7 +134,7 @@ class KeypointDetections(Generic[Array]):
             for c, each in enumerate(cameras):
                 rows = np.searchsorted(frame, each.frame)
                 stacked[name][rows, c, : each.score.shape[1]] = each.arrays()[name]
-        return KeypointDetections(frame=frame, **stacked)
+        return cameras[0].with_arrays(stacked, frame)
 
     def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
         """Return the detections of some rows of the frame dimension, in memory."""
@@ -134,6 +147,11 @@ class KeypointDetections(Generic[Array]):
             detection_index=self.detection_index[frames]
             if len(self.detection_index)
             else self.detection_index,
+            points=self.points,
+            extra_keypoints=None if self.extra_keypoints is None else self.extra_keypoints[frames],
+            extra_confidence=None
+            if self.extra_confidence is None
+            else self.extra_confidence[frames],
         )
 
     def assign_people(self, detection_index: NDArray[np.integer]) -> KeypointDetections[Array]:
@@ -148,16 +166,17 @@ class KeypointDetections(Generic[Array]):
         self: KeypointDetections, detections: slice | NDArray[np.intp] | Flags
     ) -> KeypointDetections:
         """Return some detections of every frame (and camera), by index or by mask."""
-        return KeypointDetections(
-            keypoints=self.keypoints[..., detections, :, :],
-            confidence=self.confidence[..., detections, :],
-            boxes=self.boxes[..., detections, :],
-            score=self.score[..., detections],
-            frame=self.frame,
+        before = (slice(None),) * (self.score.ndim - 1)
+        return self.with_arrays(
+            {name: array[(*before, detections)] for name, array in self.arrays().items()},
+            self.frame,
         )
 
     def without(self: KeypointDetections, keypoints: Flags) -> KeypointDetections:
-        """Return the detections without the marked keypoints (..., 17), which become NaN."""
+        """Return the detections without the marked keypoints (..., 17), which become NaN.
+
+        Other points stay.
+        """
         return replace(
             self,
             keypoints=np.where(keypoints[..., None], np.nan, self.keypoints),
@@ -172,16 +191,79 @@ class KeypointDetections(Generic[Array]):
         for name, array in kept.arrays().items():
             padded[name] = np.full((len(frame), *array.shape[1:]), np.nan, dtype=np.float32)
             padded[name][row] = array
-        return KeypointDetections(frame=frame, **padded)
+        return self.with_arrays(padded, frame)
 
     def arrays(self: KeypointDetections) -> dict[str, AnyFloats]:
-        """Return the arrays by their names in a store, `KEYPOINT_ARRAYS`."""
-        return {
+        """Return the arrays by their names in a store, `KEYPOINT_ARRAYS` and `EXTRA_ARRAYS`."""
+        arrays = {
             "keypoints": self.keypoints,
             "confidence": self.confidence,
             "boxes": self.boxes,
             "score": self.score,
         }
+        if self.extra_keypoints is not None and self.extra_confidence is not None:
+            arrays["extra_keypoints"] = self.extra_keypoints
+            arrays["extra_confidence"] = self.extra_confidence
+        return arrays
+
+    def labels(self) -> dict[str, list[str]]:
+        """Return the attribute `POINT_ATTRIBUTE` of a result with these arrays."""
+        return {"point": list(self.points)} if self.points else {}
+
+    def with_arrays(
+        self: KeypointDetections, arrays: Mapping[str, AnyFloats], frame: Integers
+    ) -> KeypointDetections:
+        """Return detections of the same points with other arrays, named as those of `arrays`."""
+        every: dict[str, Any] = dict(arrays)
+        return KeypointDetections(frame=frame, points=self.points, **every)
+
+    def add_points(
+        self: KeypointDetections,
+        points: tuple[str, ...],
+        keypoints: AnyFloats,
+        confidence: AnyFloats,
+    ) -> KeypointDetections:
+        """Return the detections with these points besides COCO-17 and no others.
+
+        Args:
+            points: their names.
+            keypoints: (..., points, 2) [px]; NaN where not found.
+            confidence: (..., points); NaN where not found.
+        """
+        return replace(self, points=points, extra_keypoints=keypoints, extra_confidence=confidence)
+
+    def select_points(self: KeypointDetections) -> KeypointDetections:
+        """Return the points besides COCO-17 in place of the keypoints of COCO-17.
+
+        So they are triangulated like those.
+        """
+        keypoints, confidence = self.extra_keypoints, self.extra_confidence
+        if keypoints is None or confidence is None:
+            shape = self.score.shape
+            keypoints, confidence = np.empty((*shape, 0, 2)), np.empty((*shape, 0))
+        return replace(
+            self,
+            keypoints=keypoints,
+            confidence=confidence,
+            points=(),
+            extra_keypoints=None,
+            extra_confidence=None,
+        )
+
+    def with_points(self: KeypointDetections, points: tuple[str, ...]) -> KeypointDetections:
+        """Return the detections with exactly these points besides COCO-17; absent ones are NaN."""
+        if points == self.points:
+            return self
+        if not points:
+            return replace(self, points=(), extra_keypoints=None, extra_confidence=None)
+        keypoints = np.full((*self.score.shape, len(points), 2), np.nan, self.keypoints.dtype)
+        confidence = np.full(keypoints.shape[:-1], np.nan, self.confidence.dtype)
+        if self.extra_keypoints is not None and self.extra_confidence is not None:
+            both = [point for point in points if point in self.points]
+            to, of = [points.index(each) for each in both], [self.points.index(p) for p in both]
+            keypoints[..., to, :] = self.extra_keypoints[..., of, :]
+            confidence[..., to] = self.extra_confidence[..., of]
+        return replace(self, points=points, extra_keypoints=keypoints, extra_confidence=confidence)
 
 
 KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {
@@ -238,3 +320,30 @@ KEYPOINT_ARRAYS = (
     ),
 )
 """Arrays of the people one camera saw; the detection dimension is padded with missing values."""
+
+EXTRA_ARRAYS = (
+    ArrayLayout(
+        name="extra_keypoints",
+        dims=("frame", "detection", "point", "axis"),
+        dtype="float32",
+        unit="px",
+        missing="nan",
+        about="detected points besides COCO-17, such as heels and toes; attribute `point` names "
+        "them",
+        chunk_dim="frame",
+    ),
+    ArrayLayout(
+        name="extra_confidence",
+        dims=("frame", "detection", "point"),
+        dtype="float32",
+        unit="1",
+        missing="nan",
+        about="the detector's confidence of each of these points, in (0, 1]",
+        chunk_dim="frame",
+    ),
+)
+"""Arrays of points besides COCO-17; absent where the detector gave none."""
+POINT_ATTRIBUTE = {"point": "names of the points besides COCO-17; absent without any"}
+"""The attribute that labels the dimension of `EXTRA_ARRAYS`."""
+OPTIONAL_POINTS = (*(array.name for array in EXTRA_ARRAYS), *POINT_ATTRIBUTE)
+"""What is absent from a result without such points."""

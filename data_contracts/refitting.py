@@ -40,7 +40,7 @@ REFITTING = BODY_FITTING.model_copy(
                 chunk_dim="frame",
             ),
         ),
-        "optional": ("views",),
+        "optional": ("views", *BODY_FITTING.optional),
         "attributes": {
             **BODY_FITTING.attributes,
             "without_body": "people that no static camera films and who have no body: id to reason",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import FRAME
+from data_contracts.keypoints import FRAME, POINT_ATTRIBUTE
 from data_contracts.tracking import PERSON
 
 EXCHANGED_PARTS = {
@@ -13,6 +13,49 @@ EXCHANGED_PARTS = {
     "legs": ("hip", "knee", "ankle"),
 }
 """Parts of a body whose left and right sides a detector swaps together, and their joints."""
+
+EXTRA_JOINTS = (
+    ArrayLayout(
+        name="extra_joints",
+        dims=("frame", "person", "point", "coordinate"),
+        dtype="float64",
+        unit="m",
+        missing="nan",
+        about="points besides COCO-17, world; attribute `point` names them",
+        chunk_dim="frame",
+    ),
+    ArrayLayout(
+        name="extra_covariance",
+        dims=("frame", "person", "point", "coordinate", "coordinate_"),
+        dtype="float64",
+        unit="m^2",
+        missing="nan",
+        about="covariance of `extra_joints`, from the same errors as `covariance`",
+        chunk_dim="frame",
+    ),
+)
+"""Points besides COCO-17 in 3D; absent where no detector gave any."""
+EXTRA_TRIANGULATION = (
+    *EXTRA_JOINTS,
+    ArrayLayout(
+        name="extra_views",
+        dims=("frame", "person", "point"),
+        dtype="uint8",
+        unit="1",
+        missing="0",
+        about="number of inlier cameras of `extra_joints`",
+        chunk_dim="frame",
+    ),
+    ArrayLayout(
+        name="extra_common_bias",
+        dims=("point",),
+        dtype="float64",
+        unit="m",
+        missing="none",
+        about="as `common_bias`; `extra_covariance` contains it",
+    ),
+)
+"""The same as triangulation gives them."""
 
 TRIANGULATION = GroupLayout(
     stage="triangulation",
@@ -156,6 +199,7 @@ TRIANGULATION = GroupLayout(
             missing="none",
             about="standard error of `clock_late`",
         ),
+        *EXTRA_TRIANGULATION,
     ),
     labels={
         "joint": COCO17,
@@ -164,5 +208,6 @@ TRIANGULATION = GroupLayout(
         "coordinate": ("x", "y", "z"),
         "coordinate_": ("x", "y", "z"),
     },
-    attributes={"camera": "camera ids in the order of the camera dimension"},
+    attributes={"camera": "camera ids in the order of the camera dimension", **POINT_ATTRIBUTE},
+    optional=(*(array.name for array in EXTRA_TRIANGULATION), *POINT_ATTRIBUTE),
 )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, GroupLayout
@@ -37,7 +38,7 @@ from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
-from worldpose.triangulation import undo_swaps
+from worldpose.triangulation import ExtraJoints, undo_swaps
 
 
 @unit_task
@@ -88,6 +89,7 @@ class ClipPeople:
         shared_covariance: (frames, persons, 3, 3) [m^2], the part of it that moves all joints
             together.
         common_bias: (17,) per axis, systematic error shared by all views [m]; in `covariance`.
+        extra: points besides COCO-17, triangulated; None without any.
     """
 
     clip: ClipInputs
@@ -97,6 +99,7 @@ class ClipPeople:
     covariance: Floats
     shared_covariance: Floats
     common_bias: Floats
+    extra: ExtraJoints | None
 
 
 def open_people(store: Store, work: Work) -> ClipPeople:
@@ -113,6 +116,20 @@ def open_people(store: Store, work: Work) -> ClipPeople:
         placed["covariance"].values,
         placed["shared_covariance"].values,
         placed["common_bias"].values,
+        extra_joints(placed),
+    )
+
+
+def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
+    """Return the points besides COCO-17 of a result of triangulation; None without any."""
+    if "extra_joints" not in placed:
+        return None
+    return ExtraJoints(
+        tuple(placed["point"].values.tolist()),
+        placed["extra_joints"].values,
+        placed["extra_covariance"].values,
+        placed["extra_views"].values,
+        placed["extra_common_bias"].values,
     )
 
 
@@ -145,6 +162,7 @@ def fit_people(
             monocular_poses=monocular_poses,
             common_bias=people.common_bias,
             shared_covariance=people.shared_covariance,
+            extra=people.extra,
         ),
         settings,
         ground,
@@ -177,6 +195,15 @@ def publish_fit(
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Write bodies, the arrays in `further`, the group's other attributes, and their metrics."""
+    extra: dict[str, NDArray[Any]] = {}
+    points: dict[str, list[str]] = {}
+    if fit.extra is not None:
+        points = {"point": list(fit.extra.points)}
+        extra = {
+            "extra_joints": fit.extra.joints,
+            "extra_covariance": fit.extra.covariance,
+            "extra_offsets": fit.extra.offsets,
+        }
     result.write(
         layout,
         arrays={
@@ -190,10 +217,11 @@ def publish_fit(
             "filled": fit.filled,
             "guided": fit.guided,
             "joint_offsets": fit.offsets,
+            **extra,
             **(further or {}),
         },
         coordinates={"frame": people.detections.frame, "person": people.person},
-        attributes={"body_model": model.name, **(attributes or {})},
+        attributes={"body_model": model.name, **points, **(attributes or {})},
     )
     far = far_offsets(fit.offsets, people.common_bias)
     if far:

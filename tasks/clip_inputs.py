@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import ClipArray, Integers
-from data_contracts.keypoints import KeypointDetections
+from data_contracts.keypoints import EXTRA_ARRAYS, KeypointDetections
 from data_contracts.redetection import redetection_name
 from data_contracts.work import Work
 from tasks.unit import open_input
@@ -319,6 +319,11 @@ def _make_inputs(
     sources: dict[str, Any] = work.recipe.sources
     camera_ids = tuple(sources["cameras"])
     cameras, covariance, surface = _load_cameras(store, work, camera_ids)
+    seen, points = _align_points(seen)
+    extra = [
+        StoredArray(seen, array.name, redetected=redetected) if points else None
+        for array in EXTRA_ARRAYS
+    ]
     return ClipInputs(
         camera_ids=camera_ids,
         cameras=cameras,
@@ -329,10 +334,40 @@ def _make_inputs(
             boxes=StoredArray(seen, "boxes", redetected=redetected),
             score=StoredArray(seen, "score", redetected=redetected),
             frame=frame,
+            points=points,
+            extra_keypoints=extra[0],
+            extra_confidence=extra[1],
         ),
         surface=surface,
         fps=float(sources["fps"]),
     )
+
+
+def _align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[str, ...]]:
+    """Return the detections of all cameras with the same points besides COCO-17, and their names.
+
+    A camera without a point that another has gets NaN.
+    """
+    given = [
+        tuple(clip["point"].values.tolist()) if EXTRA_ARRAYS[0].name in clip else ()
+        for clip in seen
+    ]
+    points = tuple(dict.fromkeys(point for each in given for point in each))
+    aligned = []
+    for clip, own in zip(seen, given, strict=True):
+        if own == points:
+            aligned.append(clip)
+            continue
+        empty = np.broadcast_to(
+            np.float32(np.nan), (clip.sizes["frame"], clip.sizes["detection"], len(points), 2)
+        )
+        filled = {
+            array.name: (array.dims, empty[..., 0] if array.dims[-1] == "point" else empty)
+            for array in EXTRA_ARRAYS
+        }
+        whole = clip.reindex(point=list(points)) if own else clip.assign(filled)
+        aligned.append(whole.assign_coords(point=list(points)))
+    return aligned, points
 
 
 def open_venue(store: Store, work: Work, camera_ids: Sequence[str]) -> Venue:

@@ -106,11 +106,13 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
     report = finder.report
     return _Found(
-        KeypointDetections(
-            frame=np.arange(
-                sources["first_frame"], sources["first_frame"] + sources["frame_count"]
-            ),
-            **{name: values[:, :most] for name, values in spool.arrays().items()},
+        KeypointDetections.from_arrays(
+            {
+                "frame": np.arange(
+                    sources["first_frame"], sources["first_frame"] + sources["frame_count"]
+                ),
+                **{name: values[:, :most] for name, values in spool.arrays().items()},
+            }
         ),
         stretches(np.array(report.unreadable, dtype=np.int64)),
         {

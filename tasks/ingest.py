@@ -42,7 +42,7 @@ def _write_observations(result: ResultWriter, work: Work) -> None:
         INGEST,
         arrays=observations.arrays(),
         coordinates={"frame": observations.frame},
-        attributes={"camera_id": work.recipe.unit, "video": None},
+        attributes={"camera_id": work.recipe.unit, "video": None, **observations.labels()},
     )
     result.figures["frames"] = observations.frame.size
     result.figures["detections"] = int(np.isfinite(observations.score).sum())

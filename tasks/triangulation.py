@@ -19,6 +19,7 @@ from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import (
     CameraClocks,
+    DetectorModel,
     Smoothing,
     Triangulation,
     TriangulationSettings,
@@ -68,9 +69,9 @@ def write_joints(
             layout,
             arrays=spool.arrays()
             | clock_arrays(model.clocks)
-            | {"common_bias": model.detector.common_bias},
+            | bias_arrays(model.detector, clip.detections.points, settings),
             coordinates={"frame": clip.detections.frame, "person": tracks["person"].values},
-            attributes={"camera": list(clip.camera_ids)},
+            attributes={"camera": list(clip.camera_ids), **clip.detections.labels()},
         )
     agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)
     if agreement.joints == 0 and index.shape[2]:
@@ -106,7 +107,14 @@ def camera_errors(work: Work, clip: ClipInputs) -> NDArray[np.float64] | None:
 
 def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[Any]]:
     """Return the stored arrays with a frame dimension."""
-    return {
+    extra: dict[str, NDArray[Any]] = {}
+    if joints.extra is not None:
+        extra = {
+            "extra_joints": joints.extra.joints,
+            "extra_covariance": joints.extra.covariance,
+            "extra_views": joints.extra.views,
+        }
+    return extra | {
         "joints": joints.joints,
         "covariance": joints.covariance,
         "shared_covariance": joints.shared_covariance,
@@ -120,6 +128,16 @@ def part_arrays(joints: Triangulation, smooth: Smoothing) -> dict[str, NDArray[A
         "smoothed_covariance": smooth.covariance,
         "filled": smooth.filled,
     }
+
+
+def bias_arrays(
+    detector: DetectorModel, points: tuple[str, ...], settings: TriangulationSettings
+) -> dict[str, NDArray[Any]]:
+    """Return the stored errors that all views share."""
+    arrays: dict[str, NDArray[Any]] = {"common_bias": detector.common_bias}
+    if points:
+        arrays["extra_common_bias"] = np.full(len(points), settings.common_bias_m)
+    return arrays
 
 
 def clock_arrays(clocks: CameraClocks) -> dict[str, NDArray[Any]]:

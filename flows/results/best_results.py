@@ -14,11 +14,11 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from flows.stage import Match
 from worldpose.body import BodyModel, BodyParameters, find_body
-from worldpose.body_fitting import perceived_joints
+from worldpose.body_fitting import perceived_joints, perceived_points
 from worldpose.errors import InputError, UsageError, WorldposeError
 from worldpose.filtering import perceived_covariance
 from worldpose.formats import JointTracks
-from worldpose.formats.joints_file import fill_gaps
+from worldpose.formats.joints_file import ExtraTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
@@ -105,7 +105,34 @@ def joint_tracks(
         joints=joints,
         covariance=covariance,
         views=seen["views"].values.astype(np.int64),
+        extra=_extra_tracks(result, seen, definition),
     )
+
+
+def _extra_tracks(
+    result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
+) -> ExtraTracks | None:
+    """Return the points besides COCO-17 of a result; None without any.
+
+    Args:
+        result: bodies or triangulated joints.
+        seen: the triangulation of the same people.
+        definition: definition of the points of bodies.
+    """
+    if "extra_joints" not in result:
+        return None
+    points = tuple(result["point"].values.tolist())
+    joints = result["extra_joints"].values
+    if "extra_offsets" in result and definition == "detector":
+        bodies = BodyParameters(
+            np.broadcast_to(result["betas"].values, (*joints.shape[:2], result["betas"].shape[-1])),
+            *(result[name].values for name in ("global_orient", "body_pose", "transl")),
+        )
+        model = find_body(result.attrs["body_model"])
+        offsets = result["extra_offsets"].values
+        joints = joints + perceived_points(model, points, bodies, offsets)
+    views = seen["extra_views"].sel(point=list(points)).values.astype(np.int64)
+    return ExtraTracks(points, joints, result["extra_covariance"].values, views)
 
 
 def tracked_people(run: Run, clip: str) -> tuple[xr.Dataset, dict[int, Track]]:

@@ -74,6 +74,18 @@ class ChainedKeypoints:
             shares[:, parent] += shares[:, joint]
         return cls(model, rest[0], vectors)
 
+    def move_points(self, first: int, joints: NDArray[np.int64], by: Floats) -> ChainedKeypoints:
+        """Return the keypoints with some moved by vectors fixed to joints.
+
+        Args:
+            first: index of the first of these keypoints.
+            joints: (n,) joint that moves each of them and those after it.
+            by: (n, 3) [m], in the axes of the unposed body.
+        """
+        vectors = self.vectors.copy()
+        vectors[first + np.arange(len(joints)), joints, :, 0] += by
+        return ChainedKeypoints(self.model, self.pelvis, vectors)
+
     def differentiate(self, parameters: BodyParameters) -> KeypointJacobian:
         """Return the keypoints and their Jacobian; NaN where a parameter is."""
         flat, batch, count = parameters.flat(), parameters.batch_shape, len(self.vectors)

@@ -51,8 +51,80 @@ JOINT_NAMES: Final = (
 JOINT_OF_POINT: Final = MappingProxyType(
     {"mid_hip": 0} | {name: number for number, name in enumerate(JOINT_NAMES)}
 )
+LANDMARKS: Final = MappingProxyType(
+    {
+        "left_head_1": 20,
+        "right_head_1": 21,
+        "left_head_2": 58,
+        "right_head_2": 57,
+        "left_head_3": 1299,
+        "right_head_3": 1301,
+        "left_head_4": 1376,
+        "right_head_4": 1362,
+        "left_trunk_1": 2016,
+        "right_trunk_1": 2015,
+        "left_trunk_2": 2190,
+        "right_trunk_2": 2189,
+        "left_trunk_3": 2337,
+        "right_trunk_3": 2338,
+        "left_trunk_4": 2721,
+        "right_trunk_4": 2722,
+        "left_trunk_5": 2894,
+        "right_trunk_5": 2895,
+        "left_trunk_6": 2977,
+        "right_trunk_6": 2976,
+        "left_trunk_7": 3603,
+        "right_trunk_7": 3604,
+        "left_trunk_8": 3795,
+        "right_trunk_8": 3794,
+        "left_pelvis_1": 4757,
+        "right_pelvis_1": 4758,
+        "left_pelvis_2": 4765,
+        "right_pelvis_2": 4766,
+        "left_upper_arm_1": 2653,
+        "right_upper_arm_1": 2654,
+        "left_upper_arm_2": 2382,
+        "right_upper_arm_2": 2381,
+        "left_upper_arm_3": 2032,
+        "right_upper_arm_3": 2031,
+        "left_forearm_1": 3421,
+        "right_forearm_1": 3420,
+        "left_forearm_2": 2854,
+        "right_forearm_2": 2853,
+        "left_thigh_1": 4840,
+        "right_thigh_1": 4839,
+        "left_thigh_2": 4971,
+        "right_thigh_2": 4970,
+        "left_thigh_3": 5006,
+        "right_thigh_3": 5007,
+        "left_thigh_4": 5068,
+        "right_thigh_4": 5069,
+        "left_thigh_5": 5114,
+        "right_thigh_5": 5115,
+        "left_thigh_6": 5157,
+        "right_thigh_6": 5156,
+        "left_thigh_7": 5287,
+        "right_thigh_7": 5286,
+        "left_shank_1": 5358,
+        "right_shank_1": 5359,
+        "left_shank_2": 5439,
+        "right_shank_2": 5438,
+        "left_shank_3": 5489,
+        "right_shank_3": 5488,
+        "left_shank_4": 5591,
+        "right_shank_4": 5590,
+        "left_foot_1": 6863,
+        "right_foot_1": 6862,
+        "left_foot_2": 6109,
+        "right_foot_2": 6108,
+    }
+)
+"""Vertices of landmarks of the surface, in mirrored pairs that cover all segments but hands and
+toes evenly (`infra/open_body/make_landmarks.py`), numbered from the top of a segment down."""
+
 VERTEX_OF_POINT: Final = MappingProxyType(
     {
+        **LANDMARKS,
         "nose": 332,
         "left_eye": 2800,
         "right_eye": 6260,
@@ -213,6 +285,12 @@ def fold_keypoints(model: BodyModel, points: tuple[str, ...]) -> FoldedKeypoints
                 todo="Name another point or use fold_regressor with weights of your own.",
             )
     return fold_regressor(model, joint_shares, vertex_shares)
+
+
+def point_segments(model: BodyModel, points: tuple[str, ...]) -> NDArray[np.int64]:
+    """Return the joint that moves each point of the surface most (points,)."""
+    vertices = [VERTEX_OF_POINT[point] for point in points]
+    return np.asarray(model.weights[vertices].argmax(axis=-1), dtype=np.int64)
 
 
 def fold_regressor(

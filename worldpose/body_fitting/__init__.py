@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         measure_bones,
         pool_shapes,
     )
+    from worldpose.body_fitting.extra_points import ExtraFit, perceived_points
     from worldpose.body_fitting.held_out import HeldOutComparison, SeenClip, compare_held_out
     from worldpose.body_fitting.monocular import (
         MonocularEstimates,
@@ -52,6 +53,7 @@ __all__ = [
     "BodyFittingSettings",
     "BoneLengths",
     "ClipEvidence",
+    "ExtraFit",
     "Ground",
     "HeldOutComparison",
     "MonocularEstimates",
@@ -71,6 +73,7 @@ __all__ = [
     "identify_people",
     "measure_bones",
     "perceived_joints",
+    "perceived_points",
     "place_monocular_poses",
     "pool_shapes",
     "read_monocular",
@@ -96,6 +99,7 @@ __getattr__ = import_on_use(
             "measure_bones",
             "pool_shapes",
         ),
+        "worldpose.body_fitting.extra_points": ("ExtraFit", "perceived_points"),
         "worldpose.body_fitting.held_out": (
             "HeldOutComparison",
             "SeenClip",

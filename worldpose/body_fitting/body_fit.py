@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.model import BODY_POSE
 from worldpose.body_fitting.bones import BONES, Shape
+from worldpose.body_fitting.extra_points import ExtraFit, prepare_points
 from worldpose.body_fitting.monocular import (
     MonocularPoses,
     MonocularPrior,
@@ -33,7 +34,6 @@ from worldpose.body_fitting.objective import (
     Evidence,
     Ground,
     Pose,
-    Track,
     body_axes,
 )
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior, nearest_known
@@ -48,6 +48,7 @@ from worldpose.body_fitting.solver import (
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
+from worldpose.triangulation import ExtraJoints
 
 MAX_DEVIATION: Final = 0.035
 """Joints are well determined if their median standard deviation per axis is below this [m]: 16
@@ -79,6 +80,7 @@ class BodyFit:
         filled: (frames, persons), bodies in frames without any joint of theirs.
         guided: (frames, persons), bodies fitted with a monocular pose.
         offsets: (17, 3) [m] forward, left and up: from a body's joints to the detector's.
+        extra: points besides COCO-17; None without evidence about any.
     """
 
     betas: Floats
@@ -89,6 +91,7 @@ class BodyFit:
     filled: NDArray[np.bool_]
     guided: NDArray[np.bool_]
     offsets: Floats
+    extra: ExtraFit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +112,8 @@ class ClipEvidence:
         shared_covariance: (frames, persons, 3, 3) [m^2], the part of `covariance` that moves all
             joints of a person together: no number of joints reduces it. NaN = unknown in this
             frame; None = none.
+        extra: points besides COCO-17 of the same frames and persons; None = none. They determine
+            poses, those of the feet too, and no shapes.
 
     Raises:
         InputError: the shapes do not match.
@@ -121,6 +126,7 @@ class ClipEvidence:
     ray_constraints: Sequence[RayConstraints] = ()
     monocular_poses: MonocularPoses | None = None
     shared_covariance: Floats | None = None
+    extra: ExtraJoints | None = None
 
     def __post_init__(self) -> None:
         shape = self.joints.shape
@@ -187,13 +193,19 @@ def fit_bodies(
         fps,
     )
     result = FittedArrays.empty(model, frames, persons)
+    extra = prepare_points(solver, evidence.extra, spans, by_person, shapes, fps)
+    if extra is not None:
+        solver, by_person = extra.solver, extra.people
 
-    def fit_person(person: int) -> None:
-        pose, track = solver.solve_poses(
-            by_person[person], shapes.people[person], shapes.offsets, fps
-        )
-        spread = _covariance(track, pose, shapes.offsets, bias)
-        result.put(solver, person, spans[person], pose, spread, shapes)
+    def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
+        own, span = by_person[person], spans[person]
+        pose, track = solver.solve_poses(own, shapes.people[person], shapes.offsets, fps, prior)
+        random = pose_covariance(track, pose, shapes.offsets)
+        spread = random[:, :17] + bias[:, None, None] ** 2 * np.eye(3)
+        determined = None if extra is None else extra.determined[person]
+        bodies = result.put(solver, person, span, pose, spread, shapes, determined)
+        if extra is not None:
+            extra.put(person, span, bodies, random[:, 17:])
 
     # Tracks of many minutes need gigabytes each: one at a time.
     for _ in (map_in_threads if frames <= THREAD_FRAMES else map)(fit_person, spans):
@@ -203,20 +215,22 @@ def fit_bodies(
             result, joint_seen, covariance, evidence.monocular_poses, spans, fps
         )
         for person, prior in priors.items():
-            shape = shapes.people[person]
-            pose, track = solver.solve_poses(by_person[person], shape, shapes.offsets, fps, prior)
-            spread = _covariance(track, pose, shapes.offsets, bias)
-            result.put(solver, person, spans[person], pose, spread, shapes)
+            fit_person(person, prior)
             result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
         gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
         result.drop(person, span, gone)
+        if extra is not None:
+            extra.drop(person, span, gone)
     if evidence.shared_covariance is not None:
         for person, span in spans.items():
             shared = _nearest_known(evidence.shared_covariance[span, person])
             result.covariance[span, person] += shared[:, None]
-    return result.fit(shapes)
+            if extra is not None:
+                extra.covariance[span, person] += shared[:, None]
+    fit = result.fit(shapes)
+    return fit if extra is None else replace(fit, extra=extra.fit())
 
 
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
@@ -228,16 +242,6 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """
     modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
     return covariance - modelled[:, None, None] * np.eye(3)
-
-
-def _covariance(track: Track, pose: Pose, offsets: Floats, common_bias: Floats) -> Floats:
-    """Return the covariance (frames, 17, 3, 3) [m^2] of a person's keypoints.
-
-    The common bias adds in full: joints of real people's bodies are as far from the labels as
-    triangulated joints.
-    """
-    random = pose_covariance(track, pose, offsets)
-    return random + common_bias[:, None, None] ** 2 * np.eye(3)
 
 
 def _nearest_known(matrices: Floats) -> Floats:
@@ -328,25 +332,30 @@ class FittedArrays:
         pose: Pose,
         covariance: Floats,
         shapes: Shapes,
-    ) -> None:
-        """Write the result of one person; covariance (frames, 17, 3, 3) [m^2] of the keypoints.
+        determined: NDArray[np.bool_] | None = None,
+    ) -> BodyParameters:
+        """Write the result of one person, and return the bodies with their feet.
+
+        Covariance (frames, 17, 3, 3) [m^2] is that of the keypoints; `determined` is as `seen` of
+        `Solver.plant_feet`.
 
         The covariance of the detector's offsets and of the person's own is added.
         """
         shape = shapes.people[person]
-        body = solver.chained.differentiate(pose.parameters())
-        plant_feet = solver.plant_feet(pose)
+        keypoints = solver.chained.differentiate(pose.parameters()).keypoints[:, :17]
+        bodies = solver.plant_feet(pose, determined)
         self.betas[person] = shape.betas
         self.betas_covariance[person] = shape.covariance
-        self.orient[span, person] = plant_feet.global_orient
-        self.body_pose[span, person] = plant_feet.body_pose
-        self.transl[span, person] = plant_feet.transl
-        self.joints[span, person] = body.keypoints
-        axes = body_axes(body.keypoints)[:, None]
+        self.orient[span, person] = bodies.global_orient
+        self.body_pose[span, person] = bodies.body_pose
+        self.transl[span, person] = bodies.transl
+        self.joints[span, person] = keypoints
+        axes = body_axes(keypoints)[:, None]
         # A joint is the detector's joint minus the offset: the offset's covariance adds up.
         shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
         own = solver.settings.own_bias_std_m**2 * np.eye(3)
         self.covariance[span, person] = covariance + shared + own
+        return bodies
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""

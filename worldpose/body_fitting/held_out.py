@@ -147,7 +147,7 @@ def compare_held_out(
     pieces = _choose_pieces(frames, len(known), clip.fps)
     chosen = np.concatenate([np.arange(piece.start, piece.stop) for piece in pieces])
     length = pieces[0].stop - pieces[0].start
-    detections = clip.detections[chosen]
+    detections = clip.detections[chosen].with_points(())
     solver = Solver(
         ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
     )

@@ -20,7 +20,7 @@ from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
-from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREAD, PosePrior
+from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREADS, PosePrior
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import compile_kernel
 
@@ -85,6 +85,23 @@ class Evidence:
     information: Floats
     """(frames, 17, 3, 3) [1/m^2], inverse covariance; 0 where unknown."""
 
+    def add_points(
+        self, joints: Floats, covariance: Floats, fps: float, settings: BodyFittingSettings
+    ) -> Evidence:
+        """Return the evidence with points besides COCO-17 after it.
+
+        Args:
+            joints: (frames, points, 3) [m], world; NaN where missing.
+            covariance: (frames, points, 3, 3) [m^2], as triangulation states it.
+            fps: [1/s].
+            settings: scale and correlation time of the noise.
+        """
+        own = self.of(joints, covariance, fps, settings)
+        return Evidence(
+            np.concatenate([self.joints, own.joints], axis=1),
+            np.concatenate([self.information, own.information], axis=1),
+        )
+
     @property
     def known(self) -> NDArray[np.bool_]:
         """(frames, 17), joints with any information."""
@@ -97,14 +114,15 @@ class Evidence:
         """Return the evidence of joints whose errors last for `noise_time_s`.
 
         Args:
-            joints: (frames, 17, 3) [m], world.
+            joints: (frames, 17, 3) [m], world; or other points.
             covariance: (frames, 17, 3, 3) [m^2], as triangulation states it.
             fps: [1/s].
             settings: scale and correlation time of the noise.
         """
         seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
         stated = np.where(seen[..., None, None], covariance, np.eye(3))
-        spread = settings.noise_scale**2 * JOINT_SPREAD[:, None, None] ** 2 * stated
+        relative = JOINT_SPREAD if joints.shape[1] == len(JOINT_SPREAD) else np.ones(1)
+        spread = settings.noise_scale**2 * relative[:, None, None] ** 2 * stated
         spread = spread + settings.min_joint_std_m**2 * np.eye(3)
         # Correlated frames count as one observation.
         spread *= 1.0 + settings.noise_time_s * fps
@@ -216,7 +234,9 @@ def level_feet(rotations: Floats, clear: Floats) -> Floats:
 
 
 UNKNOWNS: Final = 6 + SIZE
-"""Unknowns per frame: translation, orientation and angles."""
+"""Unknowns per frame: translation, orientation and angles; more with points of the feet."""
+POINT_ACCELERATION: Final = 6.0
+"""Acceleration of points besides COCO-17 as a multiple of the hips': heels and toes."""
 ACCELERATION_SCALE: Final = np.array(
     [1, 1, 1, 1, 1, 1, 1, 2, 2, 3, 3, 1, 1, 5, 5, 5, 5], dtype=np.float64
 )
@@ -227,26 +247,37 @@ _MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
-SPREAD_ANGLE, SPREAD_UNKNOWN = np.nonzero(SPREAD)
-SPREAD_FACTOR: Final = SPREAD[SPREAD_ANGLE, SPREAD_UNKNOWN]
+def _spread_terms(spread: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    angle, coordinate = np.nonzero(spread)
+    return angle, coordinate, spread[angle, coordinate]
 
 
-def differentiate_points(pose: Floats) -> Floats:
-    """Return derivatives of points by the unknowns (frames, points, 3, 36).
+SPREAD_TERMS: Final = {size: _spread_terms(spread) for size, spread in SPREADS.items()}
+"""Angle, coordinate and factor of every nonzero entry of `SPREADS`."""
+
+
+def differentiate_points(pose: Floats, size: int) -> Floats:
+    """Return derivatives of points by the unknowns (frames, points, 3, 6 + size).
 
     Args:
         pose: (frames, points, 3, 72), by the angles of all joints.
+        size: number of coordinates of the pose.
     """
-    return _gather_angles(pose, 3 + SPREAD_ANGLE, 6 + SPREAD_UNKNOWN, SPREAD_FACTOR)
+    angle, coordinate, factor = SPREAD_TERMS[size]
+    return _gather_angles(pose, 3 + angle, 6 + coordinate, factor, 6 + size)
 
 
 @compile_kernel
 def _gather_angles(
-    pose: Floats, angle: NDArray[np.int64], unknown: NDArray[np.int64], factor: Floats
+    pose: Floats,
+    angle: NDArray[np.int64],
+    unknown: NDArray[np.int64],
+    factor: Floats,
+    unknowns: int,
 ) -> Floats:
     """Return derivatives by the unknowns: sums of those by angles, with factors, (terms,) each."""
     frames, points = pose.shape[:2]
-    rows = np.zeros((frames, points, 3, UNKNOWNS))
+    rows = np.zeros((frames, points, 3, unknowns))
     for t in range(frames):
         for p in range(points):
             for a in range(3):
@@ -321,13 +352,14 @@ class Pose:
     orient: Floats
     """(frames, 3) [rad]"""
     angles: Floats
-    """(frames, 30) [rad], of `pose_space`."""
+    """(frames, 30) [rad], of `pose_space`; (frames, 38) with those of the feet."""
     betas: Floats
     """(shapes,)"""
 
     def parameters(self) -> BodyParameters:
         """Return the bodies (frames,)."""
-        return BodyParameters(self.betas, self.orient, self.angles @ SPREAD.T, self.transl)
+        angles = self.angles @ SPREADS[self.angles.shape[1]].T
+        return BodyParameters(self.betas, self.orient, angles, self.transl)
 
     def apply_step(self, step: Floats, betas: Floats | float = 0.0) -> Pose:
         """Return the pose after a step (frames, 36), with rotations clipped to the linear range."""
@@ -385,7 +417,10 @@ class Track:
         frames, settings = len(pose.transl), self.settings
         body = self.differentiate(pose)
         by_frame, shapes = body.pose, body.betas.shape[-1]
-        rows = by_frame.reshape(frames, 51, UNKNOWNS)
+        points = by_frame.shape[1]
+        rows = by_frame.reshape(frames, 3 * points, -1)
+        # The points besides COCO-17 already lie where the detector has them.
+        offsets = np.concatenate([offsets, np.zeros((points - len(offsets), 3))])
 
         axes = body_axes(body.keypoints)
         known = self.evidence.known
@@ -407,31 +442,31 @@ class Track:
         cost += smooth_cost + self._add_angles(pose.angles, blocks[0], gradient)
         if self.monocular_prior is not None:
             matrix, slope, prior_cost = self.monocular_prior.normal_equations(
-                pose.orient, pose.angles
+                pose.orient, pose.angles[:, :SIZE]
             )
-            blocks[0][:, 3:, 3:] += matrix
-            gradient[:, 3:] += slope
+            blocks[0][:, 3:UNKNOWNS, 3:UNKNOWNS] += matrix
+            gradient[:, 3:UNKNOWNS] += slope
             cost += prior_cost
 
         width = shapes + MIRRORED_OFFSETS.shape[-1] if bordered else 0
-        border, corner = np.zeros((frames, UNKNOWNS, width)), np.zeros((width, width))
+        border, corner = np.zeros((frames, rows.shape[-1], width)), np.zeros((width, width))
         shared = np.zeros(width)
         if bordered:
-            by_shared = np.zeros((frames, 17, 3, width))
+            by_shared = np.zeros((frames, points, 3, width))
             by_shared[..., :shapes] = body.betas
-            by_shared[..., shapes:] = np.einsum("fab,jbu->fjau", axes, MIRRORED_OFFSETS)
-            columns = by_shared.reshape(frames, 51, width)
+            by_shared[:, :17, :, shapes:] = np.einsum("fab,jbu->fjau", axes, MIRRORED_OFFSETS)
+            columns = by_shared.reshape(frames, 3 * points, width)
             held = (information @ by_shared).reshape(columns.shape)
             border = np.swapaxes(rows, 1, 2) @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
-            shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 51))
+            shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 3 * points))
         equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
         return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
 
     def differentiate(self, pose: Pose) -> KeypointJacobian:
-        """Return the keypoints with derivatives by the unknowns (frames, 17, 3, 36) in `pose`.
+        """Return the points with derivatives by the unknowns (frames, points, 3, 36) in `pose`.
 
         Some frames at a time, so that the derivatives by all angles stay in the processor's cache.
         """
@@ -443,21 +478,24 @@ class Track:
             if not start:
                 keypoints = np.empty((frames, *body.keypoints.shape[1:]))
                 betas = np.empty((frames, *body.betas.shape[1:]))
-                rows = np.empty((*keypoints.shape, UNKNOWNS))
+                rows = np.empty((*keypoints.shape, 6 + pose.angles.shape[1]))
             keypoints[part], betas[part] = body.keypoints, body.betas
-            rows[part] = differentiate_points(body.pose)
+            rows[part] = differentiate_points(body.pose, pose.angles.shape[1])
         return KeypointJacobian(keypoints, betas, rows)
 
     def _smoothness(self, keypoints: Floats) -> tuple[list[Floats], Floats, float]:
-        """Return weights (frames, 17) on the three diagonals, gradient (frames, 17, 3) and cost.
+        """Return weights (frames, points) on the three diagonals, gradient (..., 3) and cost.
 
         They cover second differences of keypoints, and motion of standing ankles.
         """
         settings, frames = self.settings, len(keypoints)
-        bands = [np.zeros((frames, 17)) for _ in range(3)]
+        points = keypoints.shape[1]
+        bands = [np.zeros((frames, points)) for _ in range(3)]
         slope, cost = np.zeros_like(keypoints), 0.0
         if frames > 2:
-            spread = self.acceleration * ACCELERATION_SCALE / self.fps**2
+            further = np.full(points - len(ACCELERATION_SCALE), POINT_ACCELERATION)
+            scale = np.concatenate([ACCELERATION_SCALE, further])
+            spread = self.acceleration * scale / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
             tail = 3.0 * settings.acceleration_loss_scale**2
             deviation = (second**2).sum(-1) / spread**2 / tail
@@ -486,11 +524,13 @@ class Track:
         """Add the pose prior and the joint limits; return their cost."""
         prior = self.pose_weight * self.prior.precision
         away = angles - self.prior.mean
-        beyond = np.maximum(angles - MAX_ANGLES, 0.0) + np.minimum(angles - MIN_ANGLES, 0.0)
+        size = angles.shape[1]
+        beyond = np.maximum(angles - MAX_ANGLES[:size], 0.0)
+        beyond = beyond + np.minimum(angles - MIN_ANGLES[:size], 0.0)
         stiff = 1.0 / self.settings.limit_std_rad**2
         gradient[:, 6:] += away @ prior + stiff * beyond
         blocks[:, 6:, 6:] += prior
-        places = np.arange(6, UNKNOWNS)
+        places = np.arange(6, 6 + size)
         blocks[:, places, places] += stiff * (beyond != 0.0)
         return 0.5 * float(((away @ prior) * away).sum() + stiff * (beyond**2).sum())
 

@@ -3,7 +3,7 @@
 COCO's 17 points leave many of a body's 69 angles undetermined: the bend of single spine joints,
 hands and feet. 30 coordinates remain: bend of the whole spine and of the whole neck, hips, knees,
 shoulders and elbows. The other angles follow from them (spine and neck share evenly) or from the
-ground (feet).
+ground (feet). Where a detector gives points of the feet, 8 more coordinates bend ankles and toes.
 
 Initial poses have limbs along the joints, frame by frame. Root alignment follows the paper:
 translation and orientation from hips and torso alone. Two-bone directions orient the limbs, which
@@ -50,23 +50,35 @@ _LIMITS: Final = {
     "knee": ((-0.05, 2.7), (-0.4, 0.4), (-0.3, 0.3)),
     "shoulder": ((-2.0, 2.0), (-2.0, 1.2), (-2.0, 1.8)),
     "elbow": ((-0.5, 0.5), (-2.7, 0.1), (-0.5, 0.5)),
+    # The first angle of a foot points it down.
+    "ankle": ((-0.7, 1.0), (-0.5, 0.5), (-0.5, 0.5)),
+    "foot": ((-1.0, 0.3),),
 }
 """Limits of the middle and the left side; the right side mirrors the second and third angle."""
 
 
+FOOT_JOINTS: Final = ("left_ankle", "right_ankle", "left_foot", "right_foot")
+"""Joints of further coordinates: three of each ankle, and the bend of the toes of each foot."""
+FOOT_SIZE: Final = 8
+_FOOT_SPREAD: Final = (0.4, 0.2, 0.2, 0.4, 0.2, 0.2, 0.3, 0.3)
+"""Standard deviations of these coordinates [rad], about a foot at a right angle to the shank: the
+range of motion of walking and running."""
+
+
 def _limits() -> tuple[Floats, Floats]:
-    low, high = np.empty(SIZE), np.empty(SIZE)
-    for index, joints in enumerate(COORDINATES):
-        name = joints[0]
+    bounds = []
+    for name in (*(joints[0] for joints in COORDINATES), *FOOT_JOINTS):
         kind = next(kind for kind in _LIMITS if kind in name)
-        bounds = np.array(_LIMITS[kind])
+        own = np.array(_LIMITS[kind])
         if name.startswith("right"):
-            bounds[1:] = -bounds[1:, ::-1]
-        low[3 * index : 3 * index + 3], high[3 * index : 3 * index + 3] = bounds.T
+            own[1:] = -own[1:, ::-1]
+        bounds.append(own)
+    low, high = np.concatenate(bounds).T
     return low, high
 
 
 MIN_ANGLES, MAX_ANGLES = _limits()
+"""(38,) [rad], of the coordinates and then of those of the feet."""
 
 
 def _spread() -> Floats:
@@ -80,6 +92,21 @@ def _spread() -> Floats:
 
 SPREAD: Final = _spread()
 """(69, 30): matrix from coordinates to `body_pose` [1]; feet and hands are straight."""
+
+
+def _foot_spread() -> Floats:
+    matrix = np.zeros((BODY_POSE, FOOT_SIZE))
+    column = 0
+    for joint in FOOT_JOINTS:
+        axes = 3 if "ankle" in joint else 1
+        row = 3 * (JOINT_NAMES.index(joint) - 1)
+        matrix[row : row + axes, column : column + axes] = np.eye(axes)
+        column += axes
+    return matrix
+
+
+SPREADS: Final = {SIZE: SPREAD, SIZE + FOOT_SIZE: np.hstack([SPREAD, _foot_spread()])}
+"""The matrix to `body_pose` by the number of coordinates, without and with those of the feet."""
 GATHER: Final = (SPREAD.T > 0.0).astype(np.float64)
 """(30, 69): matrix from `body_pose` to coordinates; shared rotations are summed."""
 
@@ -92,6 +119,14 @@ class PosePrior:
     """(30,) [rad]."""
     precision: Floats
     """(30, 30) [1/rad^2]."""
+
+    def add_feet(self) -> PosePrior:
+        """Return the prior of 38 coordinates, of ankles and toes too."""
+        size = len(self.mean) + FOOT_SIZE
+        precision = np.zeros((size, size))
+        precision[:-FOOT_SIZE, :-FOOT_SIZE] = self.precision
+        precision[-FOOT_SIZE:, -FOOT_SIZE:] = np.diag(1.0 / np.array(_FOOT_SPREAD) ** 2)
+        return PosePrior(np.concatenate([self.mean, np.zeros(FOOT_SIZE)]), precision)
 
 
 @functools.cache
@@ -178,7 +213,7 @@ def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
 def start_poses(
     model: BodyModel, betas: Floats, joints: Floats, prior: PosePrior
 ) -> tuple[Floats, Floats, Floats]:
-    """Return `transl` (frames, 3), `global_orient` (frames, 3) and coordinates (frames, 30).
+    """Return `transl` (frames, 3), `global_orient` (frames, 3) and coordinates of the prior.
 
     Args:
         model: the body.
@@ -198,7 +233,7 @@ def start_poses(
     from_torso = place + turns @ (rest[1:3].mean(axis=0) - torso.mean(axis=0))
     middle = np.where(np.isfinite(middle), middle, from_torso)
     pelvis = middle - turns @ (rest[1:3].mean(axis=0) - rest[0])
-    coordinates = np.broadcast_to(prior.mean, (len(joints), SIZE)).copy()
+    coordinates = np.broadcast_to(prior.mean, (len(joints), len(prior.mean))).copy()
     for ends, bones, places, hinge in _LIMBS:
         upper, lower = (joints[:, ends[k + 1]] - joints[:, ends[k]] for k in (0, 1))
         if not (np.isfinite(upper).all() and np.isfinite(lower).all()):

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.body import BodyParameters
@@ -27,7 +28,6 @@ from worldpose.body_fitting.objective import (
     ACCELERATION_SCALE,
     JOINT_SPREAD,
     MIRRORED_OFFSETS,
-    UNKNOWNS,
     Evidence,
     Ground,
     NormalEquations,
@@ -91,7 +91,7 @@ class Solver:
             settings.pose_weight,
             monocular_prior=monocular_prior,
         )
-        target = interpolate_gaps(evidence.joints)
+        target = interpolate_gaps(evidence.joints[:, :17])
         with np.errstate(invalid="ignore"):
             axes = body_axes(target)
         moved = target - np.einsum("fab,jb->fja", axes, offsets)
@@ -125,8 +125,14 @@ class Solver:
         contacts = find_contacts(joints, height, self.ground, track.fps, self.settings)
         return replace(track, contacts=contacts)
 
-    def plant_feet(self, pose: Pose) -> BodyParameters:
-        """Return the bodies of a pose, with feet that are near the ground turned level with it."""
+    def plant_feet(self, pose: Pose, seen: NDArray[np.bool_] | None = None) -> BodyParameters:
+        """Return the bodies of a pose, with feet that are near the ground turned level with it.
+
+        Args:
+            pose: the pose.
+            seen: (frames, 2), whether points of the left and right foot determine its pose, which
+                then stays; None = neither.
+        """
         parameters = pose.parameters()
         if self.ground is None:
             return parameters
@@ -138,7 +144,8 @@ class Solver:
             place = body.joints[:, foot] + parameters.transl
             clear = place[:, 2] - self.ground(place[:, 0], place[:, 1]) - height
             turned = level_feet(body.rotations[:, shank], np.maximum(clear, 0.0))
-            angles[:, foot - 1] = Rigid(turned, np.zeros(3)).rotvec
+            level = slice(None) if seen is None else ~seen[:, foot - 7]
+            angles[level, foot - 1] = Rigid(turned[level], np.zeros(3)).rotvec
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
 
 
@@ -155,11 +162,12 @@ def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
     inside &= after - before <= monocular_prior.correlated_frames
     nearest = np.where(frames - before <= after - frames, before, after)
     known = Rigid(monocular_prior.orient[nearest], np.zeros(3)).rotvec
-    return replace(
-        pose,
-        orient=np.where(inside[:, None], known, pose.orient),
-        angles=np.where(inside[:, None], monocular_prior.angles[nearest], pose.angles),
+    # A monocular pose has no coordinates of the feet.
+    angles, size = pose.angles.copy(), monocular_prior.angles.shape[1]
+    angles[:, :size] = np.where(
+        inside[:, None], monocular_prior.angles[nearest], pose.angles[:, :size]
     )
+    return replace(pose, orient=np.where(inside[:, None], known, pose.orient), angles=angles)
 
 
 def damp_motion(track: Track) -> Track:
@@ -172,7 +180,7 @@ def damp_motion(track: Track) -> Track:
 
 
 def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> Floats:
-    """Return the covariance of a solved track's keypoints from its poses (frames, 17, 3, 3) [m^2].
+    """Return the covariance of a solved track's points from its poses (frames, points, 3, 3) [m^2].
 
     Args:
         track: the track, with its standing ankles.
@@ -191,7 +199,7 @@ def factor(blocks: Floats) -> BandedFactor:
     Raises:
         DegenerateError: rounding leaves no positive definite system.
     """
-    places = np.arange(UNKNOWNS)
+    places = np.arange(blocks.shape[-1])
     blocks[0][:, places, places] *= 1.0 + 1e-4
     blocks[0][:, places, places] += DAMPING
     solved = BandedFactor.of(blocks, overwrite=True)

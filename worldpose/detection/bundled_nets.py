@@ -24,7 +24,6 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from data_contracts.arrays import Image, Singles
-from worldpose.detection.bundled_crops import MAP_COUNT
 from worldpose.detection.onnx_nets import open_session
 from worldpose.errors import InputError
 
@@ -38,6 +37,9 @@ CROP: Final = (96, 128)
 """Width, height of the crops that the keypoint net takes [px]."""
 CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
+MAP_COUNT: Final = 3
+"""The target box, boxes of people in front of the target, and of people behind it: maps that the
+keypoint net takes beside a crop."""
 EDGE_CELL: Final = 4
 """Pixels of the crop per cell of the edge maps [px]."""
 APART: Final = 3

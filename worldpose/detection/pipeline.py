@@ -321,9 +321,10 @@ def detect_people(
         return KeypointDetections.from_keypoints(np.empty((0, 0, 17, 2)), np.empty((0, 0, 17)))
     most = max(int(np.isfinite(chunk.score).sum(axis=1).max()) for chunk in chunks)
     chunks = [chunk.select(slice(0, most)) for chunk in chunks]
-    names = ("keypoints", "confidence", "boxes", "score", "frame")
-    return KeypointDetections(
-        **{name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
+    each = [chunk.arrays() for chunk in chunks]
+    return chunks[0].with_arrays(
+        {name: np.concatenate([one[name] for one in each]) for name in each[0]},
+        np.concatenate([chunk.frame for chunk in chunks]),
     )
 
 

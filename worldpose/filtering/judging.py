@@ -149,7 +149,7 @@ def measure_held_out(
     if count - max(1, count // FOLDS) < settings.min_views:
         return None
     fold = np.arange(count) % FOLDS
-    total, keypoints = 0.0, 0
+    total, keypoints, used = 0.0, 0, used.with_points(())
     for left_out in range(min(FOLDS, count)):
         index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
         others = replace(used, detection_index=index.astype(np.int16))

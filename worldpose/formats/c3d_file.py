@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
@@ -37,12 +36,13 @@ def write_c3d(
 ) -> None:
     """Write the joints of one person as a C3D file, whole or not at all.
 
-    Points are the 17 joints in millimetres, x, y and z as in the world, z up, in single precision:
-    0.004 mm at 60 m. Frame 1 is the first frame of `tracks`, and frames cover all up to the last,
-    so that the files of all people of a clip agree in time. The residual of a joint is its standard
-    deviation, the mean over the axes, in whole millimetres from 1; it is 0, which the format
-    reserves for computed points, if no camera contributes, and -1 if the joint is missing. Events
-    mark the clip's begin and end, and group WORLDPOSE holds the notes.
+    Points are the 17 joints, and heels and toes where the clip has them, in millimetres, x, y and z
+    as in the world, z up, in single precision: 0.004 mm at 60 m. Frame 1 is the first frame of
+    `tracks`, and frames cover all up to the last, so that the files of all people of a clip agree
+    in time. The residual of a joint is its standard deviation, the mean over the axes, in whole
+    millimetres from 1; it is 0, which the format reserves for computed points, if no camera
+    contributes, and -1 if the joint is missing. Events mark the clip's begin and end, and group
+    WORLDPOSE holds the notes.
 
     Args:
         path: the file.
@@ -62,28 +62,34 @@ def write_c3d(
             found=f"{count}",
             todo="Choose another format, such as parquet, or shorter clips.",
         )
-    parameters = _parameters(f"person_{tracks.person_ids[person]}", count, fps, notes)
+    names = tracks.markers.points
+    parameters = _parameters(f"person_{tracks.person_ids[person]}", names, count, fps, notes)
     # The start of the data is itself a parameter, whose length does not depend on its value.
     start = 2 + _blocks(_parameter_section(path, parameters))
     parameters["POINT"]["DATA_START"] = np.int16(start)
     section = _parameter_section(path, parameters)
-    content = [_header(count, fps, start), section, _points(tracks, person, count).tobytes()]
+    content = [
+        _header(len(names), count, fps, start),
+        section,
+        _points(tracks, person, count).tobytes(),
+    ]
     with whole_file(path) as draft:
         draft.write_bytes(b"".join(_pad(part) for part in content))
 
 
 def _points(tracks: JointTracks, person: int, count: int) -> NDArray[np.float32]:
-    """Return x, y, z [mm] and the residual [mm] of each frame and joint (count, 17, 4)."""
-    joints = tracks.joints[:, person]
+    """Return x, y, z [mm] and the residual [mm] of each frame and point (count, points, 4)."""
+    markers = tracks.markers
+    joints = markers.joints[:, person]
     there = np.isfinite(joints[..., 0])
     residual = np.ones(there.shape)
-    if tracks.covariance is not None:
-        variance = np.diagonal(tracks.covariance[:, person], axis1=-2, axis2=-1).mean(-1)
+    if markers.covariance is not None:
+        variance = np.diagonal(markers.covariance[:, person], axis1=-2, axis2=-1).mean(-1)
         std_mm = 1000.0 * np.sqrt(np.where(np.isfinite(variance), variance, 0.0))
         residual = np.clip(np.round(std_mm), 1, MAX_RESIDUAL_MM)
-    if tracks.views is not None:
-        residual[tracks.views[:, person] == 0] = 0.0
-    rows = np.zeros((count, len(COCO17), 4), np.float32)
+    if markers.views is not None:
+        residual[markers.views[:, person] == 0] = 0.0
+    rows = np.zeros((count, len(markers.points), 4), np.float32)
     rows[..., 3] = -1.0
     found = np.concatenate([joints * 1000.0, residual[..., None]], axis=-1)
     rows[tracks.frames - tracks.frames[0]] = np.where(
@@ -92,29 +98,29 @@ def _points(tracks: JointTracks, person: int, count: int) -> NDArray[np.float32]
     return rows
 
 
-def _header(count: int, fps: float, start: int) -> bytes:
+def _header(points: int, count: int, fps: float, start: int) -> bytes:
     """Return the first block: sizes, rate, and that event labels have four characters."""
-    sizes = struct.pack("<BB5H", 2, 0x50, len(COCO17), 0, 1, count, 0)
+    sizes = struct.pack("<BB5H", 2, 0x50, points, 0, 1, count, 0)
     # A negative scale announces floats; its absolute value is the unit of residuals.
     rates = struct.pack("<fHHf", -1.0, start, 0, fps)
     return sizes + rates
 
 
 def _parameters(
-    subject: str, count: int, fps: float, notes: Mapping[str, str]
+    subject: str, points: Sequence[str], count: int, fps: float, notes: Mapping[str, str]
 ) -> dict[str, dict[str, _Value]]:
     """Return parameters by group and name."""
     begin_end = [[0.0, 0.0], [0.0, (count - 1) / fps]]  # minutes, seconds
     zero = np.int16(0)
     return {
         "POINT": {
-            "USED": np.int16(len(COCO17)),
+            "USED": np.int16(len(points)),
             "FRAMES": np.uint16(count).astype(np.int16),
             "DATA_START": zero,
             "SCALE": np.float32(-1.0),
             "RATE": np.float32(fps),
-            "LABELS": list(COCO17),
-            "DESCRIPTIONS": [name.replace("_", " ") for name in COCO17],
+            "LABELS": list(points),
+            "DESCRIPTIONS": [name.replace("_", " ") for name in points],
             "UNITS": "mm",
             "X_SCREEN": "+X",
             "Y_SCREEN": "+Z",

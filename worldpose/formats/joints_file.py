@@ -25,8 +25,31 @@ MEMBERS: Final = {
     "joints": Member(("frames", "persons", JOINTS, 3), "float"),
     "covariance": Member(("frames", "persons", JOINTS, 3, 3), "float", required=False),
     "views": Member(("frames", "persons", JOINTS), "int", required=False),
+    "points": Member(("points",), "text", required=False),
+    "extra_joints": Member(("frames", "persons", "points", 3), "float", required=False),
+    "extra_covariance": Member(("frames", "persons", "points", 3, 3), "float", required=False),
+    "extra_views": Member(("frames", "persons", "points"), "int", required=False),
 }
-"""Arrays of a joints file; `covariance` and `views` are optional."""
+"""Arrays of a joints file; all but the first three are optional."""
+EXTRA_MEMBERS: Final = ("points", "extra_joints", "extra_covariance", "extra_views")
+"""Those of points besides COCO-17."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExtraTracks:
+    """Points besides COCO-17 of several people over time, such as heels and toes.
+
+    Attributes:
+        points: (points,) names, each once and none of COCO-17.
+        joints: (frames, persons, points, 3) [m], world; NaN where missing.
+        covariance: (frames, persons, points, 3, 3) [m^2]; None if unknown.
+        views: (frames, persons, points), as in `JointTracks`; None if unknown.
+    """
+
+    points: tuple[str, ...]
+    joints: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None = None
+    views: NDArray[np.integer] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +72,33 @@ class JointTracks:
     views: NDArray[np.integer] | None = None
     """(frames, persons, 17) number of cameras used for the joint, or that saw it for ground
     truth."""
+    extra: ExtraTracks | None = None
+    """Points besides COCO-17 of the same frames and persons; None without any."""
+
+    @property
+    def markers(self) -> ExtraTracks:
+        """All points by name, those of COCO-17 first."""
+        if self.extra is None:
+            return ExtraTracks(COCO17, self.joints, self.covariance, self.views)
+
+        def join(own: NDArray[Any] | None, extra: NDArray[Any] | None, missing: float) -> Any:  # noqa: ANN401
+            if own is None or self.extra is None:
+                return None
+            if extra is None:
+                shape = (*own.shape[:2], len(self.extra.points), *own.shape[3:])
+                extra = np.full(shape, missing, own.dtype)
+            return np.concatenate([own, extra], axis=2)
+
+        return ExtraTracks(
+            (*COCO17, *self.extra.points),
+            join(self.joints, self.extra.joints, np.nan),
+            join(self.covariance, self.extra.covariance, np.nan),
+            join(self.views, self.extra.views, 0),
+        )
 
     def __post_init__(self) -> None:
+        if self.extra is not None:
+            self._check_extra(self.extra)
         shape = (*self.frames.shape, *self.person_ids.shape, JOINTS)
         shapes: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
             "joints": (self.joints, (*shape, 3))
@@ -82,6 +130,23 @@ class JointTracks:
         if self.views is not None:
             self._refuse("views", self.views < 0, "counts from 0")
 
+    def _check_extra(self, extra: ExtraTracks) -> None:
+        names = extra.points
+        if len(set(names)) < len(names) or set(names) & set(COCO17):
+            todo = "Rename the points."
+            raise wrong("points", "each name once, and none of COCO-17", ", ".join(names), todo)
+        shape = (*self.frames.shape, *self.person_ids.shape, len(names))
+        for name, array, expected in (
+            ("extra_joints", extra.joints, (*shape, 3)),
+            ("extra_covariance", extra.covariance, (*shape, 3, 3)),
+            ("extra_views", extra.views, shape),
+        ):
+            if array is not None and array.shape != expected:
+                raise wrong(name, f"shape {expected}", f"{array.shape}", "Give all arrays alike.")
+        missing = np.isnan(extra.joints)
+        if (missing.any(axis=-1) & ~missing.all(axis=-1)).any() or np.isinf(extra.joints).any():
+            raise wrong("extra_joints", "finite x, y, z or none", "others", "Correct them.")
+
     def _refuse(self, name: str, bad: NDArray[np.bool_], expected: str) -> None:
         if not bad.any():
             return
@@ -107,16 +172,17 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
         return tracks
     frames = np.arange(tracks.frames[0], tracks.frames[-1] + 1)
     rows = tracks.frames - tracks.frames[0]
-    shape = (len(frames), *tracks.joints.shape[1:3])
+    markers = tracks.markers
+    shape = (len(frames), *markers.joints.shape[1:3])
     joints = np.full((*shape, 3), np.nan)
     covariance = np.full((*shape, 3, 3), np.nan)
     views = np.zeros(shape, np.int64)
-    joints[rows] = tracks.joints
-    if tracks.covariance is not None:
-        covariance[rows] = tracks.covariance
+    joints[rows] = markers.joints
+    if markers.covariance is not None:
+        covariance[rows] = markers.covariance
     there = np.isfinite(joints[..., 0])
     covariance[~there] = np.nan
-    views[there] = 1 if tracks.views is None else tracks.views[there[rows]]
+    views[there] = 1 if markers.views is None else markers.views[there[rows]]
     for person, joint in np.ndindex(shape[1:]):
         known = np.flatnonzero(there[:, person, joint])
         if len(known) < 2:
@@ -125,12 +191,22 @@ def fill_gaps(tracks: JointTracks) -> JointTracks:
         if len(gaps):
             path = PchipInterpolator(known, joints[known, person, joint])
             joints[gaps, person, joint] = path(gaps)
+    stated = None if tracks.covariance is None else covariance
+    extra = None
+    if tracks.extra is not None:
+        extra = ExtraTracks(
+            tracks.extra.points,
+            joints[:, :, JOINTS:],
+            None if stated is None else stated[:, :, JOINTS:],
+            views[:, :, JOINTS:],
+        )
     return JointTracks(
         frames,
         tracks.person_ids,
-        joints,
-        covariance=None if tracks.covariance is None else covariance,
-        views=views,
+        joints[:, :, :JOINTS],
+        covariance=None if stated is None else stated[:, :, :JOINTS],
+        views=views[:, :, :JOINTS],
+        extra=extra,
     )
 
 
@@ -139,7 +215,8 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
 
     Members: `frames` (frames,) int64, `person_ids` (persons,) int64, `joints` (frames, persons,
     17, 3) float64 [m, world], and where known `covariance` (frames, persons, 17, 3, 3) float64
-    [m^2] and `views` (frames, persons, 17) uint8.
+    [m^2] and `views` (frames, persons, 17) uint8. Points besides COCO-17 are in `points`, their
+    names as text, `extra_joints`, `extra_covariance` and `extra_views`.
     """
     arrays: dict[str, NDArray[np.generic]] = {
         "frames": tracks.frames.astype(np.int64),
@@ -150,6 +227,13 @@ def write_joints(path: str | os.PathLike[str], tracks: JointTracks) -> None:
         arrays["covariance"] = tracks.covariance.astype(np.float64)
     if tracks.views is not None:
         arrays["views"] = tracks.views.astype(np.uint8)
+    if tracks.extra is not None:
+        arrays["points"] = np.array(tracks.extra.points, dtype=np.str_)
+        arrays["extra_joints"] = tracks.extra.joints.astype(np.float64)
+        if tracks.extra.covariance is not None:
+            arrays["extra_covariance"] = tracks.extra.covariance.astype(np.float64)
+        if tracks.extra.views is not None:
+            arrays["extra_views"] = tracks.extra.views.astype(np.uint8)
     write_archive(Path(path), arrays)
 
 
@@ -160,9 +244,20 @@ def read_joints(path: str | os.PathLike[str]) -> JointTracks:
         InputError: the file is absent or truncated, or has missing or unknown members, wrong shapes
             or infinite values; the error names file and place.
     """
-    arrays = read_archive(Path(path), MEMBERS)
+    arrays: dict[str, Any] = dict(read_archive(Path(path), MEMBERS))
+    points = {name: arrays.pop(name, None) for name in EXTRA_MEMBERS}
     try:
-        return JointTracks(**arrays)
+        extra = None
+        if points["points"] is not None or points["extra_joints"] is not None:
+            if points["points"] is None or points["extra_joints"] is None:
+                raise wrong("points", "points with extra_joints", "one without the other")
+            extra = ExtraTracks(
+                tuple(map(str, points["points"].tolist())),
+                points["extra_joints"],
+                points["extra_covariance"],
+                points["extra_views"],
+            )
+        return JointTracks(**arrays, extra=extra)
     except InputError as error:
         raise InputError(
             f"{path}: {error.where}", expected=error.expected, found=error.found, todo=error.todo

@@ -9,17 +9,20 @@ Reader and writer of 2D poses as npz: the arrays of `KeypointDetections`, faster
 
 Members: `frame` (frames,) int64, `keypoints` (frames, detections, 17, 2), `confidence` (frames,
 detections, 17), `boxes` (frames, detections, 4) and `score` (frames, detections), all float32 in
-little-endian order, NaN where missing (`data_contracts.keypoints`).
+little-endian order, NaN where missing (`data_contracts.keypoints`). Points besides COCO-17 are in
+`point` (points,), their names as text, `extra_keypoints` (frames, detections, points, 2) and
+`extra_confidence` (frames, detections, points); a file has all three or none.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib import format as npy
@@ -294,6 +297,14 @@ _SHAPES: Final = {
     "boxes": ("frames", "detections", 4),
     "score": ("frames", "detections"),
 }
+_EXTRA_SHAPES: Final = {
+    "point": ("points",),
+    "extra_keypoints": ("frames", "detections", "points", 2),
+    "extra_confidence": ("frames", "detections", "points"),
+}
+"""Members of points besides COCO-17."""
+POINTS_LIMIT: Final = 1000
+"""Maximum number of these points."""
 
 
 def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
@@ -301,9 +312,10 @@ def write_keypoint_arrays(path: Path, people: KeypointDetections) -> None:
 
     The file has no compression, since a compressor's output changes with its version.
     """
+    named = {"point": np.array(people.points, dtype=np.str_)} if people.points else {}
     with zipfile.ZipFile(path, "w") as file:
-        for name, array in {"frame": people.frame, **people.arrays()}.items():
-            dtype = "<i8" if name == "frame" else "<f4"
+        for name, array in {"frame": people.frame, **people.arrays(), **named}.items():
+            dtype = {"frame": "<i8", "point": "<U"}.get(name, "<f4")
             # A ZipInfo from a name alone has the fixed date 1980-01-01.
             with file.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 npy.write_array(member, np.ascontiguousarray(array, dtype), allow_pickle=False)
@@ -325,35 +337,42 @@ def read_keypoint_arrays(path: Path) -> KeypointDetections:
         headers = {name: read_header(path, file, info) for name, info in infos.items()}
         _check_headers(path, infos, headers)
         arrays = {name: read_array(path, file, info) for name, info in infos.items()}
-    people = KeypointDetections(
-        frame=cast("NDArray[np.int64]", arrays["frame"]),
-        keypoints=cast("NDArray[np.float32]", arrays["keypoints"]),
-        confidence=cast("NDArray[np.float32]", arrays["confidence"]),
-        boxes=cast("NDArray[np.float32]", arrays["boxes"]),
-        score=cast("NDArray[np.float32]", arrays["score"]),
-    )
+    people = KeypointDetections.from_arrays(arrays)
+    if len(set(people.points)) < len(people.points) or set(people.points) & set(COCO17):
+        raise npz_error(
+            f"{path}: point", "each point once, and none of COCO-17", f"{people.points}"
+        )
     _check_values(path, people)
     return people
 
 
 def _members(path: Path, file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    names = [info.filename for info in file.infolist()]
+    names = sorted(info.filename for info in file.infolist())
     expected = [f"{name}.npy" for name in _SHAPES]
-    if sorted(names) != sorted(expected):
-        found = ", ".join(names[:8]) or "nothing"
-        raise npz_error(str(path), f"the members {', '.join(expected)}", found)
-    return {name: file.getinfo(f"{name}.npy") for name in _SHAPES}
+    more = [f"{name}.npy" for name in _EXTRA_SHAPES]
+    if names not in (sorted(expected), sorted(expected + more)):
+        raise npz_error(
+            str(path),
+            f"the members {', '.join(expected)}, and all or none of {', '.join(more)}",
+            ", ".join(names[:8]) or "nothing",
+        )
+    members = [*_SHAPES, *(_EXTRA_SHAPES if len(names) > len(expected) else ())]
+    return {name: file.getinfo(f"{name}.npy") for name in members}
 
 
 def _check_headers(
     path: Path, infos: dict[str, zipfile.ZipInfo], headers: dict[str, Header]
 ) -> None:
     sizes: dict[str, int] = {}
-    for name, dims in _SHAPES.items():
-        where = f"{path}: {infos[name].filename}"
+    for name, info in infos.items():
+        dims = {**_SHAPES, **_EXTRA_SHAPES}[name]
+        where = f"{path}: {info.filename}"
         shape, _, dtype = headers[name]
         wanted = np.dtype("<i8" if name == "frame" else "<f4")
-        if dtype != wanted:
+        if name == "point":
+            if dtype.kind != "U" or shape == (0,) or math.prod(shape) > POINTS_LIMIT:
+                raise npz_error(where, f"1 to {POINTS_LIMIT} names as text", f"{dtype} {shape}")
+        elif dtype != wanted:
             raise npz_error(where, f"{wanted.str} ({wanted.name}, little-endian)", dtype.str)
         fits = len(shape) == len(dims) and all(
             n >= 0 and n == (sizes.setdefault(dim, n) if isinstance(dim, str) else dim)
@@ -392,7 +411,7 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
     unlike = (np.isfinite(people.keypoints) != found[..., None]).any(axis=-1)
     far = np.abs(people.keypoints) > COORDINATE_LIMIT
     ordered = ~np.any(people.boxes[..., :2] > people.boxes[..., 2:], axis=-1)
-    checks = (
+    checks = [
         ("keypoints", far.any(axis=-1), f"pixels up to {COORDINATE_LIMIT:g}"),
         ("keypoints", unlike, "finite exactly where confidence is"),
         (
@@ -404,7 +423,21 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
         ("boxes", person & np.isnan(people.boxes).any(axis=-1), "a box for every person"),
         ("score", np.isinf(people.score) | (people.score < 0), "finite values from 0"),
         ("score", person & np.isnan(people.score), "a score for every person"),
-    )
+    ]
+    if people.extra_keypoints is not None and people.extra_confidence is not None:
+        there, sure = np.isfinite(people.extra_keypoints), people.extra_confidence
+        far = np.abs(people.extra_keypoints) > COORDINATE_LIMIT
+        unlike = (there != np.isfinite(sure)[..., None]).any(axis=-1)
+        checks += [
+            ("extra_keypoints", far.any(axis=-1), f"pixels up to {COORDINATE_LIMIT:g}"),
+            ("extra_keypoints", unlike, "finite exactly where extra_confidence is"),
+            ("extra_confidence", (sure <= 0) | (sure > 1), "values in (0, 1], NaN where not found"),
+            (
+                "extra_confidence",
+                np.isfinite(sure) & ~person[..., None],
+                "points only of a person with a keypoint of COCO-17",
+            ),
+        ]
     for name, wrong, rule in checks:
         if np.any(wrong):
             place = tuple(int(i) for i in np.argwhere(wrong)[0])
@@ -457,7 +490,7 @@ def on_frames(
         InputError: the frame numbers or the arrays are too large.
     """
     detections, joints = people.confidence.shape[1:]
-    frame_bytes = 8 + 4 * (3 * joints + 5) * detections
+    frame_bytes = 8 + 4 * (3 * (joints + len(people.points)) + 5) * detections
     total = sum(count for _, count in ranges)
     farthest = max(abs(first) for first, _ in ranges)
     if total * frame_bytes > ARRAY_BYTES or farthest > FRAME_LIMIT:

@@ -125,6 +125,7 @@ TRC_DECIMALS: Final = 3
 def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> None:
     """Write the joints of one person as a TRC file, whole or not at all.
 
+    Markers are the 17 joints, and heels and toes where the clip has them.
     Rows cover every frame from the person's first to last joint; a missing joint has empty cells.
     `Frame#` is the match frame plus one, as such files count from one, and `Time` is that of the
     match frame [s]. Coordinates are y up, in millimetres.
@@ -136,7 +137,8 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
         fps: frames per second.
     """
     first, markers = _rows(tracks, person)
-    count = len(COCO17)
+    names = tracks.markers.points
+    count = len(names)
     values = markers.reshape(len(markers), 3 * count)
     cells = np.char.mod(f"%.{TRC_DECIMALS}f", values)
     cells[np.isnan(values)] = ""
@@ -145,7 +147,7 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
         "\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
         f"{fps:g}\t{fps:g}\t{len(markers)}\t{count}\tmm\t{fps:g}\t1\t{len(markers)}",
-        "Frame#\tTime\t" + "\t\t\t".join(COCO17) + "\t\t",
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
         "\t\t" + "\t".join(f"X{n}\tY{n}\tZ{n}" for n in range(1, count + 1)),
         "",
     ]
@@ -156,14 +158,15 @@ def write_markers(path: Path, tracks: JointTracks, person: int, fps: float) -> N
 
 
 def _rows(tracks: JointTracks, person: int) -> tuple[int, NDArray[np.float64]]:
-    """Return the first match frame, and markers (frames, 17, 3) [mm, y up] from there."""
+    """Return the first match frame, and markers (frames, points, 3) [mm, y up] from there."""
+    joints = tracks.markers.joints
     seen = np.flatnonzero(np.isfinite(tracks.joints[:, person]).any((-1, -2)))
     if not len(seen):
-        return 0, np.empty((0, len(COCO17), 3))
+        return 0, np.empty((0, joints.shape[2], 3))
     numbers = tracks.frames[seen]
     first = int(numbers[0])
-    markers = np.full((int(numbers[-1]) - first + 1, len(COCO17), 3), np.nan)
-    markers[numbers - first] = tracks.joints[seen, person] @ Y_UP.T * MILLIMETRES
+    markers = np.full((int(numbers[-1]) - first + 1, joints.shape[2], 3), np.nan)
+    markers[numbers - first] = joints[seen, person] @ Y_UP.T * MILLIMETRES
     return first, markers
 
 

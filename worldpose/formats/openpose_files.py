@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.conventions import COCO17
+from data_contracts.conventions import COCO17, FEET
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25
@@ -18,14 +19,26 @@ from worldpose.formats.files import read_json
 from worldpose.formats.keypoint_files import COORDINATE_LIMIT, PEOPLE_LIMIT
 
 KEYPOINTS_KEY: Final = "pose_keypoints_2d"
+
+
+class PointOrder(NamedTuple):
+    """A set of keypoints of an estimator."""
+
+    name: str
+    joints: tuple[int, ...]
+    """(17,) places of COCO-17's joints in it."""
+    feet: tuple[int, ...] = ()
+    """(6,) places of `FEET`; none if it has no feet."""
+
+
 PLACES: Final = {
-    17: ("COCO-17", tuple(range(17))),
-    25: ("BODY_25", tuple(BODY25.index(name) for name in COCO17)),
-    26: ("HALPE-26", tuple(range(17))),
-    133: ("COCO-WholeBody", tuple(range(17))),
-    136: ("HALPE-136", tuple(range(17))),
+    17: PointOrder("COCO-17", tuple(range(17))),
+    25: PointOrder("BODY_25", *(tuple(map(BODY25.index, names)) for names in (COCO17, FEET))),
+    26: PointOrder("HALPE-26", tuple(range(17)), (20, 22, 24, 21, 23, 25)),
+    133: PointOrder("COCO-WholeBody", tuple(range(17)), tuple(range(17, 23))),
+    136: PointOrder("HALPE-136", tuple(range(17)), (20, 22, 24, 21, 23, 25)),
 }
-"""Name of a set of keypoints and the places of COCO-17's in it, by its size."""
+"""Sets of keypoints by their size."""
 _NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
@@ -33,7 +46,7 @@ class OpenPoseFolder(NamedTuple):
     """Content of a folder of frames."""
 
     people: KeypointDetections
-    """The keypoints of COCO-17; those of feet, hands and face are left out."""
+    """The keypoints of COCO-17, and `FEET` if the set has them; others are left out."""
     kind: str | None
     """Name of the set of keypoints in the files; None without people."""
 
@@ -65,18 +78,22 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
             found=f"{one} in {file.name}, {two} in {other.name}",
             todo="Use the files of one estimator, and remove older ones.",
         )
-    kind, places = PLACES[next(iter(sizes))] if sizes else (None, tuple(range(17)))
+    order = PLACES[next(iter(sizes))] if sizes else None
+    places = [*order.joints, *order.feet] if order else list(range(17))
     most = max(map(len, people), default=0)
-    values = np.full((len(frames), most, len(COCO17), 3), np.nan, np.float32)
-    for row, found in enumerate(people):
-        for column, person in enumerate(found):
-            values[row, column] = person[list(places)]
+    values = np.full((len(frames), most, len(places), 3), np.nan, np.float32)
+    for row, each in enumerate(people):
+        for column, person in enumerate(each):
+            values[row, column] = person[places]
     keypoints, confidence = values[..., :2], np.minimum(values[..., 2], 1.0)
-    missing = ~(confidence > 0.0)
+    found = np.asarray(confidence > 0.0)
+    # An entry without any keypoint of COCO-17 is no person.
+    there = np.asarray(found[..., :17].any(axis=-1))
+    missing = ~(found & there[..., None])
     keypoints = np.where(missing[..., None], np.nan, keypoints)
     confidence = np.where(missing, np.nan, confidence).astype(np.float32)
-    # An entry without any keypoint is no person.
-    there = ~missing.all(axis=-1)
+    keypoints, feet = np.split(keypoints, [17], axis=-2)
+    confidence, sure = np.split(confidence, [17], axis=-1)
     boxes = np.full((*there.shape, 4), np.nan, np.float32)
     score = np.full(there.shape, np.nan, np.float32)
     boxes[there] = np.concatenate(
@@ -84,7 +101,9 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
     )
     score[there] = np.nanmean(confidence[there], axis=-1)
     detected = KeypointDetections(keypoints, confidence, boxes, score, np.array(frames, np.int64))
-    return OpenPoseFolder(detected, kind)
+    if order is not None and order.feet:
+        detected = replace(detected, points=FEET, extra_keypoints=feet, extra_confidence=sure)
+    return OpenPoseFolder(detected, None if order is None else order.name)
 
 
 def _frame_files(folder: Path) -> dict[int, Path]:
@@ -132,7 +151,7 @@ def _read_frame(file: Path) -> list[NDArray[np.float64]]:
 
 def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN401
     numbers = person.get(KEYPOINTS_KEY) if isinstance(person, dict) else None
-    known = ", ".join(f"{3 * size} ({name})" for size, (name, _) in PLACES.items())
+    known = ", ".join(f"{3 * size} ({order.name})" for size, order in PLACES.items())
     if (
         not isinstance(numbers, list)
         or len(numbers) not in {3 * size for size in PLACES}

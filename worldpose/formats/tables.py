@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
@@ -115,6 +114,8 @@ def _speeds(xy: Floats, fps: float) -> Floats:
 def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> pd.DataFrame:
     """Return one row per frame, person and joint; missing joints have none.
 
+    Heels and toes follow the 17 joints of a person where the clip has them.
+
     Columns: frame, time_s (frame / fps), person, kind (of the person), joint, x_m, y_m, z_m
     (world), x_std_m, y_std_m, z_std_m, views (cameras that contribute), filled (no camera does).
 
@@ -125,23 +126,24 @@ def joints_table(tracks: JointTracks, fps: float, people: Mapping[int, str]) -> 
     """
     import pandas as pd  # late: it takes half a second
 
-    row, person, joint = np.nonzero(np.isfinite(tracks.joints[..., 0]))
+    markers = tracks.markers
+    row, person, joint = np.nonzero(np.isfinite(markers.joints[..., 0]))
     there = (row, person, joint)
     kinds = np.array([people[int(one)] for one in tracks.person_ids], dtype=object)
     std = np.full((len(row), 3), np.nan)
-    if tracks.covariance is not None:
-        std = np.sqrt(np.diagonal(tracks.covariance[there], axis1=-2, axis2=-1))
+    if markers.covariance is not None:
+        std = np.sqrt(np.diagonal(markers.covariance[there], axis1=-2, axis2=-1))
     columns = {
         "frame": tracks.frames[row],
         "time_s": tracks.frames[row] / fps,
         "person": tracks.person_ids[person],
         "kind": pd.Categorical(kinds[person]),
-        "joint": pd.Categorical.from_codes(joint, categories=list(COCO17)),
-        **{f"{axis}_m": tracks.joints[there][:, n] for n, axis in enumerate("xyz")},
+        "joint": pd.Categorical.from_codes(joint, categories=list(markers.points)),
+        **{f"{axis}_m": markers.joints[there][:, n] for n, axis in enumerate("xyz")},
         **{f"{axis}_std_m": std[:, n] for n, axis in enumerate("xyz")},
     }
-    if tracks.views is not None:
-        columns |= {"views": tracks.views[there], "filled": tracks.views[there] == 0}
+    if markers.views is not None:
+        columns |= {"views": markers.views[there], "filled": markers.views[there] == 0}
     return pd.DataFrame(columns)
 
 

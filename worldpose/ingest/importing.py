@@ -415,11 +415,12 @@ def import_pose2sim(
             shutil.copyfile(file, building / "videos" / file.name)
 
     write_match(out, spec, calibrations=cameras, observations=people, further=copy)
-    kinds = sorted({found.kind for found in read.values() if found.kind})
+    kinds = {found.kind: found.people.points for found in read.values() if found.kind}
     notes += [
         f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
-        + ("" if kind == "COCO-17" else ", those of feet, hands and face are left out")
-        for kind in kinds
+        + (" and heels and toes" if points else "")
+        + ("" if kind == "COCO-17" else "; those of hands, face and trunk are left out")
+        for kind, points in sorted(kinds.items())
     ]
     if not poses:
         notes.append(

@@ -48,12 +48,8 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
         found: detected or given observations; not modified.
         edits: edits of this camera, in the order they were made.
     """
-    changed = KeypointDetections(
-        frame=found.frame,
-        keypoints=found.keypoints.copy(),
-        confidence=found.confidence.copy(),
-        boxes=found.boxes.copy(),
-        score=found.score.copy(),
+    changed = found.with_arrays(
+        {name: array.copy() for name, array in found.arrays().items()}, found.frame
     )
     objections = []
     for edit in edits:
@@ -112,7 +108,7 @@ def _with_place(found: KeypointDetections, detection: int) -> KeypointDetections
         name: np.pad(array, [(0, 0), (0, 1)] + [(0, 0)] * (array.ndim - 2), constant_values=np.nan)
         for name, array in found.arrays().items()
     }
-    return KeypointDetections.from_arrays({"frame": found.frame, **widened})
+    return found.with_arrays(widened, found.frame)
 
 
 def _row(found: KeypointDetections, frame: int) -> int | None:

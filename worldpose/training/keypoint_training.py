@@ -15,16 +15,23 @@ from torch.nn import functional
 from data_contracts.arrays import Flags, Floats, Image, Singles
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.records import Record
-from worldpose.detection.bundled_crops import (
-    MAP_CELL,
+from worldpose.detection.bundled_nets import (
+    CELL,
+    CROP,
     MAP_COUNT,
+    KeypointNet,
+    Seen,
+    normalize,
+    peaks,
+)
+from worldpose.detection.bundled_pose import (
+    MAP_CELL,
     SAME_PERSON_IOU,
     crops_around,
     cut_crop,
     frame_from_crop,
     surroundings,
 )
-from worldpose.detection.bundled_nets import CELL, CROP, KeypointNet, Seen, normalize, peaks
 from worldpose.geometry.boxes import box_iou
 from worldpose.training.augmentation import AugmentationSettings, augment
 from worldpose.training.labels import LabelledPicture, PictureCache

@@ -13,8 +13,8 @@ from torch.nn import functional
 
 from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.records import Record
-from worldpose.detection.bundled_crops import cut_crop, frame_from_crop
 from worldpose.detection.bundled_nets import STRIDE, PeopleNet, cell_centres, normalize
+from worldpose.detection.bundled_pose import cut_crop, frame_from_crop
 from worldpose.training.augmentation import AugmentationSettings, augment, draw_clutter
 from worldpose.training.labels import LabelledPicture, PictureCache
 

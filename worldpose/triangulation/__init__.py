@@ -19,7 +19,12 @@ if TYPE_CHECKING:
     )
     from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, shift_in_time
     from worldpose.triangulation.limb_lengths import undo_swaps
-    from worldpose.triangulation.passes import Triangulation, triangulate_joints
+    from worldpose.triangulation.passes import (
+        DetectorModel,
+        ExtraJoints,
+        Triangulation,
+        triangulate_joints,
+    )
     from worldpose.triangulation.reports import TriangulationReport
     from worldpose.triangulation.settings import TriangulationSettings
     from worldpose.triangulation.smoothing import Smoothing, smooth_joints
@@ -28,6 +33,8 @@ __all__ = [
     "CameraClocks",
     "Chunk",
     "ClipModel",
+    "DetectorModel",
+    "ExtraJoints",
     "Reconstruction",
     "Smoothing",
     "Triangulation",
@@ -61,6 +68,8 @@ __getattr__ = import_on_use(
         ),
         "worldpose.triangulation.limb_lengths": ("undo_swaps",),
         "worldpose.triangulation.passes": (
+            "DetectorModel",
+            "ExtraJoints",
             "Triangulation",
             "triangulate_joints",
         ),

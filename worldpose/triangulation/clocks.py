@@ -257,11 +257,15 @@ def read_frames(
     each = [read_frames(detections, slice(frame, frame + 1), late) for frame in frames.tolist()]
     if not each:
         return read_frames(detections, slice(0, 0), late)
-    return KeypointDetections.from_keypoints(
+    found = KeypointDetections.from_keypoints(
         np.concatenate([one.keypoints for one in each]),
         np.concatenate([one.confidence for one in each]),
         np.concatenate([one.detection_index for one in each]),
     )
+    if not detections.points:
+        return found
+    extra = [(one.extra_keypoints, one.extra_confidence) for one in each]
+    return found.add_points(detections.points, *map(np.concatenate, zip(*extra, strict=True)))
 
 
 def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetections:
@@ -274,7 +278,8 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
         late: (cameras,) [frame]; NaN or 0 leaves a camera as it is.
 
     Returns:
-        Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index.
+        Keypoints (frames, cameras, persons, joints, 2), confidence, and the matching index; so are
+        the points besides COCO-17.
     """
     frames, _, persons = detections.detection_index.shape
     row, camera_row, _ = np.ogrid[:frames, : detections.detection_index.shape[1], :persons]
@@ -282,6 +287,10 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
     there = (detections.detection_index >= 0)[..., None]
     pixels = detections.keypoints[place].astype(np.float64, copy=False)
     weights = detections.confidence[place].astype(np.float64, copy=False)
+    joints = weights.shape[-1]
+    if detections.extra_keypoints is not None and detections.extra_confidence is not None:
+        pixels = np.concatenate([pixels, detections.extra_keypoints[place]], axis=-2)
+        weights = np.concatenate([weights, detections.extra_confidence[place]], axis=-1)
     weights = np.where(there & np.isfinite(pixels).all(axis=-1), weights, np.nan)
     for camera in np.flatnonzero(np.nan_to_num(late)):
         time = np.arange(frames) - late[camera]
@@ -297,6 +306,9 @@ def shift_in_time(detections: KeypointDetections, late: Floats) -> KeypointDetec
             moved = (1.0 - part) * of[before] + part * of[after]
             moved[outside] = np.nan
             array[:, camera] = moved
-    seen = np.isfinite(weights).any(axis=-1)
+    seen = np.isfinite(weights[..., :joints]).any(axis=-1)
     index = np.where(seen, np.arange(persons), -1).astype(np.int16)
-    return KeypointDetections.from_keypoints(pixels, weights, index)
+    found = KeypointDetections.from_keypoints(pixels[..., :joints, :], weights[..., :joints], index)
+    if not detections.points:
+        return found
+    return found.add_points(detections.points, pixels[..., joints:, :], weights[..., joints:])

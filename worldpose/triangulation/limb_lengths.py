@@ -39,6 +39,13 @@ PART_OF: Final = np.repeat(
     np.arange(len(EXCHANGED_PARTS)), [len(names) for names in EXCHANGED_PARTS.values()]
 )
 """(pairs,) part of each pair."""
+POINT_PARTS: Final = {
+    **dict.fromkeys(("toe", "heel", "thigh", "shank", "foot"), "legs"),
+    **dict.fromkeys(("upper_arm", "forearm"), "arms"),
+    "head": "face",
+}
+"""Part of the body that a point besides COCO-17 belongs to, by a word in its name; others are of
+the trunk, and swapped with arms and legs together."""
 WHOLE: Final = 2.0 * math.log(50.0)
 """Twice the logarithm of the prior odds against a left-right swap of the whole body: detectors
 mistake one back in fifty for a front. Half or one and a half times as much changes mean errors by
@@ -72,7 +79,7 @@ def find_swaps(
 
 
 def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDetections:
-    """Return detections with left-right swaps undone.
+    """Return detections with left-right swaps undone, also of the points besides COCO-17.
 
     Args:
         detections: detections before any correction; not changed.
@@ -88,7 +95,37 @@ def undo_swaps(detections: KeypointDetections, exchanged: Flags) -> KeypointDete
         of_part = PAIRS[part == PART_OF]
         for right, seen in ((keypoints, detections.keypoints), (confidence, detections.confidence)):
             right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
-    return replace(detections, keypoints=keypoints, confidence=confidence)
+    swapped = replace(detections, keypoints=keypoints, confidence=confidence)
+    if detections.extra_keypoints is None or detections.extra_confidence is None:
+        return swapped
+    points = detections.points
+    extra, sure = detections.extra_keypoints.copy(), detections.extra_confidence.copy()
+    names = list(EXCHANGED_PARTS)
+    limbs = exchanged[..., [names.index(part) for part in ("arms", "legs")]].all(axis=-1)
+    for name in (*names, ""):
+        of_part = _point_pairs(points, name)
+        its = exchanged[..., names.index(name)] if name else limbs
+        frame, camera, person = np.nonzero(its)
+        detection = detections.detection_index[frame, camera, person]
+        place = tuple(each[:, None] for each in (frame, camera, detection))
+        for right, seen in (
+            (extra, detections.extra_keypoints),
+            (sure, detections.extra_confidence),
+        ):
+            right[(*place, of_part.ravel())] = seen[(*place, of_part[:, ::-1].ravel())]
+    return swapped.add_points(points, extra, sure)
+
+
+def _point_pairs(points: tuple[str, ...], part: str) -> NDArray[np.int64]:
+    """Return left and right points (pairs, 2) of a part; those of the trunk without a name."""
+    pairs = [
+        (place, points.index(mirrored))
+        for place, point in enumerate(points)
+        if point.startswith("left_")
+        and (mirrored := point.replace("left_", "right_", 1)) in points
+        and part == next((its for word, its in POINT_PARTS.items() if word in point), "")
+    ]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 @compile_kernel

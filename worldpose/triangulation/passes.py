@@ -53,16 +53,47 @@ class DetectorModel:
         factor: on the stated variance of calibration.
         lengths: (persons, limbs) [m], limb lengths; NaN where unknown.
         common_bias: (joints,) per axis, error that all views share [m].
+        extra_noise: noise model of points besides COCO-17; None without any.
     """
 
     noise: tuple[NoiseModel, ...]
     factor: float
     lengths: Floats
     common_bias: Floats
+    extra_noise: NoiseModel | None = None
 
     def select_person(self, person: int) -> DetectorModel:
         """Return the model for one person alone."""
         return replace(self, lengths=self.lengths[person : person + 1])
+
+
+@dataclass(frozen=True, eq=False)
+class ExtraJoints:
+    """Points besides COCO-17 in 3D, with covariance.
+
+    Attributes:
+        points: (points,) names.
+        joints: (frames, persons, points, 3) [m], world; NaN where not determined.
+        covariance: (frames, persons, points, 3, 3) [m^2], of `joints`: noise from their residuals,
+            calibration, and the bias that all views share.
+        views: (frames, persons, points) uint8, inlier cameras; 0 where not determined.
+        common_bias: (points,) per axis, error that all views share [m]; in `covariance`.
+    """
+
+    points: tuple[str, ...]
+    joints: Floats
+    covariance: Floats
+    views: NDArray[np.uint8]
+    common_bias: Floats
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[ExtraJoints]) -> ExtraJoints:
+        """Return the points of consecutive parts of a clip."""
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("joints", "covariance", "views")
+        }
+        return replace(parts[0], **arrays)
 
 
 @dataclass(frozen=True)
@@ -88,6 +119,7 @@ class Triangulation:
         common_bias: (17,) per axis, error that all views share [m]; included in `covariance`.
         noise: noise model of the detector.
         agreement: counts and histograms behind `report`.
+        extra: points besides COCO-17, which influence none of the above; None without any.
     """
 
     joints: Floats
@@ -102,6 +134,7 @@ class Triangulation:
     common_bias: Floats
     noise: NoiseModel
     agreement: Agreement
+    extra: ExtraJoints | None = None
 
     @property
     def shared_covariance(self) -> Floats:
@@ -140,7 +173,13 @@ def concatenate_frames(parts: Sequence[Triangulation]) -> Triangulation:
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in BY_FRAME
     }
-    return replace(parts[0], **arrays, agreement=reduce(add, (part.agreement for part in parts)))
+    extra = [part.extra for part in parts if part.extra is not None]
+    return replace(
+        parts[0],
+        **arrays,
+        agreement=reduce(add, (part.agreement for part in parts)),
+        extra=ExtraJoints.concatenate(extra) if extra else None,
+    )
 
 
 def triangulate_joints(
@@ -185,7 +224,7 @@ def triangulate_joints(
         passes.offset_covariance + bias[:, None, None] ** 2 * np.eye(3), solution.covariance.shape
     )
     covariance = solution.covariance + lasting
-    return Triangulation(
+    found = Triangulation(
         joints=solution.joints,
         covariance=covariance,
         views=solution.views,
@@ -199,6 +238,18 @@ def triangulate_joints(
         noise=noise,
         agreement=_count_agreement(passes, covariance, detections.detection_index),
     )
+    if passes.extra is None:
+        return found
+    # Calibration moves all points of a person together, as it does the joints.
+    shared = np.nan_to_num(found.shared_covariance) + settings.common_bias_m**2 * np.eye(3)
+    extra = ExtraJoints(
+        detections.points,
+        passes.extra.joints,
+        passes.extra.covariance + shared[:, :, None],
+        passes.extra.views,
+        np.full(len(detections.points), settings.common_bias_m),
+    )
+    return replace(found, extra=extra)
 
 
 def sample_frames(shape: tuple[int, ...], joints: int) -> NDArray[np.int64]:
@@ -228,6 +279,7 @@ class _Passes:
     offset_covariance: Floats | float
     model: DetectorModel
     misplaced: tuple[Histogram, ...]
+    extra: Solution | None
 
 
 def _run_passes(
@@ -297,8 +349,23 @@ def _run_passes(
     elif settings.learn_noise and len(bias) == len(BY_JOINT):
         seen_noise = solution.covariance + offset_covariance
         bias = BY_JOINT * learn_common_bias(solution.joints, seen_noise, settings.common_bias_m)
-    model = DetectorModel(tuple(models), factor, lengths, bias)
-    return _Passes(solution, exchanged, shift, offset_covariance, model, misplaced)
+    extra, extra_noise = None, None
+    if detections.points:
+        points = detections.select_points()
+        extra_noise = NoiseModel.nominal(len(detections.points))
+        if known is not None and known.extra_noise is not None:
+            extra_noise = known.extra_noise
+        elif settings.learn_noise:
+            extra_noise = learn_noise(rig, points, shift, settings.noise, limit)
+        precision = extra_noise.precision(points.confidence)
+        extra = solve_joints(
+            Observations.from_rig(
+                rig, points.keypoints, precision, detections.detection_index, shift
+            ),
+            settings,
+        )
+    model = DetectorModel(tuple(models), factor, lengths, bias, extra_noise)
+    return _Passes(solution, exchanged, shift, offset_covariance, model, misplaced, extra)
 
 
 def _count_agreement(passes: _Passes, covariance: Floats, index: NDArray[np.integer]) -> Agreement:

@@ -374,7 +374,7 @@ def shift_frames(
             inside = (rows >= 0) & (rows < frames)
             moved[inside, k] = array[rows[inside], camera]
         arrays[name] = moved
-    return KeypointDetections(frame=np.arange(frames), **arrays)
+    return detections.with_arrays(arrays, np.arange(frames))
 
 
 class _Table:

@@ -3,7 +3,6 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from worldpose.detection.bundled_crops import crops_around, cut_crop, frame_from_crop
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import (
     CROP,
@@ -17,7 +16,13 @@ from worldpose.detection.bundled_nets import (
     peaks,
     save_weights,
 )
-from worldpose.detection.bundled_pose import BundledPoseEstimator, CropEstimates
+from worldpose.detection.bundled_pose import (
+    BundledPoseEstimator,
+    CropEstimates,
+    crops_around,
+    cut_crop,
+    frame_from_crop,
+)
 from worldpose.detection.models import (
     BUNDLED_WEIGHTS,
     QUANTIZED_WEIGHTS,

@@ -8,9 +8,13 @@ from pydantic import ValidationError
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
-from worldpose.detection.bundled_crops import surroundings
 from worldpose.detection.bundled_nets import decode_candidates
-from worldpose.detection.bundled_pose import CropEstimates, assign_joints, find_occluded_people
+from worldpose.detection.bundled_pose import (
+    CropEstimates,
+    assign_joints,
+    find_occluded_people,
+    surroundings,
+)
 from worldpose.detection.interfaces import FindsOccludedPeople
 from worldpose.detection.models import load_bundled_pose
 from worldpose.detection.views import FlipTest

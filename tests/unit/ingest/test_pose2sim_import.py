@@ -82,7 +82,7 @@ def test_a_trial_becomes_a_match(trial, tmp_path):
     spec, notes = import_pose2sim(trial, tmp_path / "m")
     clip = spec.clips[0]
     assert (spec.fps, clip.first_frame, clip.frame_count) == (60.0, 10, 4)
-    assert any("HALPE-26; kept are the 17 keypoints of COCO, those of feet" in n for n in notes)
+    assert any("HALPE-26; kept are the 17 keypoints of COCO and heels and toes" in n for n in notes)
     match = read_match(tmp_path / "m")
     people, given = read_unit(match, "cam02")
     expected = person(26, 100 + 100 + 1)[1]

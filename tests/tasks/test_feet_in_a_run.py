@@ -1,0 +1,153 @@
+"""Heels and toes of 2D poses reach the store of every stage, and the exports of a run."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import FEET
+from flows.match import task_of
+from flows.method import METHOD
+from flows.registering import register
+from flows.results.best_results import joint_tracks
+from flows.run_plan import plan_run
+from worldpose.body import BodyParameters, find_body, fold_keypoints
+from worldpose.formats import read_camera
+from worldpose.formats.joints_file import read_poses
+from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.store import Store
+
+STAGES = (
+    *("ingest", "static_calibration", "camera_consistency", "tracking", "triangulation"),
+    *("bundle_adjustment", "retriangulation", "body_fitting"),
+)
+NOISE_PX = 1.0
+
+
+class Results(dict):
+    """Results of a run by unit, as `worldpose.store.Run` gives them."""
+
+
+def add_feet(folder):
+    """Give the 2D poses of all static cameras but the first the feet of their people."""
+    poses, _ = read_poses(folder / "reference" / "poses" / "clip.npz")
+    feet = fold_keypoints(find_body(), FEET)(poses)  # (persons, frames, 6, 3)
+    rng = np.random.default_rng(0)
+    for file in sorted((folder / "detections").glob("cam*.npz"))[1:]:
+        camera = read_camera(folder / "reference" / "cameras" / file.name)[0]
+        with np.load(folder / "reference" / "identities" / file.name) as known:
+            person, frame = known["person"], known["frame"]
+        people = read_keypoint_arrays(file)
+        assert people.frame.tolist() == frame.tolist()
+        shown = camera.project(feet[np.maximum(person, 0), np.arange(len(frame))[:, None]])
+        shown += NOISE_PX * rng.standard_normal(shown.shape)
+        body = np.isfinite(people.confidence).any(axis=-1)
+        there = np.isfinite(shown[..., 0]) & ((person >= 0) & body)[..., None]
+        pixels = np.where(there[..., None], shown, np.nan).astype(np.float32)
+        sure = np.where(there, 0.9, np.nan).astype(np.float32)
+        write_keypoint_arrays(file, people.add_points(FEET, pixels, sure))
+    return np.asarray(feet.swapaxes(0, 1))
+
+
+def compute(folder, project):
+    """Compute all units up to bodies in this process; return their results by name."""
+    store = Store.create(project)
+    match, _ = register(store, folder)
+    stages = {stage.name: stage for stage in METHOD}
+    found = {}
+    for unit in plan_run(store, match, {}):
+        if unit.recipe.stage in STAGES:
+            task_of(stages[unit.recipe.stage]).fn(unit.work(store.url, match, "0001"))
+            found[unit.name] = store.open_result(
+                match.match_id, unit.recipe.stage, unit.recipe.unit, unit.key
+            )
+    return found
+
+
+@pytest.fixture(scope="module")
+def runs(tiny, tmp_path_factory):
+    """Results without and with feet, and the true feet (frames, persons, 6, 3) [m]."""
+    base = tmp_path_factory.mktemp("feet")
+    found = []
+    for name in ("plain", "feet"):
+        folder = shutil.copytree(tiny, base / name)
+        shutil.copy(folder / "reference" / "calibration.toml", folder)
+        truth = add_feet(folder) if name == "feet" else None
+        found.append(compute(folder, base / f"{name}-project"))
+    return found[0], found[1], truth
+
+
+def test_other_results_are_those_without_feet(runs):
+    plain, with_feet, _ = runs
+    assert plain.keys() == with_feet.keys()
+    for name, result in plain.items():
+        assert "point" not in result.dims and not [v for v in result if v.startswith("extra")]
+        stage = name.split("/")[0]
+        changed = {"body_pose", "global_orient", "transl", "joints", "covariance"}
+        for array in result.data_vars:
+            if stage != "body_fitting" or array not in changed:
+                np.testing.assert_array_equal(
+                    result[array].values, with_feet[name][array].values, err_msg=f"{name} {array}"
+                )
+
+
+def test_ingest_stores_them_by_name(runs):
+    found = runs[1]
+    assert found["ingest/cam01"]["point"].values.tolist() == list(FEET)
+    assert np.isfinite(found["ingest/cam01"]["extra_keypoints"].values).any()
+    assert "extra_keypoints" not in found["ingest/cam00"]  # the camera without feet
+
+
+def true_people(result, truth):
+    """Return the true feet of the people of a result, who are nearest to their triangulation."""
+    joints = result["extra_joints"].values
+    away = np.linalg.norm(joints[:, :, None] - truth[:, None], axis=-1)
+    return truth[:, np.nanmedian(away, axis=(0, 3)).argmin(axis=1)]
+
+
+@pytest.mark.parametrize("stage", ["triangulation", "retriangulation"])
+def test_triangulation_finds_them(runs, stage):
+    _, found, truth = runs
+    result = found[f"{stage}/clip"]
+    assert result["point"].values.tolist() == list(FEET)
+    away = np.linalg.norm(result["extra_joints"].values - true_people(result, truth), axis=-1)
+    assert np.nanmedian(away) < 0.03
+    assert np.isfinite(away).mean() > 0.6
+    assert (result["extra_views"].values[np.isfinite(away)] >= 2).all()
+
+
+def test_bodies_follow_them(runs):
+    plain, found, truth = runs
+    result = found["body_fitting/clip"]
+    wanted = true_people(result, truth)
+    errors = []
+    for each in (plain["body_fitting/clip"], result):
+        bodies = BodyParameters(
+            np.broadcast_to(each["betas"].values, (*each["transl"].shape[:2], 10)),
+            *(each[name].values for name in ("global_orient", "body_pose", "transl")),
+        )
+        feet = fold_keypoints(find_body(), FEET)(bodies)
+        errors.append(np.nanmedian(np.linalg.norm(feet - wanted, axis=-1)))
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_joint_tracks_carry_them_in_both_definitions(runs):
+    run = Results(runs[1])
+    assert joint_tracks(Results(runs[0]), "clip").extra is None
+    body, seen = (joint_tracks(run, "clip", definition=name).extra for name in ("body", "detector"))
+    placed = joint_tracks(run, "clip", "retriangulation")
+    assert body.points == seen.points == placed.extra.points == FEET
+    result = run["body_fitting/clip"]
+    np.testing.assert_array_equal(body.joints, result["extra_joints"].values)
+    length = np.linalg.norm(result["extra_offsets"].values, axis=-1)
+    moved = np.linalg.norm(seen.joints - body.joints, axis=-1)
+    np.testing.assert_allclose(
+        moved[np.isfinite(moved).all(axis=-1)].mean(axis=0), length, atol=1e-9
+    )
+    # Offsets bring bodies nearer to what the views show.
+    near, far = (
+        np.nanmedian(np.linalg.norm(each.joints - placed.extra.joints, axis=-1))
+        for each in (seen, body)
+    )
+    assert near < far + 1e-3
+    assert (body.views == placed.extra.views).all()

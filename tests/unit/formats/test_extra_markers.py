@@ -1,0 +1,120 @@
+"""Heels and toes come back from every file of joints; files without them stay as they were."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_marker_file import read_trc
+
+from data_contracts.conventions import COCO17, FEET
+from worldpose.errors import InputError
+from worldpose.formats import JointTracks, read_joints, write_joints
+from worldpose.formats.c3d_file import write_c3d
+from worldpose.formats.joints_file import ExtraTracks, fill_gaps
+from worldpose.formats.motion_capture import write_markers
+from worldpose.formats.tables import joints_table, write_csv
+
+FPS = 50.0
+
+
+@pytest.fixture
+def tracks():
+    """Two people over four frames; a toe of the second is missing in one of them."""
+    rng = np.random.default_rng(0)
+    shape = (4, 2, 6)
+    feet = rng.uniform(-50.0, 50.0, (*shape, 3))
+    feet[1, 1, 3] = np.nan
+    views = np.full(shape, 3)
+    views[2, 1, 5] = 0
+    extra = ExtraTracks(FEET, feet, np.zeros((*shape, 3, 3)) + 4e-4 * np.eye(3), views)
+    return JointTracks(
+        np.arange(100, 104),
+        np.array([4, 9]),
+        rng.uniform(-50.0, 50.0, (4, 2, 17, 3)),
+        np.zeros((4, 2, 17, 3, 3)) + 1e-4 * np.eye(3),
+        np.full((4, 2, 17), 5),
+        extra,
+    )
+
+
+def test_a_joints_file_keeps_them(tracks, tmp_path):
+    write_joints(tmp_path / "a.npz", tracks)
+    back = read_joints(tmp_path / "a.npz").extra
+    assert back.points == FEET
+    for name in ("joints", "covariance", "views"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(tracks.extra, name))
+    bare = replace(tracks, extra=replace(tracks.extra, covariance=None, views=None))
+    write_joints(tmp_path / "b.npz", bare)
+    back = read_joints(tmp_path / "b.npz").extra
+    assert back.covariance is None and back.views is None
+
+
+def test_a_joints_file_without_them_has_the_same_bytes_as_before(tracks, tmp_path):
+    write_joints(tmp_path / "a.npz", replace(tracks, extra=None))
+    with np.load(tmp_path / "a.npz") as file:
+        assert set(file) == {"frames", "person_ids", "joints", "covariance", "views"}
+    assert read_joints(tmp_path / "a.npz").extra is None
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"points": ("nose", *FEET[1:])}, "none of COCO-17"),
+        ({"points": (FEET[1], *FEET[1:])}, "each name once"),
+        ({"joints": np.zeros((4, 2, 5, 3))}, "extra_joints"),
+        ({"views": np.zeros((4, 2, 6, 1), int)}, "extra_views"),
+        ({"joints": np.full((4, 2, 6, 3), [np.nan, 0.0, 0.0])}, "finite x, y, z or none"),
+    ],
+)
+def test_wrong_points_are_refused(tracks, change, word):
+    with pytest.raises(InputError, match=word):
+        replace(tracks, extra=replace(tracks.extra, **change))
+
+
+def test_names_without_points_are_refused(tracks, tmp_path):
+    write_joints(tmp_path / "a.npz", tracks)
+    with np.load(tmp_path / "a.npz") as file:
+        arrays = {name: file[name] for name in file if name != "extra_joints"}
+    np.savez(tmp_path / "b.npz", **arrays)
+    with pytest.raises(InputError, match="one without the other"):
+        read_joints(tmp_path / "b.npz")
+
+
+def test_c3d_has_them_as_points(tracks, tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    write_c3d(tmp_path / "p.c3d", tracks, 1, FPS, {})
+    file = ezc3d.c3d(str(tmp_path / "p.c3d"))
+    assert file["parameters"]["POINT"]["LABELS"]["value"] == [*COCO17, *FEET]
+    points = file["data"]["points"][:3, 17:].transpose(2, 1, 0) / 1000.0
+    np.testing.assert_allclose(points, tracks.extra.joints[:, 1], atol=1e-4)
+    residuals = file["data"]["meta_points"]["residuals"][0].T
+    assert (residuals[1, 20], residuals[2, 22]) == (-1.0, 0.0)
+
+
+def test_trc_has_them_as_markers(tracks, tmp_path):
+    write_markers(tmp_path / "p.trc", tracks, 1, FPS)
+    _, names, _, _, markers = read_trc(tmp_path / "p.trc")
+    assert tuple(names) == (*COCO17, *FEET)
+    back = np.stack([markers[..., 0], -markers[..., 2], markers[..., 1]], axis=-1) / 1000.0
+    np.testing.assert_allclose(back[:, 17:], tracks.extra.joints[:, 1], atol=5.1e-7)
+
+
+def test_tables_have_a_row_for_each(tracks, tmp_path):
+    table = joints_table(tracks, FPS, {4: "triangulated", 9: "triangulated"})
+    assert len(table) == 4 * 2 * 23 - 1
+    write_csv(tmp_path / "joints.csv", table, {"licence": "For tests alone."})
+    back = pd.read_csv(tmp_path / "joints.csv")
+    row = back[(back.frame == 102) & (back.person == 9) & (back.joint == "right_heel")]
+    np.testing.assert_allclose(
+        row[["x_m", "y_m", "z_m"]].to_numpy()[0], tracks.extra.joints[2, 1, 5], atol=1e-5
+    )
+    assert row.filled.item() and row.x_std_m.item() == pytest.approx(0.02)
+
+
+def test_gaps_of_them_are_filled_on_request(tracks):
+    extra = fill_gaps(tracks).extra
+    assert np.isfinite(extra.joints).all()
+    assert extra.views[1, 1, 3] == 0 and np.isnan(extra.covariance[1, 1, 3]).all()
+    there = np.isfinite(tracks.extra.joints)
+    np.testing.assert_array_equal(extra.joints[there], tracks.extra.joints[there])

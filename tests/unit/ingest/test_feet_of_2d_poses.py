@@ -1,0 +1,183 @@
+"""Heels and toes of 2D poses are kept beside the 17 keypoints: in memory, files and a store."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_pose2sim_import import person, write_frame
+
+from data_contracts.conventions import COCO17, FEET
+from data_contracts.ingest import INGEST
+from data_contracts.keypoints import KeypointDetections
+from tasks.clip_inputs import StoredArray, _align_points
+from worldpose.errors import InputError
+from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
+from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.store.groups import checked_arrays, checked_attributes
+
+PLACES = {
+    25: (19, 20, 21, 22, 23, 24),
+    26: (20, 22, 24, 21, 23, 25),
+    133: (17, 18, 19, 20, 21, 22),
+    136: (20, 22, 24, 21, 23, 25),
+}
+"""Left and right big toe, small toe and heel in the published orders."""
+
+
+def people(frames=3, detections=2, points=FEET, seed=0):
+    rng = np.random.default_rng(seed)
+    shape = (frames, detections)
+    corner = rng.uniform(0, 100, (*shape, 2))
+    return KeypointDetections(
+        keypoints=rng.uniform(100, 900, (*shape, 17, 2)).astype(np.float32),
+        confidence=rng.uniform(0.1, 1.0, (*shape, 17)).astype(np.float32),
+        boxes=np.concatenate([corner, corner + 900], axis=-1).astype(np.float32),
+        score=rng.uniform(0.1, 1.0, shape).astype(np.float32),
+        frame=np.arange(4, 4 + frames),
+        points=points,
+        extra_keypoints=rng.uniform(100, 900, (*shape, len(points), 2)).astype(np.float32),
+        extra_confidence=rng.uniform(0.1, 1.0, (*shape, len(points))).astype(np.float32),
+    )
+
+
+def same(one, two):
+    assert one.points == two.points
+    assert one.arrays().keys() == two.arrays().keys()
+    for name, array in one.arrays().items():
+        np.testing.assert_array_equal(array, two.arrays()[name])
+
+
+@pytest.mark.parametrize(("size", "places"), PLACES.items())
+def test_every_set_with_feet_gives_them_in_one_order(tmp_path, size, places):
+    values, _ = person(size, 3)
+    values[places[4]] = 0.0  # the right small toe, missing
+    write_frame(tmp_path / "a_json", 7, [values])
+    found = read_openpose_folder(tmp_path / "a_json").people
+    assert found.points == FEET
+    seen = np.arange(6) != 4
+    wanted = values[list(places)]
+    np.testing.assert_allclose(found.extra_keypoints[0, 0, seen], wanted[seen, :2], rtol=1e-6)
+    np.testing.assert_allclose(found.extra_confidence[0, 0, seen], wanted[seen, 2], rtol=1e-6)
+    assert np.isnan(found.extra_keypoints[0, 0, 4]).all()
+    assert np.isnan(found.extra_confidence[0, 0, 4])
+    # Box and score are those of COCO-17, as without feet.
+    body = found.keypoints[0, 0]
+    np.testing.assert_array_equal(found.boxes[0, 0], [*body.min(axis=0), *body.max(axis=0)])
+
+
+def test_feet_alone_are_no_person(tmp_path):
+    values, _ = person(26, 1)
+    values[:17] = 0.0
+    write_frame(tmp_path / "a_json", 0, [values, person(26, 2)[0]])
+    found = read_openpose_folder(tmp_path / "a_json").people
+    assert np.isnan(found.extra_confidence[0, 0]).all()
+    assert np.isfinite(found.extra_confidence[0, 1]).all()
+
+
+def test_a_set_without_feet_has_no_further_arrays(tmp_path):
+    write_frame(tmp_path / "a_json", 0, [person(17, 1)[0]])
+    found = read_openpose_folder(tmp_path / "a_json").people
+    assert found.points == () and found.extra_keypoints is None
+    assert set(found.arrays()) == {"keypoints", "confidence", "boxes", "score"}
+
+
+def test_files_keep_them(tmp_path):
+    given = people()
+    write_keypoint_arrays(tmp_path / "a.npz", given)
+    same(read_keypoint_arrays(tmp_path / "a.npz"), given)
+    plain = given.with_points(())
+    write_keypoint_arrays(tmp_path / "b.npz", plain)
+    same(read_keypoint_arrays(tmp_path / "b.npz"), plain)
+
+
+def broken(given, fault):
+    extra, sure = given.extra_keypoints.copy(), given.extra_confidence.copy()
+    if fault == "lone":
+        sure[0, 0, 0] = np.nan
+    if fault == "large":
+        sure[0, 0, 0] = 1.5
+    if fault == "far":
+        extra[0, 0, 0] = 1e7
+    return given.add_points(("nose",) * 6 if fault == "named" else given.points, extra, sure)
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [
+        ("lone", "extra_keypoints"),
+        ("large", "extra_confidence"),
+        ("far", "pixels up to"),
+        ("named", "none of COCO-17"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_place(tmp_path, fault, word):
+    write_keypoint_arrays(tmp_path / "a.npz", broken(people(), fault))
+    with pytest.raises(InputError, match=word):
+        read_keypoint_arrays(tmp_path / "a.npz")
+
+
+def test_a_person_without_joints_has_no_feet_in_a_file(tmp_path):
+    given = people()
+    given = given.without(np.ones((3, 2, 17), dtype=bool))
+    write_keypoint_arrays(tmp_path / "a.npz", given)
+    with pytest.raises(InputError, match="points only of a person"):
+        read_keypoint_arrays(tmp_path / "a.npz")
+
+
+def test_all_selections_keep_them():
+    given = people()
+    same(
+        given[1:],
+        replace(given, **{n: a[1:] for n, a in given.arrays().items()}, frame=given.frame[1:]),
+    )
+    one = given.select(slice(1, 2))
+    np.testing.assert_array_equal(one.extra_keypoints, given.extra_keypoints[:, 1:2])
+    wider = given.reindex(np.arange(3, 9))
+    np.testing.assert_array_equal(wider.extra_keypoints[1:4], given.extra_keypoints)
+    assert np.isnan(wider.extra_confidence[[0, 4, 5]]).all()
+    both = KeypointDetections.concatenate([given, given])
+    np.testing.assert_array_equal(both.extra_confidence[:, 2:], given.extra_confidence)
+
+
+def test_cameras_with_other_points_are_padded():
+    one, other = people(), people(points=(), seed=1)
+    stacked = KeypointDetections.stack(
+        [one, replace(other, extra_keypoints=None, extra_confidence=None)]
+    )
+    assert stacked.points == FEET
+    np.testing.assert_array_equal(stacked.extra_keypoints[:, 0], one.extra_keypoints)
+    assert np.isnan(stacked.extra_confidence[:, 1]).all()
+
+
+def stored(given):
+    """Return detections as the store gives them."""
+    arrays = checked_arrays(INGEST, given.arrays(), {"frame": given.frame})
+    labels = checked_attributes(INGEST, arrays, {"camera_id": "a", "video": None, **given.labels()})
+    dims = {name: INGEST.layout(name).dims for name in arrays}
+    data = xr.Dataset({name: (dims[name], array) for name, array in arrays.items()})
+    return data.assign_coords(point=labels["point"]) if "point" in labels else data
+
+
+def test_a_store_keeps_them_and_labels_them():
+    given = people()
+    same(KeypointDetections.from_arrays(stored(given)), given)
+    plain = given.with_points(())
+    assert "extra_keypoints" not in stored(plain)
+    same(KeypointDetections.from_arrays(stored(plain)), plain)
+
+
+def test_a_clip_aligns_the_points_of_its_cameras():
+    one, two, plain = people(), people(points=FEET[:3], seed=1), people(seed=2).with_points(())
+    clips, points = _align_points([stored(one), stored(two), stored(plain)])
+    assert points == FEET
+    read = StoredArray(clips, "extra_keypoints")[:]
+    np.testing.assert_array_equal(read[:, 0], one.extra_keypoints)
+    np.testing.assert_array_equal(read[:, 1, :, :3], two.extra_keypoints)
+    assert np.isnan(read[:, 1, :, 3:]).all() and np.isnan(read[:, 2]).all()
+    clips, points = _align_points([stored(plain)])
+    assert points == () and "extra_keypoints" not in clips[0]
+
+
+def test_the_names_are_no_keypoints_of_coco():
+    assert not set(FEET) & set(COCO17)

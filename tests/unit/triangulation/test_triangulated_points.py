@@ -1,0 +1,170 @@
+"""Points besides COCO-17 are triangulated like joints, and change none of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_contracts.conventions import FEET
+from data_contracts.keypoints import KeypointDetections
+from worldpose.triangulation import (
+    TriangulationSettings,
+    learn_clip,
+    reconstruct_chunks,
+    reconstruct_joints,
+    shift_in_time,
+    triangulate_joints,
+    undo_swaps,
+)
+
+NOISE = 2.0
+FPS = 50.0
+
+
+@pytest.fixture
+def clip(ring, seen):
+    """Six cameras, two people; true points (frames, persons, 6, 3) and noisy detections."""
+    rng = np.random.default_rng(5)
+    cameras = ring(6)
+    time = np.arange(60)[:, None, None, None] / FPS
+    body = rng.uniform(-0.4, 0.4, (1, 2, 23, 3)) + [[[0.0, 0.0, 1.0]]]
+    places = (
+        body + np.array([0.0, 0.0, 0.0, 4.0]).reshape(1, 2, 1, 2)[..., :1] + time * [1.0, 0.5, 0.0]
+    )
+    keypoints, confidence, index = seen(cameras, places)
+    keypoints = keypoints + NOISE * rng.standard_normal(keypoints.shape)
+    detections = KeypointDetections.from_keypoints(
+        keypoints[..., :17, :], confidence[..., :17], index
+    )
+    feet = keypoints[..., 17:, :], confidence[..., 17:]
+    return cameras, detections, detections.add_points(FEET, *feet), places[..., 17:, :]
+
+
+def test_joints_are_bit_for_bit_those_without_points(clip):
+    cameras, plain, with_feet, _ = clip
+    one = reconstruct_joints(cameras, plain, FPS)
+    two = reconstruct_joints(cameras, with_feet, FPS)
+    assert one.triangulation.extra is None
+    for name in ("joints", "covariance", "views", "inliers", "exchanged", "offsets"):
+        np.testing.assert_array_equal(
+            getattr(one.triangulation, name), getattr(two.triangulation, name)
+        )
+    np.testing.assert_array_equal(one.smoothing.joints, two.smoothing.joints)
+
+
+def test_points_are_found_within_their_noise(clip):
+    cameras, _, with_feet, truth = clip
+    found = triangulate_joints(cameras, with_feet, replace_settings(offsets="none")).extra
+    assert found.points == FEET and found.joints.shape == truth.shape
+    away = found.joints - truth
+    # 30 m away at 1500 px, 2 px are 40 mm across one ray; six views leave half of that.
+    assert 0.01 < np.sqrt((away**2).mean()) < 0.03
+    random = found.covariance - found.common_bias[0] ** 2 * np.eye(3)
+    square = np.einsum("fpka,fpkab,fpkb->fpk", away, np.linalg.inv(random), away)
+    assert 2.4 < square.mean() < 3.6  # chi-square of three degrees of freedom
+    assert (found.views >= 5).mean() > 0.95
+
+
+def replace_settings(**changes):
+    return TriangulationSettings().model_copy(update=changes)
+
+
+def test_their_noise_is_learned_apart_from_that_of_joints(clip):
+    cameras, plain, with_feet, _ = clip
+    rng = np.random.default_rng(1)
+    worse = with_feet.extra_keypoints + 6.0 * rng.standard_normal(with_feet.extra_keypoints.shape)
+    noisy = plain.add_points(FEET, worse, with_feet.extra_confidence)
+    settings = replace_settings(offsets="none")
+    exact = triangulate_joints(cameras, with_feet, settings).extra
+    rough = triangulate_joints(cameras, noisy, settings).extra
+
+    def noise(extra):
+        random = extra.covariance - extra.common_bias[0] ** 2 * np.eye(3)
+        return np.sqrt(np.nanmean(np.einsum("...aa", random)))
+
+    assert noise(rough) == pytest.approx(noise(exact) * np.hypot(2.0, 6.0) / 2.0, rel=0.15)
+
+
+def test_a_gross_error_of_one_view_is_rejected(clip):
+    cameras, plain, with_feet, truth = clip
+    shifted = with_feet.extra_keypoints.copy()
+    shifted[:, 2] += 80.0
+    found = triangulate_joints(
+        cameras,
+        plain.add_points(FEET, shifted, with_feet.extra_confidence),
+        replace_settings(offsets="none"),
+    ).extra
+    assert np.sqrt(np.nanmean((found.joints - truth) ** 2)) < 0.03
+    assert np.nanmax(found.views) <= 5
+
+
+def test_points_that_one_camera_sees_are_missing(clip):
+    cameras, plain, with_feet, _ = clip
+    sure = with_feet.extra_confidence.copy()
+    sure[:, 1:, :, 0] = np.nan
+    pixels = np.where(np.isfinite(sure)[..., None], with_feet.extra_keypoints, np.nan)
+    found = triangulate_joints(cameras, plain.add_points(FEET, pixels, sure)).extra
+    assert np.isnan(found.joints[:, :, 0]).all() and not found.views[:, :, 0].any()
+    assert np.isfinite(found.joints[:, :, 1:]).mean() > 0.99
+
+
+def test_feet_are_swapped_back_with_the_legs(clip):
+    _, _, with_feet, _ = clip
+    exchanged = np.zeros((60, 6, 2, 3), dtype=bool)
+    exchanged[10, 3, 1, 2] = True  # the legs
+    exchanged[11, 3, 1, 1] = True  # the arms
+    found = undo_swaps(with_feet, exchanged)
+    given = with_feet.extra_keypoints
+    np.testing.assert_array_equal(
+        found.extra_keypoints[10, 3, 1], given[10, 3, 1][[3, 4, 5, 0, 1, 2]]
+    )
+    changed = (found.extra_keypoints != given).any(axis=(-1, -2))
+    assert np.argwhere(changed).tolist() == [[10, 3, 1]]
+
+
+def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip):
+    _, plain, _, _ = clip
+    names = ("left_thigh_1", "right_thigh_1", "left_trunk_1", "right_trunk_1", "left_forearm_1")
+    rng = np.random.default_rng(2)
+    shape = (*plain.score.shape, len(names))
+    given = plain.add_points(names, rng.normal(size=(*shape, 2)), rng.uniform(0.1, 1.0, shape))
+    exchanged = np.zeros((60, 6, 2, 3), dtype=bool)
+    exchanged[4, 0, 0, 2] = True
+    exchanged[5, 0, 0] = True
+    found = undo_swaps(given, exchanged).extra_keypoints
+    one, all_ = given.extra_keypoints[4, 0, 0], given.extra_keypoints[5, 0, 0]
+    np.testing.assert_array_equal(found[4, 0, 0], one[[1, 0, 2, 3, 4]])
+    np.testing.assert_array_equal(found[5, 0, 0], all_[[1, 0, 3, 2, 4]])  # a lone point stays
+
+
+def test_they_follow_the_clock_correction_of_their_camera(clip):
+    _, _, with_feet, _ = clip
+    late = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    found = shift_in_time(with_feet, late)
+    middle = 0.5 * (with_feet.extra_keypoints[9, 1] + with_feet.extra_keypoints[10, 1])
+    np.testing.assert_allclose(found.extra_keypoints[10, 1], middle)
+    np.testing.assert_array_equal(found.extra_keypoints[10, 0], with_feet.extra_keypoints[10, 0])
+
+
+def test_chunks_give_the_same_points_as_the_whole_clip(clip):
+    cameras, _, with_feet, _ = clip
+    settings = TriangulationSettings()
+    model = learn_clip(cameras, with_feet, FPS, settings)
+    whole = reconstruct_joints(cameras, with_feet, FPS, settings).triangulation.extra
+    many = with_feet[np.arange(300) % 60]
+    parts = list(reconstruct_chunks(cameras, many, model, FPS, settings, length=128))
+    assert len(parts) > 1
+    joined = np.concatenate([part.triangulation.extra.joints for part in parts])
+    np.testing.assert_array_equal(joined[:60], whole.joints)
+    np.testing.assert_allclose(joined[120:180], whole.joints, atol=1e-6)  # in other tiles
+
+
+def test_replacing_all_points_by_nothing_leaves_them_missing(clip):
+    cameras, plain, with_feet, _ = clip
+    empty = plain.add_points(
+        FEET,
+        np.full_like(with_feet.extra_keypoints, np.nan),
+        np.full_like(with_feet.extra_confidence, np.nan),
+    )
+    found = triangulate_joints(cameras, replace(empty, frame=plain.frame)).extra
+    assert np.isnan(found.joints).all() and not found.views.any()

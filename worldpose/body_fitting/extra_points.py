@@ -1,0 +1,298 @@
+"""Points besides COCO-17 as evidence about bodies: heels, toes and landmarks of the surface.
+
+A point is a vertex of the body model. A detector's point lies near it, at an offset that is fixed
+to the segment of the body, the same for all persons and mirrored left to right: shoes, and another
+definition. The offsets are learned from residuals, like those of joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.arrays import Floats
+from data_contracts.conventions import COCO17
+from worldpose.body import BodyModel, BodyParameters, fold_keypoints
+from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import JOINT_NAMES, VERTEX_OF_POINT, point_segments
+from worldpose.body.model import SMPL_VERTICES
+from worldpose.body_fitting.objective import Evidence
+from worldpose.body_fitting.solver import Shapes, Solver
+from worldpose.compiled import map_in_threads
+from worldpose.triangulation import ExtraJoints
+
+OFFSET_STD_M: Final = 0.02
+"""Expected offset of a detector's point from the body's, per axis of the segment [m]: soles and toe
+caps of shoes are 1 to 3 cm thick."""
+OWN_STD_M: Final = 0.01
+"""Difference of that offset between persons, per axis [m]."""
+ROUNDS: Final = 2
+"""Estimates of the offsets, each from poses that know the one before."""
+SAMPLE_S: Final = 2.0
+"""Time of each person from which offsets are learned [s]: they are few numbers."""
+MIN_FOOT_POINTS: Final = 2
+"""Points that determine the pose of a foot in a frame [1]: a heel and a toe."""
+FOOT_TIME_S: Final = 0.1
+"""Time around such a frame for which the motion determines the pose of a foot [s]."""
+MIRROR: Final = np.array([-1.0, 1.0, 1.0])
+"""Of vectors in the axes of the unposed body: left, up, forward."""
+KEPT_BIAS_M: Final = 0.01
+"""Part of the points' common bias that stays in their covariance per axis [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExtraFit:
+    """Points besides COCO-17 of fitted bodies.
+
+    Attributes:
+        points: (points,) names.
+        joints: (frames, persons, points, 3) [m], world, where the body model has them.
+        covariance: (frames, persons, points, 3, 3) [m^2].
+        offsets: (points, 3) [m] left, up and forward in the axes of the point's segment: from the
+            body's point to the detector's.
+    """
+
+    points: tuple[str, ...]
+    joints: Floats
+    covariance: Floats
+    offsets: Floats
+
+
+def known_points(model: BodyModel, extra: ExtraJoints | None) -> ExtraJoints | None:
+    """Return the points that a body model has; None without any in 3D."""
+    if extra is None or len(model.template) != SMPL_VERTICES:
+        return None
+    there = np.asarray(np.isfinite(extra.joints[..., 0]).any(axis=(0, 1)))
+    kept = [k for k, point in enumerate(extra.points) if point in VERTEX_OF_POINT and there[k]]
+    if not kept:
+        return None
+    return ExtraJoints(
+        tuple(extra.points[k] for k in kept),
+        extra.joints[:, :, kept],
+        extra.covariance[:, :, kept],
+        extra.views[:, :, kept],
+        extra.common_bias[kept],
+    )
+
+
+def with_points(solver: Solver, points: tuple[str, ...]) -> Solver:
+    """Return the solver of poses that also knows these points, and bends ankles and toes."""
+    chained = ChainedKeypoints.of(fold_keypoints(solver.chained.model, (*COCO17, *points)))
+    return replace(solver, chained=chained, prior=solver.prior.add_feet())
+
+
+def move_points(solver: Solver, points: tuple[str, ...], offsets: Floats) -> Solver:
+    """Return the solver of `with_points` with the points where the detector has them."""
+    its = point_segments(solver.chained.model, points)
+    return replace(solver, chained=solver.chained.move_points(len(COCO17), its, offsets))
+
+
+def perceived_points(
+    model: BodyModel, points: tuple[str, ...], parameters: BodyParameters, offsets: Floats
+) -> Floats:
+    """Return vectors (..., points, 3) [m], world, from the body's points to the detector's.
+
+    Args:
+        model: the body.
+        points: names of the points.
+        parameters: bodies (...).
+        offsets: (points, 3) [m], as in `ExtraFit`.
+    """
+    turned = model.articulate(parameters).rotations[..., point_segments(model, points), :, :]
+    moved: Floats = np.einsum("...pab,pb->...pa", turned, offsets)
+    return moved
+
+
+def learn_point_offsets(
+    solver: Solver,
+    points: tuple[str, ...],
+    people: Mapping[int, Evidence],
+    shapes: Shapes,
+    fps: float,
+) -> tuple[Floats, Floats]:
+    """Return the offsets of a detector's points and their variance (points, 3) [m, m^2].
+
+    Args:
+        solver: result of `with_points`.
+        points: names of the points.
+        people: joints and points of each person.
+        shapes: betas of each person, and offsets of the joints.
+        fps: [1/s].
+    """
+    model = solver.chained.model
+    offsets = np.zeros((len(points), 3))
+    variance = np.full(offsets.shape, OFFSET_STD_M**2)
+    sample = {
+        person: _densest(own, max(3, round(SAMPLE_S * fps))) for person, own in people.items()
+    }
+
+    def residuals(person: int) -> Floats:
+        part = sample[person]
+        pose, _ = moved.solve_poses(part, shapes.people[person], shapes.offsets, fps)
+        parameters = pose.parameters()
+        places = solver.chained.differentiate(parameters).keypoints[:, len(COCO17) :]
+        turned = model.articulate(parameters).rotations[:, point_segments(model, points)]
+        away: Floats = part.joints[:, len(COCO17) :] - places
+        return np.asarray(np.einsum("fpba,fpb->fpa", turned, away))
+
+    for _ in range(ROUNDS):
+        moved = move_points(solver, points, offsets)
+        medians = []
+        for own in map_in_threads(residuals, sample):
+            seen = np.isfinite(own[..., 0])
+            median = np.full(offsets.shape, np.nan)
+            for point in np.flatnonzero(seen.any(axis=0)):
+                median[point] = np.median(own[seen[:, point], point], axis=0)
+            medians.append(median)
+        each = np.array(medians)
+        for place in range(len(points)):
+            values = each[:, place]
+            other = _mirror_place(points, place)
+            if other is not None:
+                values = np.concatenate([values, each[:, other] * MIRROR])
+            values = values[np.isfinite(values[:, 0])]
+            weight = len(values) / OWN_STD_M**2 + 1.0 / OFFSET_STD_M**2
+            offsets[place] = values.sum(axis=0) / OWN_STD_M**2 / weight
+            variance[place] = 1.0 / weight
+    return offsets, variance
+
+
+def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
+    """Return the place of a point's mirror image among the points."""
+    name = points[place]
+    one, two = ("left_", "right_") if name.startswith("left_") else ("right_", "left_")
+    other = name.replace(one, two, 1)
+    return points.index(other) if other != name and other in points else None
+
+
+def _densest(evidence: Evidence, frames: int) -> Evidence:
+    """Return the interval of so many frames with the most points."""
+    known = evidence.known[:, len(COCO17) :].sum(axis=1)
+    total = np.concatenate([[0], np.cumsum(known)])
+    length = min(frames, len(known))
+    start = int((total[length:] - total[: len(total) - length]).argmax())
+    part = slice(start, start + length)
+    return Evidence(evidence.joints[part], evidence.information[part])
+
+
+def feet_determined(
+    model: BodyModel, points: tuple[str, ...], evidence: Evidence, fps: float
+) -> NDArray[np.bool_]:
+    """Return the frames in which points determine the left and right foot (frames, 2)."""
+    its = point_segments(model, points)
+    known = evidence.known[:, len(COCO17) :]
+    reach = round(FOOT_TIME_S * fps)
+    determined = np.zeros((len(known), 2), dtype=np.bool_)
+    for side, name in enumerate(("left", "right")):
+        foot = [JOINT_NAMES.index(f"{name}_{part}") for part in ("ankle", "foot")]
+        sure = known[:, np.isin(its, foot)].sum(axis=1) >= MIN_FOOT_POINTS
+        near = np.convolve(sure, np.ones(2 * reach + 1), mode="full")
+        determined[:, side] = near[reach : reach + len(sure)] > 0.0
+    return determined
+
+
+@dataclass(frozen=True, eq=False)
+class PointArrays:
+    """Points besides COCO-17 of a fit in progress.
+
+    Attributes:
+        solver: solver of poses that knows the points.
+        people: evidence about each person, with the points.
+        determined: (frames, 2) of each person, as in `feet_determined`.
+        points: (points,) names.
+        joints: (frames, persons, points, 3) [m], world.
+        covariance: (frames, persons, points, 3, 3) [m^2].
+        offsets: (points, 3) [m], as in `ExtraFit`.
+        systematic: (points, 3, 3) [m^2], covariance of the offsets and of the common bias.
+    """
+
+    solver: Solver
+    people: dict[int, Evidence]
+    determined: dict[int, NDArray[np.bool_]]
+    points: tuple[str, ...]
+    joints: Floats
+    covariance: Floats
+    offsets: Floats
+    systematic: Floats
+
+    def put(self, person: int, span: slice, bodies: BodyParameters, random: Floats) -> None:
+        """Write one person's points.
+
+        Args:
+            person: index of the person.
+            span: frames of the person.
+            bodies: (frames,) with their feet.
+            random: (frames, points, 3, 3) [m^2], covariance of the poses.
+        """
+        keypoints = fold_keypoints(self.solver.chained.model, self.points)
+        self.joints[span, person] = keypoints(bodies)
+        self.covariance[span, person] = random + self.systematic
+
+    def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
+        """Remove a person from frames of a span."""
+        self.joints[span, person][gone] = np.nan
+        self.covariance[span, person][gone] = np.nan
+
+    def fit(self) -> ExtraFit:
+        """Return the complete points."""
+        return ExtraFit(self.points, self.joints, self.covariance, self.offsets)
+
+
+def prepare_points(
+    solver: Solver,
+    extra: ExtraJoints | None,
+    spans: Mapping[int, slice],
+    people: Mapping[int, Evidence],
+    shapes: Shapes,
+    fps: float,
+) -> PointArrays | None:
+    """Return solver and evidence with the points; None without any that the body model has.
+
+    Args:
+        solver: solver of the joints.
+        extra: points in 3D.
+        spans: frames of each person.
+        people: evidence about the joints of each person in these frames.
+        shapes: betas of each person, and offsets of the joints.
+        fps: [1/s].
+    """
+    found = known_points(solver.chained.model, extra)
+    if found is None or not people:
+        return None
+    points, settings = found.points, solver.settings
+    solver = with_points(solver, points)
+
+    def add(covariance: Floats) -> dict[int, Evidence]:
+        return {
+            person: own.add_points(
+                found.joints[spans[person], person],
+                covariance[spans[person], person],
+                fps,
+                settings,
+            )
+            for person, own in people.items()
+        }
+
+    # With the bias in their covariance the points hardly move the bodies: residuals show it.
+    offsets, variance = learn_point_offsets(solver, points, add(found.covariance), shapes, fps)
+    modelled = np.maximum(found.common_bias**2 - KEPT_BIAS_M**2, 0.0)
+    whole = add(found.covariance - modelled[:, None, None] * np.eye(3))
+    model = solver.chained.model
+    shape = found.joints.shape
+    bias = found.common_bias[:, None] ** 2 + variance + settings.own_bias_std_m**2
+    return PointArrays(
+        solver=move_points(solver, points, offsets),
+        people=whole,
+        determined={
+            person: feet_determined(model, points, own, fps) for person, own in whole.items()
+        },
+        points=points,
+        joints=np.full(shape, np.nan),
+        covariance=np.full((*shape, 3), np.nan),
+        offsets=offsets,
+        systematic=bias[..., None] * np.eye(3),
+    )
