@@ -114,7 +114,8 @@ def simulate(scenario: str, seeds: range) -> Iterator[Outcome]:
                 continue
             seconds = time.process_time() - start
             off = ground_errors(found.estimate.camera, true, places, painted)
-            yield Outcome(label, True, float(np.median(off)) if len(off) else 0.0, seconds)
+            middle = float(np.median(off)) if len(off) else np.nan  # no player is in view
+            yield Outcome(label, True, middle, seconds)
 
 
 def simulate_sides(scenario: str, seeds: range, duration: float) -> Iterator[Outcome]:
