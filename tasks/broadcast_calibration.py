@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.clip_inputs import ADJUSTED
@@ -19,6 +20,7 @@ from worldpose.broadcast_calibration import (
     BroadcastCalibrationSettings,
     BroadcastClip,
     BroadcastReport,
+    KnownPeople,
     People,
     broadcast_arrays,
     broadcast_attributes,
@@ -47,15 +49,14 @@ def broadcast_calibration(work: Work) -> str:
         with open_video(path) as video:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
-    people, boxes = _people(store, work)
+    people, seen, boxes = _people(store, work)
     pitch = _open_pitch(store, work)
     key_frames = [
         KeyFrame(frame=int(frame), markings=clicked_markings(markings))
         for frame, markings in clicked.items()
         if start <= int(frame) < start + count
     ]
-    side = sources.get("side")
-    if side is not None:
+    if "side" in sources:
         numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
 
         def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -63,7 +64,13 @@ def broadcast_calibration(work: Work) -> str:
                 for number in np.unique(numbers).tolist():
                     yield from video.frames(number, number + 1)
 
-        key_frames = propose_key_frames(spread_out(), pitch, side=side, where=str(path))
+        known = None
+        if people is not None and seen is not None:
+            feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
+            known = KnownPeople(seen, feet, float(sources["fps"]), start)
+        key_frames = propose_key_frames(
+            spread_out(), pitch, side=sources["side"], where=str(path), people=known
+        )
     with store.publish(work) as result:
         calibration = calibrate_broadcast(
             pitch,
@@ -98,23 +105,25 @@ def _open_pitch(store: Store, work: Work) -> PitchTemplate:
     return pitch if surface is None else pitch.with_surface(surface)
 
 
-def _people(store: Store, work: Work) -> tuple[People | None, NDArray[np.float64] | None]:
-    """Return people fitted to static cameras at the time of each image, and detected boxes."""
+def _people(
+    store: Store, work: Work
+) -> tuple[People | None, KeypointDetections | None, NDArray[np.float64] | None]:
+    """Return people fitted to static cameras at the time of each image, detections and boxes."""
     sources: dict[str, Any] = work.recipe.sources
     unit = work.recipe.unit
     seen_names = [f"{stage}/{unit}" for stage in ("ingest", "detection")]
     names = [name for name in seen_names if name in work.recipe.inputs]
     if not names:
-        return None, None
+        return None, None, None
     first, count, fps = (sources[name] for name in ("first_frame", "frame_count", "fps"))
     offset = float(sources["broadcast_offset_frames"])
-    seen = open_input(store, work, names[0]).sel(frame=np.arange(first, first + count))
-    boxes = seen["boxes"].values.astype(np.float64)
+    stored = open_input(store, work, names[0]).sel(frame=np.arange(first, first + count))
+    seen = KeypointDetections.from_arrays(stored)
     if f"body_fitting/{unit}" not in work.recipe.inputs:
-        return None, boxes
+        return None, seen, seen.boxes.astype(np.float64)
     joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
-    people = People(joints, seen["keypoints"].values.astype(np.float64), float(fps))
-    return people.later(round(offset) - offset), None
+    people = People(joints, seen.keypoints.astype(np.float64), float(fps))
+    return people.later(round(offset) - offset), seen, None
 
 
 def _figures(report: BroadcastReport) -> dict[str, float]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         moving_arrays,
         moving_from_arrays,
     )
-    from worldpose.broadcast_calibration.key_frames import propose_key_frames
+    from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
     from worldpose.broadcast_calibration.moving_camera import MovingCamera
     from worldpose.broadcast_calibration.players import FeedOffset, People, estimate_feed_offset
     from worldpose.broadcast_calibration.report import BroadcastReport
@@ -41,6 +41,7 @@ __all__ = [
     "BroadcastPrior",
     "BroadcastReport",
     "FeedOffset",
+    "KnownPeople",
     "MovingCamera",
     "People",
     "PooledCenter",
@@ -70,7 +71,7 @@ __getattr__ = import_on_use(
             "moving_arrays",
             "moving_from_arrays",
         ),
-        "worldpose.broadcast_calibration.key_frames": ("propose_key_frames",),
+        "worldpose.broadcast_calibration.key_frames": ("KnownPeople", "propose_key_frames"),
         "worldpose.broadcast_calibration.moving_camera": ("MovingCamera",),
         "worldpose.broadcast_calibration.players": (
             "FeedOffset",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
@@ -26,28 +27,55 @@ from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.errors import DegenerateError, InputError
+from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import (
     CameraEstimate,
+    SeenPeople,
     StaticCalibration,
     calibrate_camera,
     propose_camera,
 )
 from worldpose.static_calibration.parameters import nearest_on_markings
+from worldpose.static_calibration.sides import INDEPENDENT_S, MIN_EVIDENCE, compare_sides
+from worldpose.tracking import locate_feet
 
 _ROUNDS = 3
 """Iterations that match drawn markings and painted lines again [1]."""
-
-
 _SAME_CENTER = 0.1
 """Largest distance of a proposal's center from the median one, of its distance to the centre spot
 [1]: from one frame alone the distance trades with the focal length."""
 _MIN_PROPOSALS = 2
 """Minimum proposals with one center [1]."""
+_PLACE_STD = 0.1
+"""Standard deviation of people's places by static cameras, each axis [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPeople:
+    """People detected in a clip, and where cameras with known sides see them.
+
+    Attributes:
+        detections: (frames, detections) of the clip.
+        xy: (frames, people, 2) places of the same people on the pitch [m], world; NaN where
+            missing.
+        fps: frames per second.
+        first: number of the clip's first frame in its video.
+    """
+
+    detections: KeypointDetections
+    xy: Floats
+    fps: float
+    first: int = 0
 
 
 def propose_key_frames(
-    pictures: Iterable[tuple[int, Image]], pitch: PitchTemplate, *, side: Side, where: str
+    pictures: Iterable[tuple[int, Image]],
+    pitch: PitchTemplate,
+    *,
+    side: Side | None,
+    where: str,
+    people: KnownPeople | None = None,
 ) -> list[KeyFrame]:
     """Return key frames proposed from images of a clip, without a click.
 
@@ -56,17 +84,20 @@ def propose_key_frames(
     Args:
         pictures: numbers of frames, and their images (height, width, 3) RGB.
         pitch: the stadium's template.
-        side: where the camera stands.
+        side: where the camera stands; None = the people decide.
         where: clip or file, for messages.
+        people: people whose places are known; they decide the side, or confirm it.
 
     Raises:
-        InputError: fewer than two frames have a clear proposal with one center.
+        InputError: fewer than two frames have a clear proposal with one center; the people do not
+            tell the side, or contradict the stated one.
     """
     clear, seen = [], 0
     for number, picture in pictures:
         seen += 1
         with suppress(InputError):  # a frame without a pitch, or with too little paint
-            proposal = propose_camera(picture, pitch, side=side, where=f"{where}: frame {number}")
+            place = f"{where}: frame {number}"
+            proposal = propose_camera(picture, pitch, side=side or "near", where=place)
             if proposal.is_clear:
                 clear.append((number, proposal))
     centers = np.array([each.camera.center for _, each in clear]).reshape(-1, 3)
@@ -81,11 +112,74 @@ def propose_key_frames(
             "position",
             todo="Click four or more named points in three frames of the clip.",
         )
-    return [
-        KeyFrame(frame=number, markings=proposal.drawn)
-        for (number, proposal), kept in zip(clear, agreed, strict=True)
-        if kept
-    ]
+    chosen = {
+        number: proposal for (number, proposal), kept in zip(clear, agreed, strict=True) if kept
+    }
+    cameras = {number: each.camera for number, each in chosen.items()}
+    if _must_turn(cameras, pitch, side, people, where):
+        chosen = {number: each.turn() for number, each in chosen.items()}
+    return [KeyFrame(frame=number, markings=each.drawn) for number, each in chosen.items()]
+
+
+def _must_turn(
+    cameras: Mapping[int, Camera],
+    pitch: PitchTemplate,
+    side: Side | None,
+    people: KnownPeople | None,
+    where: str,
+) -> bool:
+    """Return whether the people stand where they are only after half a turn of the cameras.
+
+    Raises:
+        InputError: they do not tell, or they contradict the stated side.
+    """
+    same, turned = (0.0, 0.0) if people is None else _agreement(cameras, pitch, people)
+    if side is None and abs(same - turned) < MIN_EVIDENCE:
+        raise InputError(
+            where,
+            expected="people of the static cameras in the clip, who tell the camera's side",
+            found=f"no agreement that decides between two sides (evidence "
+            f"{abs(same - turned):.0f}, {MIN_EVIDENCE:g} needed)",
+            todo="State the broadcast camera's side (near, far, left, right) in match.yaml.",
+        )
+    if side is not None and turned - same >= MIN_EVIDENCE:
+        raise InputError(
+            where,
+            expected="people at the places where the static cameras see them",
+            found="agreement only after half a turn about the centre spot: the stated side is "
+            "wrong, or that of the static cameras",
+            todo="State the opposite side in match.yaml, or take `side` out of this camera.",
+        )
+    return side is None and turned > same
+
+
+def _agreement(
+    cameras: Mapping[int, Camera], pitch: PitchTemplate, people: KnownPeople
+) -> tuple[float, float]:
+    """Return how well people agree if the cameras stand as assumed, and after half a turn.
+
+    Args:
+        cameras: cameras of some frames, by number in the video.
+        pitch: the template.
+        people: of the clip.
+    """
+    total = np.zeros(2)
+    for number, camera in cameras.items():
+        here = slice(number - people.first, number - people.first + 1)
+        found = KeypointDetections.stack([people.detections[here]])
+        feet = locate_feet(Camera.stack([camera]), found, pitch)
+        places = people.xy[here]
+        noise = np.broadcast_to(_PLACE_STD**2 * np.eye(2), (*places.shape, 2))
+        total += compare_sides(
+            SeenPeople(camera, feet.xy[:, 0], feet.noise[:, 0]),
+            SeenPeople(None, places, noise),
+            pitch,
+            np.zeros(1),
+        )
+    # Frames closer together than this show the people at the same places.
+    moments = 1.0 + (max(cameras) - min(cameras)) / people.fps / INDEPENDENT_S
+    same, turned = min(1.0, moments / len(cameras)) * total
+    return float(same), float(turned)
 
 
 @dataclass(frozen=True, eq=False)

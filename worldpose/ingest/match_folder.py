@@ -77,13 +77,15 @@ class MatchFolder:
     def proposed_clips(self) -> tuple[str, ...]:
         """Broadcast clips without key frames whose key frames are proposed from their video.
 
-        A proposal needs the camera's side, the clip's video and the pitch.
+        A proposal needs the clip's video, the pitch, and a stated side of the camera or of a static
+        camera, whose people then tell the side of the other.
         """
         if self.pitch is None:
             return ()
+        told = any(each.side is not None for each in self.spec.static_cameras)
         clips = (each.id for each in self.spec.clips if each.broadcast is not None)
         filmed = (each for each in clips if each in self.videos and each not in self.key_frames)
-        return tuple(each for each in filmed if self.broadcast_side(each) is not None)
+        return tuple(each for each in filmed if told or self.broadcast_side(each) is not None)
 
     @property
     def calibrated_clips(self) -> tuple[str, ...]:

@@ -39,12 +39,12 @@ from worldpose.static_calibration.camera_candidates import (
 from worldpose.static_calibration.circle_candidates import name_circles
 from worldpose.static_calibration.line_samples import LineSamples, sample_markings
 from worldpose.static_calibration.paint_segments import PaintMap, find_paint, trace_marking
+from worldpose.static_calibration.parameters import drop_k3
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 from worldpose.static_calibration.sides import turn_camera, turn_name
 
-_FOCALS: Final = np.geomspace(0.45, 5.0, 13)
-"""Focal lengths to try, in image widths [1]."""
+_FOCALS: Final = np.geomspace(0.45, 5.0, 13)  # in image widths
 _ROLLS: Final = ((0.0,), (-0.14, -0.07, 0.07, 0.14))
 """Rolls to try, and more while nothing is clear [rad]: cameras on masts hang 4 to 8 degrees off."""
 PROPOSED: Final = "markings proposed from the image"
@@ -333,7 +333,7 @@ def calibrate_proposal(
             settings=stated,
             where=where,
             lens=lens,
-            start=proposal.camera,
+            start=proposal.camera if lens is not None else drop_k3(proposal.camera),
         )
 
     calibration = calibrate(proposal.drawn)

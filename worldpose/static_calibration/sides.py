@@ -42,12 +42,12 @@ class SeenPeople:
     """People in one camera's images, placed by their feet with the camera on its assumed side.
 
     Attributes:
-        camera: the camera.
+        camera: the camera; None = people of the whole pitch, by cameras with known sides.
         xy: (frames, people, 2) places [m], world; NaN where there is no person.
         noise: (frames, people, 2, 2) their covariance [m^2].
     """
 
-    camera: Camera
+    camera: Camera | None
     xy: Floats
     noise: Floats
 
@@ -240,7 +240,8 @@ class _View(NamedTuple):
 
     def turn(self) -> _View:
         """Return the view after half a turn: covariances stay, and cells come in reverse."""
-        turned = turn_camera(self.people.camera)
+        camera = self.people.camera
+        turned = None if camera is None else turn_camera(camera)
         people = replace(self.people, camera=turned, xy=-self.people.xy)
         return _View(people, self.cells[::-1])
 
@@ -265,7 +266,7 @@ def _compare(
     return found[0], found[1]
 
 
-def _seen_cells(camera: Camera, pitch: PitchTemplate) -> Flags:
+def _seen_cells(camera: Camera | None, pitch: PitchTemplate) -> Flags:
     """Return which cells of the pitch a camera sees (cells,)."""
     limits = (0.5 * pitch.length, 0.5 * pitch.width)
     counts = (max(1, round(2.0 * limit / _CELL)) for limit in limits)
@@ -317,8 +318,10 @@ def _people_in_both(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) ->
     return _Points(xy[kept], own.noise[known][kept], frame[kept])
 
 
-def _sees(camera: Camera, xy: Floats, pitch: PitchTemplate) -> Flags:
+def _sees(camera: Camera | None, xy: Floats, pitch: PitchTemplate) -> Flags:
     """Return whether places (n, 2) [m] on the pitch are in a camera's image (n,)."""
+    if camera is None:
+        return np.ones(len(xy), np.bool_)
     ground = np.concatenate([xy, pitch.height(xy[:, 0], xy[:, 1])[:, None]], axis=1)
     pixels = camera.project(ground)
     margin = _MARGIN * float(camera.image_size[0])

@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from worldpose.broadcast_calibration import propose_key_frames
+from data_contracts.keypoints import KeypointDetections
+from worldpose.broadcast_calibration import KnownPeople, propose_key_frames
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -54,3 +55,59 @@ def test_frames_of_two_centers_are_refused():
 def test_a_clip_without_a_pitch_is_refused_with_what_to_click():
     with pytest.raises(InputError, match=r"clip: expected 2 frames.*found 0 clear.*Click four"):
         propose_key_frames([(0, GRASS), (1, GRASS)], PITCH, side="near", where="clip")
+
+
+def people_of(frames, places, *, seen_at=None):
+    """Boxes of people who stand at places (p, 2) [m] in every frame, and the places they have."""
+    boxes = np.full((max(frames) + 1, len(places), 4), np.nan)
+    for number, (camera, _) in frames.items():
+        feet = camera.project(np.column_stack([places, np.zeros(len(places))]))
+        heads = camera.project(np.column_stack([places, np.full(len(places), 1.8)]))
+        half = 0.2 * (feet[:, 1] - heads[:, 1])
+        sides = feet[:, 0] - half, heads[:, 1], feet[:, 0] + half, feet[:, 1]
+        inside = ((feet > 0.0) & (feet < [1280, 720]) & (heads > 0.0)).all(axis=1)
+        boxes[number, inside] = np.stack(sides, axis=-1)[inside]
+    shape = boxes.shape[:2]
+    detections = KeypointDetections(
+        keypoints=np.full((*shape, 17, 2), np.nan),
+        confidence=np.full((*shape, 17), np.nan),
+        boxes=boxes,
+        score=np.where(np.isnan(boxes[..., 0]), np.nan, 1.0),
+        frame=np.arange(len(boxes)),
+    )
+    known = np.broadcast_to(places if seen_at is None else seen_at, (len(boxes), *places.shape))
+    return KnownPeople(detections, known, 25.0)
+
+
+FAR = {number: frame(x, (2.0, 70.0, 18.0)) for number, x in ((10, -38.0), (40, 38.0))}
+PLACES = np.random.default_rng(3).uniform([-50.0, -30.0], [50.0, 20.0], (24, 2))
+
+
+def pictures_of(frames):
+    return [(number, picture) for number, (_, picture) in frames.items()]
+
+
+def test_people_of_known_places_tell_the_side_of_a_camera_that_has_none():
+    people = people_of(FAR, PLACES)
+    found = propose_key_frames(pictures_of(FAR), PITCH, side=None, where="clip", people=people)
+    assert [each.frame for each in found] == [10, 40]
+    for key in found:
+        camera = FAR[key.frame][0]
+        for marking in key.markings.drawn:
+            line = camera.project(PITCH.marking_points(marking.name, 0.05))
+            line = line[np.isfinite(line).all(axis=1)]
+            away = np.linalg.norm(np.array(marking.xy)[:, None] - line, axis=-1).min(axis=1)
+            assert np.median(away) < 2.0, marking.name
+
+
+def test_people_who_are_elsewhere_do_not_tell_the_side():
+    elsewhere = np.random.default_rng(4).uniform([-50.0, -30.0], [50.0, 20.0], PLACES.shape)
+    people = people_of(FAR, PLACES, seen_at=elsewhere)
+    with pytest.raises(InputError, match=r"clip: expected people.*State the broadcast camera's"):
+        propose_key_frames(pictures_of(FAR), PITCH, side=None, where="clip", people=people)
+
+
+def test_a_stated_side_that_people_contradict_is_named():
+    people = people_of(FAR, PLACES)
+    with pytest.raises(InputError, match=r"only after half a turn.*State the opposite side"):
+        propose_key_frames(pictures_of(FAR), PITCH, side="near", where="clip", people=people)

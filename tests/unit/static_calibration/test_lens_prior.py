@@ -16,6 +16,8 @@ from clicking_people import (
 )
 
 from worldpose.static_calibration import calibrate_camera
+from worldpose.static_calibration.paint_segments import guess_lens
+from worldpose.static_calibration.parameters import drop_k3
 
 
 def test_a_known_lens_lowers_the_ground_error_of_few_clicks():
@@ -61,3 +63,21 @@ def test_a_loose_lens_changes_nothing_that_clicks_determine():
     )
     assert np.median(ground_errors(with_lens, without, places)) < 0.1
     assert with_lens.focal[0] == pytest.approx(without.focal[0], rel=0.02)
+
+
+def test_k1_and_k2_bend_an_image_as_a_guessed_lens_with_k3_does():
+    guessed = guess_lens(-0.22, SIZE)
+    plain = drop_k3(guessed)
+    assert plain.distortion[4] == 0.0
+    np.testing.assert_array_equal(plain.distortion[2:4], guessed.distortion[2:4])
+    straight = np.linspace(0.0, 1.2, 60)[:, None] * [0.8, 0.6]
+    bent, same = (
+        camera.project(np.column_stack([straight, np.ones(len(straight))]))
+        for camera in (guessed, plain)
+    )
+    inside = np.hypot(*(bent - guessed.principal_point).T) < 0.5 * np.hypot(*SIZE)
+    assert inside.sum() > 40
+    away = np.linalg.norm(bent - same, axis=1)[inside]
+    assert 0.0 < away.max() < 0.006 * SIZE[0]
+    unbent = guess_lens(0.0, SIZE)
+    np.testing.assert_allclose(drop_k3(unbent).distortion, 0.0, atol=1e-9)
