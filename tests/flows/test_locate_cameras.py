@@ -40,6 +40,7 @@ def lab(tmp_path_factory):
                 place.unlink()
     truth = read_calibration(folder / "calibration.toml")
     (folder / "calibration.toml").unlink()
+    (folder / "pitch.json").unlink()
     lenses = {
         name: LensCalibration(
             id=name,
