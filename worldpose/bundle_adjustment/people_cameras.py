@@ -301,6 +301,13 @@ def _part(observed: Observations, kept: Flags) -> Observations:
     return Observations(points=observed.points[used], **(rows | {"point_of": number}))
 
 
+def _mean_direction(vectors: Floats) -> Floats:
+    """Return the unit vector (3,) of vectors (frames, persons, 3), the median of each axis."""
+    known = vectors[np.isfinite(vectors).all(axis=-1)]
+    middle = np.median(known / np.linalg.norm(known, axis=1, keepdims=True), axis=0)
+    return np.asarray(middle / np.linalg.norm(middle))
+
+
 class _World(NamedTuple):
     similarity: Similarity
     std: float
@@ -365,18 +372,20 @@ class _People(NamedTuple):
         joints = scale * self.joints
         shoulders, hips = joints[:, :, [5, 6]].mean(axis=2), joints[:, :, [11, 12]].mean(axis=2)
         ankles = joints[:, :, [15, 16]]
-        upright = (shoulders - hips) + (hips - ankles.mean(axis=2))
-        upright = upright[np.isfinite(upright).all(axis=-1)]
-        up = np.median(upright / np.linalg.norm(upright, axis=1, keepdims=True), axis=0)
-        lean = up / np.linalg.norm(up)
+        trunk, legs = _mean_direction(shoulders - hips), _mean_direction(hips - ankles.mean(axis=2))
+        lean = (trunk + legs) / np.linalg.norm(trunk + legs)
+        # Who bends at the hips is not upright: trunk and legs then disagree.
+        bent = float(np.arccos(np.clip(trunk @ legs, -1.0, 1.0)))
+        lean_std = float(np.hypot(LEAN_STD, 0.5 * bent))
+        up = lean
         feet = self._standing_feet(ankles)
         for _ in range(5):
             spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
             off = spread @ up
             weight = 1.0 / (FOOT_STD_M**2 + (off / 3.0) ** 2)
             level = np.eye(3) - np.outer(up, up)
-            information = level @ (weight * spread.T) @ spread @ level + level / LEAN_STD**2
-            slope = level @ (spread.T @ (weight * off) + (up - lean) / LEAN_STD**2)
+            information = level @ (weight * spread.T) @ spread @ level + level / lean_std**2
+            slope = level @ (spread.T @ (weight * off) + (up - lean) / lean_std**2)
             up = up - np.linalg.lstsq(information, slope, rcond=1e-9)[0]
             up = up / np.linalg.norm(up)
         values = np.linalg.eigvalsh(information)[1:]
@@ -393,7 +402,7 @@ class _People(NamedTuple):
         return _World(
             Similarity(scale, rotation, -rotation @ origin),
             float(1.0 / np.sqrt(values.min())),
-            bool(values.min() > 2.0 / LEAN_STD**2),
+            bool(values.min() > 2.0 / lean_std**2),
         )
 
     def _standing_feet(self, ankles: Floats) -> Floats:

@@ -62,7 +62,7 @@ LIKELY: Final = 2.0
 """A shift is excluded if it is worse than the best by this many standard errors."""
 MIN_CONTRAST: Final = 3.0
 """Least peak of a camera's matches above the median shift, in standard errors [1]."""
-MAX_SPAN: Final = 40
+MAX_SPAN: Final = 30
 """Largest distance from the best to another likely shift [frame]: the people's motion leads from
 there to the right one."""
 MAX_ERROR: Final = 0.25

@@ -177,3 +177,35 @@ def test_the_detector_looks_at_the_size_that_suits_the_people():
     detector = SizesSeen(150.0)
     detector.detect_parts([image], [])
     assert detector.shapes == [(1080, 1920)]
+
+
+class Scripted(BundledDetector):
+    """A detector whose net finds one person with a score that depends on the image's width."""
+
+    def __init__(self, scores):
+        self.scores, self.seen = scores, []
+
+    def _detect(self, image):
+        width = image.shape[1]
+        self.seen.append(width)
+        return people((0.25 * width, 0.0, 0.5 * width, 40.0), score=self.scores.get(width, 0.1))
+
+
+def test_a_close_up_is_seen_at_the_size_of_its_surest_person():
+    frame = np.zeros((1080, 1920, 3), dtype=np.uint8)
+    close = Scripted({960: 0.4, 480: 0.5, 240: 0.8, 170: 0.7})
+    (found,) = close.detect([frame])
+    np.testing.assert_allclose(found.boxes, [[483.5, 3.5, 963.5, 323.5]])
+    np.testing.assert_allclose(found.scores, [0.8])
+    # A gain within the noise of scores, or a sure person of usual size, leaves the frame as it is.
+    for scores in ({960: 0.4, 480: 0.44}, {960: 0.6, 240: 0.95}):
+        usual = Scripted(scores)
+        usual.detect([frame])
+        assert 1920 in usual.seen
+    assert 240 not in usual.seen
+
+
+def test_where_a_camera_tells_the_size_no_close_up_is_sought():
+    told = Scripted({240: 0.95})
+    told.detect_parts([np.zeros((1080, 1920, 3), dtype=np.uint8)], [])
+    assert set(told.seen) == {1920}
