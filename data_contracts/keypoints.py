@@ -346,4 +346,4 @@ EXTRA_ARRAYS = (
 POINT_ATTRIBUTE = {"point": "names of the points besides COCO-17; absent without any"}
 """The attribute that labels the dimension of `EXTRA_ARRAYS`."""
 OPTIONAL_POINTS = (*(array.name for array in EXTRA_ARRAYS), *POINT_ATTRIBUTE)
-"""What is absent from a result without such points."""
+"""Arrays and attribute that a result without such points lacks."""

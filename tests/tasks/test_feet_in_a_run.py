@@ -24,17 +24,13 @@ STAGES = (
 NOISE_PX = 1.0
 
 
-class Results(dict):
-    """Results of a run by unit, as `worldpose.store.Run` gives them."""
-
-
 def add_feet(folder):
     """Give the 2D poses of all static cameras but the first the feet of their people."""
     poses, _ = read_poses(folder / "reference" / "poses" / "clip.npz")
     feet = fold_keypoints(find_body(), FEET)(poses)  # (persons, frames, 6, 3)
     rng = np.random.default_rng(0)
     for file in sorted((folder / "detections").glob("cam*.npz"))[1:]:
-        camera = read_camera(folder / "reference" / "cameras" / file.name)[0]
+        camera = read_camera(folder / "reference" / "cameras" / file.name)
         with np.load(folder / "reference" / "identities" / file.name) as known:
             person, frame = known["person"], known["frame"]
         people = read_keypoint_arrays(file)
@@ -65,34 +61,17 @@ def compute(folder, project):
 
 
 @pytest.fixture(scope="module")
-def runs(tiny, tmp_path_factory):
-    """Results without and with feet, and the true feet (frames, persons, 6, 3) [m]."""
+def run(tiny, tmp_path_factory):
+    """Results by unit, and the true feet (frames, persons, 6, 3) [m]."""
     base = tmp_path_factory.mktemp("feet")
-    found = []
-    for name in ("plain", "feet"):
-        folder = shutil.copytree(tiny, base / name)
-        shutil.copy(folder / "reference" / "calibration.toml", folder)
-        truth = add_feet(folder) if name == "feet" else None
-        found.append(compute(folder, base / f"{name}-project"))
-    return found[0], found[1], truth
+    folder = shutil.copytree(tiny, base / "match")
+    shutil.copy(folder / "reference" / "calibration.toml", folder)
+    truth = add_feet(folder)
+    return compute(folder, base / "project"), truth
 
 
-def test_other_results_are_those_without_feet(runs):
-    plain, with_feet, _ = runs
-    assert plain.keys() == with_feet.keys()
-    for name, result in plain.items():
-        assert "point" not in result.dims and not [v for v in result if v.startswith("extra")]
-        stage = name.split("/")[0]
-        changed = {"body_pose", "global_orient", "transl", "joints", "covariance"}
-        for array in result.data_vars:
-            if stage != "body_fitting" or array not in changed:
-                np.testing.assert_array_equal(
-                    result[array].values, with_feet[name][array].values, err_msg=f"{name} {array}"
-                )
-
-
-def test_ingest_stores_them_by_name(runs):
-    found = runs[1]
+def test_ingest_stores_them_by_name(run):
+    found, _ = run
     assert found["ingest/cam01"]["point"].values.tolist() == list(FEET)
     assert np.isfinite(found["ingest/cam01"]["extra_keypoints"].values).any()
     assert "extra_keypoints" not in found["ingest/cam00"]  # the camera without feet
@@ -106,8 +85,8 @@ def true_people(result, truth):
 
 
 @pytest.mark.parametrize("stage", ["triangulation", "retriangulation"])
-def test_triangulation_finds_them(runs, stage):
-    _, found, truth = runs
+def test_triangulation_finds_them(run, stage):
+    found, truth = run
     result = found[f"{stage}/clip"]
     assert result["point"].values.tolist() == list(FEET)
     away = np.linalg.norm(result["extra_joints"].values - true_people(result, truth), axis=-1)
@@ -116,28 +95,27 @@ def test_triangulation_finds_them(runs, stage):
     assert (result["extra_views"].values[np.isfinite(away)] >= 2).all()
 
 
-def test_bodies_follow_them(runs):
-    plain, found, truth = runs
+def test_bodies_follow_them(run):
+    found, truth = run
     result = found["body_fitting/clip"]
-    wanted = true_people(result, truth)
-    errors = []
-    for each in (plain["body_fitting/clip"], result):
-        bodies = BodyParameters(
-            np.broadcast_to(each["betas"].values, (*each["transl"].shape[:2], 10)),
-            *(each[name].values for name in ("global_orient", "body_pose", "transl")),
-        )
-        feet = fold_keypoints(find_body(), FEET)(bodies)
-        errors.append(np.nanmedian(np.linalg.norm(feet - wanted, axis=-1)))
-    assert errors[1] < 0.7 * errors[0]
+    bodies = BodyParameters(
+        np.broadcast_to(result["betas"].values, (*result["transl"].shape[:2], 10)),
+        *(result[name].values for name in ("global_orient", "body_pose", "transl")),
+    )
+    feet = fold_keypoints(find_body(), FEET)(bodies)
+    np.testing.assert_allclose(feet, result["extra_joints"].values, atol=1e-9)
+    # Without points feet are 30 to 50 mm from the truth.
+    assert np.nanmedian(np.linalg.norm(feet - true_people(result, truth), axis=-1)) < 0.025
 
 
-def test_joint_tracks_carry_them_in_both_definitions(runs):
-    run = Results(runs[1])
-    assert joint_tracks(Results(runs[0]), "clip").extra is None
-    body, seen = (joint_tracks(run, "clip", definition=name).extra for name in ("body", "detector"))
-    placed = joint_tracks(run, "clip", "retriangulation")
+def test_joint_tracks_carry_them_in_both_definitions(run):
+    results = run[0]
+    body, seen = (
+        joint_tracks(results, "clip", definition=name).extra for name in ("body", "detector")
+    )
+    placed = joint_tracks(results, "clip", "retriangulation")
     assert body.points == seen.points == placed.extra.points == FEET
-    result = run["body_fitting/clip"]
+    result = results["body_fitting/clip"]
     np.testing.assert_array_equal(body.joints, result["extra_joints"].values)
     length = np.linalg.norm(result["extra_offsets"].values, axis=-1)
     moved = np.linalg.norm(seen.joints - body.joints, axis=-1)
