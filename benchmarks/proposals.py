@@ -4,6 +4,7 @@
     python benchmarks/proposals.py lines DATA [--count 100] [--drop 0.2] [--clutter 4] [--first 0]
     python benchmarks/proposals.py images FILE ... [--out FOLDER]
     python benchmarks/proposals.py sides [SCENARIO ...] [--surveys 4] [--first 0] [--duration 4]
+    python benchmarks/proposals.py match FOLDER --out FOLDER
 
 simulation: rendered stills of the static cameras of simulated stadiums. Ground: the true pixel of a
 player's place, back through the calibrated camera onto the pitch.
@@ -17,12 +18,19 @@ images: files, each with one line and an overlay in the folder.
 sides: simulated people seen by cameras with errors of calibration, half of them turned by half a
 turn. The side of the first camera is stated; those of the others follow from the people in twelve
 frames. A side is wrong, or right, or not decided.
+
+match: a match folder of `worldpose simulate --render` with clicks, for example `--scenario
+broadcast-pan --seed 850 --duration 1`. A copy without stills and annotations, in which one static
+camera states its side, and the folder itself run from videos to bodies; one line of metrics each.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,12 +39,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from static_accuracy import ground_errors
 
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from worldpose.errors import InputError
+from worldpose.formats import read_camera
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
@@ -268,6 +278,48 @@ def images(files: Sequence[Path], out: Path | None) -> Iterator[Outcome]:
             cv2.imwrite(str(out / f"{file.stem}.png"), picture)
 
 
+def take_annotations(folder: Path, out: Path) -> Path:
+    """Return a copy of a match folder without stills, clicks and cameras, with one side."""
+    if out.exists():
+        return out
+    shutil.copytree(folder, out)
+    for name in ("annotations", "stills"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / "calibration.toml").unlink(missing_ok=True)
+    spec = yaml.safe_load((out / "match.yaml").read_text())
+    spec["match_id"] += "-without-clicks"
+    for camera in spec["cameras"]:
+        camera.pop("still", None)
+    first = spec["cameras"][0]
+    true = read_camera(
+        out / "reference" / "cameras" / f"{first['id']}.npz", (first["width"], first["height"])
+    )
+    first["side"] = side_of(true, PitchTemplate.standard())
+    (out / "match.yaml").write_text(yaml.safe_dump(spec))
+    return out
+
+
+def compare_runs(folder: Path, out: Path) -> None:
+    """Print the metrics of a run without clicks and of one with them, from videos to bodies."""
+
+    def worldpose(*words: str | Path) -> str:
+        program = (sys.executable, "-c", "from flows.cli import main; main()", *map(str, words))
+        return subprocess.run(program, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+    for each in (take_annotations(folder, out / "without_clicks"), folder):
+        start, project = time.perf_counter(), out / f"project_{each.name}"
+        worldpose("run", each, "--project", project)
+        seconds = time.perf_counter() - start
+        name = yaml.safe_load((each / "match.yaml").read_text())["match_id"]
+        where = ("--prediction", name, "--reference", each / "reference", "--project", project)
+        found = json.loads(worldpose("evaluate", *where, "--json"))
+        print(
+            f"{name}: MPJPE {found['mpjpe_mm']:.1f} mm, G-MPJPE {found['g_mpjpe_mm']:.1f} mm, "
+            f"{seconds:.0f} s, cameras {json.dumps(found['cameras'])}",
+            flush=True,
+        )
+
+
 def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
     """Print the share that is accepted, the errors among those, and why others are not."""
     accepted = np.array([each.accepted for each in outcomes])
@@ -294,7 +346,7 @@ def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("simulation", "lines", "images", "sides"))
+    parser.add_argument("part", choices=("simulation", "lines", "images", "sides", "match"))
     parser.add_argument("names", nargs="*")
     parser.add_argument("--surveys", type=int, default=4)
     parser.add_argument("--first", type=int, default=0)
@@ -304,6 +356,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--duration", type=float, default=4.0)
     arguments = parser.parse_args()
+    if arguments.part == "match":
+        compare_runs(Path(arguments.names[0]), arguments.out or Path("build/match"))
+        return
     if arguments.part == "simulation":
         seeds = range(arguments.first, arguments.first + arguments.surveys)
         parts = [simulate(name, seeds) for name in arguments.names or ("match",)]

@@ -118,7 +118,7 @@ def _open_proposal(store: Store, work: Work, pitch: PitchTemplate, where: str) -
     if own.attrs["origin"] == "none":
         raise InputError(**own.attrs["problem"])
     proposal = Proposal.from_attributes(camera_from_arrays(own.data_vars), own.attrs)
-    proposal.require_clear(where)
+    proposal.require_clear(where, pitch)
     if len(found) == 1:
         return proposal
     seen = {

@@ -212,7 +212,7 @@ def routes(context: PageContext) -> APIRouter:
             return {"drawn": {}, "markings": {}, "reason": reason}
         reason = ""
         try:
-            found.require_clear(where)
+            found.require_clear(where, drawing.template)
         except InputError as error:
             reason = describe_error(error)
         return {

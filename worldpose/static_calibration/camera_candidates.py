@@ -487,3 +487,28 @@ def _move(candidates: Candidates, step: Floats) -> Candidates:
         candidates.focals * np.exp(np.clip(step[:, 6], -0.3, 0.3)),
         candidates.radial + step[:, 7],
     )
+
+
+def explained_share(paint: PaintMap, seen: SeenMarkings, reach: float) -> float:
+    """Return the share of the segments' length that lies on a projected marking [1].
+
+    Args:
+        paint: paint of the image.
+        seen: the markings in view of one candidate.
+        reach: largest distance from a sample of a marking [px]; samples are up to tens of pixels
+            apart.
+    """
+    width, height = paint.size
+    canvas = np.ones((height, width), np.uint8)
+    image = seen.pixels[0][seen.lengths[0] > 0.0] + 0.5 * np.array([width - 1, height - 1])
+    for x, y in image:
+        cv2.circle(canvas, (round(x), round(y)), 1, 0, -1)
+    away = cv2.distanceTransform(canvas, cv2.DIST_L2, 5)
+    total = on = 0.0
+    for start, end in paint.segments:
+        count = max(2, int(np.linalg.norm(end - start)))
+        x, y = np.linspace(start, end, count).T
+        row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
+        on += float((away[row.astype(int), column.astype(int)] < reach).sum())
+        total += count
+    return on / max(total, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,6 +17,8 @@ _MARGIN = 2.0
 """Margin of the map beyond the outer lines [m]: people stand there."""
 _NUDGE = 0.01
 """Step of the surface's slope [m]."""
+_GROUND = 0.5
+"""Height below which a named point is on the ground [m]."""
 _GRAZING = 1e-9
 """Minimum image area of a square metre of ground [px^2]: less is the horizon."""
 
@@ -228,3 +231,30 @@ def _inside(estimate: CameraEstimate, pixels: NDArray[np.float64]) -> NDArray[np
     with np.errstate(invalid="ignore"):
         within = (pixels >= 0.0) & (pixels <= estimate.camera.image_size - 1.0)
     return np.asarray(within.all(axis=1))
+
+
+def points_in_view(
+    camera: Camera, pitch: PitchTemplate, lines: Collection[str], count: int = 4
+) -> tuple[str, ...]:
+    """Return named points on the ground that a camera sees, ends of some lines first, far apart.
+
+    Args:
+        camera: a single camera.
+        pitch: the template.
+        lines: lines that the image shows.
+        count: maximum number of points.
+    """
+    names = [name for name, place in pitch.points.items() if place[2] < _GROUND]
+    pixels = camera.project(pitch.positions(names))
+    inside = np.all((pixels >= 0.0) & (pixels <= camera.image_size - 1.0), axis=1).tolist()
+    left = {name: pixel for name, pixel, seen in zip(names, pixels, inside, strict=True) if seen}
+    shown = [line for name, line in pitch.lines.items() if name in lines]
+    ends = {end for line in shown for end in (line.start, line.end)}
+    away = dict.fromkeys(left, np.inf)
+    chosen: list[str] = []
+    while left and len(chosen) < count:
+        best = max(left, key=lambda name: (name in ends, away[name]))
+        here = left.pop(best)
+        chosen.append(best)
+        away = {n: min(away[n], float(np.linalg.norm(at - here))) for n, at in left.items()}
+    return tuple(chosen)

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +29,7 @@ from worldpose.static_calibration.camera_candidates import (
     INDEPENDENT,
     Candidates,
     SeenMarkings,
+    explained_share,
     join_candidates,
     name_triples,
     project_markings,
@@ -37,6 +37,7 @@ from worldpose.static_calibration.camera_candidates import (
     score_with_prior,
 )
 from worldpose.static_calibration.circle_candidates import name_circles
+from worldpose.static_calibration.ground_error import points_in_view
 from worldpose.static_calibration.line_samples import LineSamples, sample_markings
 from worldpose.static_calibration.paint_segments import PaintMap, find_paint, trace_marking
 from worldpose.static_calibration.parameters import drop_k3
@@ -127,27 +128,39 @@ class Proposal:
         enough = self.found >= MIN_FOUND and self.explained >= MIN_EXPLAINED
         return self.margin >= MIN_MARGIN and enough
 
-    def require_clear(self, where: str) -> None:
+    def require_clear(self, where: str, pitch: PitchTemplate) -> None:
         """Refuse a proposal that may not be used without a click.
 
         Args:
             where: file or camera, for messages.
+            pitch: the template, whose points the message names.
 
         Raises:
             InputError: the image shows too little, or other cameras explain it nearly as well; the
-                message says what to click.
+                message says what is missing and what to click.
         """
         if self.is_clear:
             return
         lacking = [each.name for each in self.markings if each.found < 0.5]
+        found = []
+        if self.margin < MIN_MARGIN:
+            found.append(f"another camera explains it nearly as well (margin {self.margin:.0f})")
+        if self.found < MIN_FOUND:
+            found.append(f"{self.found:.0%} of the markings that it would see are on paint")
+        if self.explained < MIN_EXPLAINED:
+            found.append(f"{self.explained:.0%} of the paint lies on its markings")
+        if lacking:
+            found.append(f"not found: {', '.join(lacking[:4])}")
+        clear = [each.name for each in self.markings if each.found >= 0.5]
+        points = points_in_view(self.camera, pitch, clear)
         raise InputError(
             where,
             expected=f"one camera that explains the paint (margin {MIN_MARGIN:g}, "
             f"{MIN_FOUND:.0%} of the markings on paint, "
             f"{MIN_EXPLAINED:.0%} of the paint on markings)",
-            found=f"margin {self.margin:.0f}, {self.found:.0%} and {self.explained:.0%}; "
-            f"not found: {', '.join(lacking[:4]) or 'nothing, but other cameras fit as well'}",
-            todo=_TO_CLICK,
+            found="; ".join(found),
+            todo=_TO_CLICK
+            + (f" If the proposed camera is right, it sees {', '.join(points)}." if points else ""),
         )
 
     def turn(self) -> Proposal:
@@ -263,7 +276,7 @@ def propose_from_paint(
         float(scores[0]),
         float(scores[0]) - _second(scores),
         float(on_paint),
-        _explained_share(paint, seen),
+        explained_share(paint, seen, 3.0 * _ON_PAINT),
     )
 
 
@@ -321,7 +334,7 @@ def calibrate_proposal(
         InputError: the proposal is not clear, or the calibration disagrees with it.
     """
     stated = settings or StaticCalibrationSettings()
-    proposal.require_clear(where)
+    proposal.require_clear(where, pitch)
     height, width = picture.shape[:2]
 
     def calibrate(drawn: ClickedMarkings) -> StaticCalibration:
@@ -552,25 +565,6 @@ def _support(
         drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
     support.sort(key=lambda each: -each.visible_px)
     return tuple(support), ClickedMarkings(drawn=tuple(drawn))
-
-
-def _explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
-    """Return the share of the segments' length that lies on a projected marking [1]."""
-    width, height = paint.size
-    canvas = np.ones((height, width), np.uint8)
-    image = seen.pixels[0][seen.lengths[0] > 0.0] + 0.5 * np.array([width - 1, height - 1])
-    for x, y in image:
-        cv2.circle(canvas, (round(x), round(y)), 1, 0, -1)
-    away = cv2.distanceTransform(canvas, cv2.DIST_L2, 5)
-    total = on = 0.0
-    for start, end in paint.segments:
-        count = max(2, int(np.linalg.norm(end - start)))
-        x, y = np.linspace(start, end, count).T
-        row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-        # Samples of markings are up to tens of pixels apart.
-        on += float((away[row.astype(int), column.astype(int)] < 3.0 * _ON_PAINT).sum())
-        total += count
-    return on / max(total, 1.0)
 
 
 def _lens_camera(lens: LensCalibration, size: tuple[int, int]) -> Camera:

@@ -299,3 +299,14 @@ def test_a_spoilt_match_yaml_is_read_or_refused(tmp_path_factory, start, length,
         assert spec.static_cameras or any(clip.broadcast for clip in spec.clips)
     except InputError as error:
         assert str(folder) in error.where
+
+
+def test_the_side_of_a_static_camera_lets_key_frames_be_proposed(match_folder, edit):
+    (match_folder / "broadcast").mkdir()
+    (match_folder / "broadcast" / "goal.mp4").write_bytes(b"video")
+    match = read_match(match_folder)
+    assert (match.proposed_clips, match.calibrated_clips) == ((), ())
+    edit(lambda content: content["cameras"][0].update(side="near"))
+    match = read_match(match_folder)
+    assert match.broadcast_side("goal") is None
+    assert match.proposed_clips == match.calibrated_clips == ("goal",)

@@ -18,6 +18,7 @@ from worldpose.static_calibration.camera_candidates import (
     refine_candidates,
     score_candidates,
 )
+from worldpose.static_calibration.ground_error import points_in_view
 from worldpose.static_calibration.line_samples import sample_markings
 from worldpose.static_calibration.paint_segments import (
     Ridges,
@@ -141,6 +142,25 @@ def test_lines_that_many_cameras_explain_are_not_clear():
     proposal = propose_from_paint([paint_of(camera(), names)], PITCH, side="near")
     assert proposal is not None
     assert not proposal.is_clear
+    with pytest.raises(InputError) as refused:
+        proposal.require_clear("image of cam3", PITCH)
+    message = str(refused.value)
+    assert "image of cam3" in message
+    assert f"another camera explains it nearly as well (margin {proposal.margin:.0f})" in message
+    assert "Click four or more named points" in message
+    named = message.rpartition("it sees ")[2].rstrip(".").split(", ")
+    assert len(named) == 4
+    pixels = proposal.camera.project(PITCH.positions(named))
+    assert ((pixels >= 0.0) & (pixels <= proposal.camera.image_size - 1.0)).all()
+
+
+def test_points_to_click_are_ends_of_found_lines_first_and_far_apart():
+    found = points_in_view(camera(), PITCH, ["penalty_area_left_front"])
+    assert set(found[:2]) == {"penalty_area_left_near_front", "penalty_area_left_far_front"}
+    assert len(set(found)) == 4
+    pixels = camera().project(PITCH.positions(found))
+    apart = np.linalg.norm(pixels[:, None] - pixels, axis=-1)[np.triu_indices(4, 1)]
+    assert apart.min() > 100.0
 
 
 @pytest.mark.parametrize(
