@@ -90,7 +90,10 @@ await field("Name", "textarea").fill(task.release.name);
 await field("Licence", "textarea").fill(task.release.licence);
 await shot(prefect, "custom_run");
 await prefect.getByRole("button", { name: "Submit" }).click();
-await prefect.waitForURL(/deployment\/[-0-9a-f]+\?/);
+await prefect.waitForURL(/deployment\/[-0-9a-f]+\?/).catch(async (error) => {
+  await shot(prefect, "not_submitted");
+  throw error;
+});
 await prefect.locator('a[href*="flow-run/"]').first().click();
 await prefect.waitForURL(/flow-run\//);
 await prefect.waitForSelector("text=Completed", { timeout: 1000 * task.patience });

@@ -238,6 +238,31 @@ def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment,
     wait_until(is_started_again, deployment.explain)
     note("worker killed and started again")
 
+    # Prometheus reads every part with the secrets of its own container.
+    def targets():
+        return {
+            each["labels"]["job"]: (each["health"], each["lastError"])
+            for each in deployment.at_prometheus("targets")["activeTargets"]
+        }
+
+    good = ("up", "")
+    wait_until(lambda: set(targets().values()) == {good}, lambda: str(targets()))
+    assert targets() == {"worldpose": good, "prefect": good, "dask": good}
+    podman("exec", deployment.name("prometheus"), "promtool", "check", "config",
+           "/etc/prometheus/prometheus.yml")  # fmt: skip
+
+    # An alert holds for the refused arrival, and for nothing that is well.
+    def alerts():
+        return {
+            each["labels"]["alertname"]
+            for each in deployment.at_prometheus("alerts")["alerts"]
+            if each["state"] == "firing"
+        }
+
+    wait_until(lambda: "WorldposeArrivalRefused" in alerts(), lambda: str(alerts()))
+    assert alerts() <= {"WorldposeArrivalRefused", "WorldposeQuality", "WorldposeDiskLow"}
+    note("watched")
+
     def is_done():
         browser.approve_all(NAME)
         assert status() != "failed", deployment.explain()
@@ -253,25 +278,13 @@ def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment,
     assert "<title>" in page, "Prefect has no dashboard"
     # The store is in the bucket, and whole; Prefect's runs are in Postgres.
     inside = ("exec", deployment.name("serve"), "worldpose")
-    said = podman(*inside, "verify", "--project", "s3://projects/worldpose")
+    project = ("--project", "s3://projects/worldpose")
+    said = podman(*inside, "verify", *project)
     assert "damaged" not in said, said
     query = ("psql", "-U", "prefect", "-tAc", "select count(*) from flow_run")
     assert int(podman("exec", deployment.name("postgres"), *query)) >= 1
-    assert "healthy" in podman(*inside, "serve", "--check", "--state", "/data/operations",
-                               "--project", "s3://projects/worldpose")  # fmt: skip
-
-    # Prometheus reads every part with the secrets of its own container.
-    def targets():
-        return {
-            each["labels"]["job"]: (each["health"], each["lastError"])
-            for each in deployment.at_prometheus("targets")["activeTargets"]
-        }
-
-    good = ("up", "")
-    wait_until(lambda: set(targets().values()) == {good}, lambda: str(targets()))
-    assert targets() == {"worldpose": good, "prefect": good, "dask": good}
-    podman("exec", deployment.name("prometheus"), "promtool", "check", "config",
-           "/etc/prometheus/prometheus.yml")  # fmt: skip
+    healthy = podman(*inside, "serve", "--check", "--state", "/data/operations", *project)
+    assert all(row.startswith("ok ") for row in healthy.splitlines()), healthy
     asked = "query?query=worldpose_matches{state=%22complete%22}"
 
     def counted():
@@ -279,17 +292,6 @@ def test_every_part_in_its_container_computes_a_match_and_is_watched(deployment,
 
     wait_until(lambda: counted() == ["1"], lambda: str(counted()))
 
-    # An alert holds for the refused arrival, and for nothing that is well.
-    def alerts():
-        return {
-            each["labels"]["alertname"]
-            for each in deployment.at_prometheus("alerts")["alerts"]
-            if each["state"] == "firing"
-        }
-
-    wait_until(lambda: "WorldposeArrivalRefused" in alerts(), lambda: str(alerts()))
-    assert alerts() <= {"WorldposeArrivalRefused", "WorldposeQuality", "WorldposeDiskLow"}
-    note("watched")
     # Parts of the inner network reach nothing outside, and are reached by nothing outside.
     routes = "print(open('/proc/net/route').read())"
     for service in ("dask-worker", "postgres", "prometheus", "s3"):
