@@ -216,7 +216,7 @@ class Views:
         """Return the cameras from the best pairs.
 
         Raises:
-            InputError: no two cameras show one person, or a camera shares no person with the others.
+            InputError: no two cameras show one person, or one shares no person with the others.
         """
         pairs = [self._pair(a, b) for a, b in combinations(range(len(self.names)), 2)]
         good = sorted((one for one in pairs if one is not None), key=lambda one: -one.worth)
