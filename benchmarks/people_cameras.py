@@ -1,4 +1,4 @@
-"""Prints how far the cameras of one calibration are from those of another.
+"""Prints the distance of one calibration's cameras from those of another.
 
     worldpose import --pose2sim TRIAL --out MATCH       # a trial without its calibration
     worldpose import --lens lenses.toml --out MATCH

@@ -228,7 +228,7 @@ def _as_json(found: CamerasFromPeople, names: list[str]) -> dict[str, Any]:
 def _print(
     found: CamerasFromPeople, names: list[str], written: list[str], known: KnownLength
 ) -> None:
-    """Print a table of the cameras, and how sure they are."""
+    """Print a table of the cameras with their standard deviations."""
     rows = []
     for c, name in enumerate(names):
         x, y, z = found.cameras.center[c]

@@ -142,7 +142,7 @@ def synchronize(
 
 
 def choose_clip(spec: MatchSpec, clip: str | None) -> str:
-    """Return the clip that was asked for; the longest if none was.
+    """Return the requested clip, or else the longest.
 
     Raises:
         UsageError: the match has no such clip.

@@ -102,7 +102,7 @@ class CamerasFromPeople:
 
 
 class KnownLength(NamedTuple):
-    """What gives the scale."""
+    """A measured length, which gives the scale."""
 
     length_m: float
     """Stature of the people, or distance of the two cameras [m]."""
@@ -374,7 +374,7 @@ class _People(NamedTuple):
         ankles = joints[:, :, [15, 16]]
         trunk, legs = _mean_direction(shoulders - hips), _mean_direction(hips - ankles.mean(axis=2))
         lean = (trunk + legs) / np.linalg.norm(trunk + legs)
-        # Who bends at the hips is not upright: trunk and legs then disagree.
+        # A person bent at the hips is not upright: trunk and legs then disagree.
         bent = float(np.arccos(np.clip(trunk @ legs, -1.0, 1.0)))
         lean_std = float(np.hypot(LEAN_STD, 0.5 * bent))
         up = lean

@@ -35,7 +35,7 @@ MAX_FRAMES: Final = 120
 MIN_FRAMES: Final = 20
 """Least frames in which two cameras show a person [frame]."""
 BUFFER_S: Final = 0.5
-"""Longest time for which a camera loses a person whom it shows again [s]."""
+"""Longest gap in a person's track in one camera [s]."""
 MAX_TRACKS: Final = 5
 """Most people of a camera who are compared; the longest seen [1]."""
 MIN_MOTION: Final = 0.25
@@ -96,7 +96,7 @@ def find_walkers(
     """Return the keypoints (frames, 12, 2) [px] of the people in each camera's images.
 
     Raises:
-        InputError: a camera shows nobody for long, or nobody walks.
+        InputError: a camera shows no person for long enough, or no person walks.
     """
     every = []
     for c, name in enumerate(names):
@@ -147,7 +147,7 @@ def _height(track: Floats) -> float:
 
 
 def _walking_distance(track: Floats) -> float:
-    """Return how far a person moves in the image, in heights of the person [1].
+    """Return the distance that a person moves in the image, in heights of the person [1].
 
     A change of size counts as motion: that person walks towards the camera.
     """
@@ -174,7 +174,7 @@ class Start(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """The second camera's pose in the first one's axes, by the people whom both show."""
+    """The second camera's pose in the first one's axes, by the people that both show."""
 
     cameras: tuple[int, int]
     pose: Rigid
@@ -216,7 +216,7 @@ class Views:
         """Return the cameras from the best pairs.
 
         Raises:
-            InputError: no two cameras show one person, or a camera shows nobody of the others.
+            InputError: no two cameras show one person, or one shares no person with the others.
         """
         pairs = [self._pair(a, b) for a, b in combinations(range(len(self.names)), 2)]
         good = sorted((one for one in pairs if one is not None), key=lambda one: -one.worth)
@@ -281,7 +281,7 @@ class Views:
         return _Pair((a, b), pose, tuple(people), count * float(np.sqrt(1.0 - parallel**2)))
 
     def _shared_joints(self, a: int, i: int, b: int, j: int) -> tuple[Floats, Floats, float]:
-        """Return joints (n, 2) that two tracks both show, and how far they may be apart."""
+        """Return joints (n, 2) that two tracks both show, and their largest distance."""
         one, other = self.planes[a][i], self.planes[b][j]
         both = np.isfinite(one[..., 0]) & np.isfinite(other[..., 0])
         limit = 0.5 * (self.limits[a][i] + self.limits[b][j])
@@ -308,7 +308,7 @@ class Views:
         """Return all cameras, added to a pair one by one, the one with the most joints first.
 
         Raises:
-            InputError: a camera shows nobody of the others.
+            InputError: a camera shares no person with the others.
         """
         a, b = pair.cameras
         poses = {a: Rigid(np.eye(3), np.zeros(3)), b: pair.pose}
@@ -323,7 +323,7 @@ class Views:
             if not agree or pose is None:
                 raise refusal(
                     [self.names[c] for c in rest],
-                    f"a person for {MIN_FRAMES} frames whom the others show at the same time",
+                    f"a person for {MIN_FRAMES} frames that the others show at the same time",
                     "none whose joints agree",
                 )
             poses[chosen] = pose

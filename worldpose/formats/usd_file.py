@@ -35,7 +35,7 @@ def write_usd(
 
     The stage is in metres, z up, as the world is; a time code is a frame. Each person is a SkelRoot
     with a skeleton of 24 joints, its animation, and a mesh with the person's shape and the model's
-    skinning weights, without pose correctives. A person who is missing is invisible. Cameras have
+    skinning weights, without pose correctives. A missing person is invisible. Cameras have
     focal length, principal point and pose, and their distortion as custom data.
 
     Args:

@@ -262,7 +262,7 @@ def _estimate_fractions(
         groups = len(parts)
         stated = np.diagonal(rows @ information.sum(axis=0) @ rows.T)
         scatter = (left**2).sum(axis=0) * groups / max(1, groups - 1)
-        # What all people of a camera have in common does not show in their scatter.
+        # The common error of all people in a camera does not show in their scatter.
         along, misses, scale = np.sum([each for _, each in sums], axis=0)
         usual = np.sqrt(np.divide(misses, 2.0 * scale, out=np.zeros(count), where=scale > 0.0))
         alike = rows[:, clock] ** 2 @ (ALIKE * along * usual) ** 2

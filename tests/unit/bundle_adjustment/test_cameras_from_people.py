@@ -185,5 +185,5 @@ def test_a_camera_that_shows_another_person_is_named(walkers, cameras):
     given = seen(cameras, walkers[:, :1])
     keypoints = given.keypoints.copy()
     keypoints[:, 1] = keypoints[::-1, 1] * [-1.0, 1.0] + [1280.0, 0.0]
-    with pytest.raises(InputError, match="east: expected a person for 20 frames whom"):
+    with pytest.raises(InputError, match="east: expected a person for 20 frames that"):
         locate_cameras(lenses(cameras), replace(given, keypoints=keypoints), FPS, KnownLength(1.8))
