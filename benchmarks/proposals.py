@@ -5,6 +5,7 @@
     python benchmarks/proposals.py images FILE ... [--out FOLDER]
     python benchmarks/proposals.py sides [SCENARIO ...] [--surveys 4] [--first 0] [--duration 4]
     python benchmarks/proposals.py match FOLDER --out FOLDER
+    python benchmarks/proposals.py pair DATA
 
 simulation: rendered stills of the static cameras of simulated stadiums. Ground: the true pixel of a
 player's place, back through the calibrated camera onto the pitch.
@@ -22,6 +23,10 @@ frames. A side is wrong, or right, or not decided.
 match: a match folder of `worldpose simulate --render` with clicks, for example `--scenario
 broadcast-pan --seed 850 --duration 1`. A copy without stills and annotations, in which one static
 camera states its side, and the folder itself run from videos to bodies; one line of metrics each.
+
+pair: the two real cameras in `static_pair`, each alone, without clicks and from its clicks: how far
+apart they project places of the pitch, each on its own surface, and the share of these distances
+inside the sum of both 95 % regions.
 """
 
 from __future__ import annotations
@@ -42,26 +47,37 @@ import numpy as np
 import yaml
 from static_accuracy import ground_errors
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
+import static_pair
+from static_pair import CROWN
+
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.errors import InputError
 from worldpose.formats import read_camera
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import surface_shape
 from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import (
     Proposal,
     SeenPeople,
+    StaticCalibration,
+    calibrate_camera,
     calibrate_without_clicks,
     decide_sides,
     propose_camera,
 )
 from worldpose.static_calibration.paint_segments import Ridges, guess_lens, straighten_paint
+from worldpose.static_calibration.parameters import by_step
 from worldpose.static_calibration.proposal import propose_from_paint
 from worldpose.static_calibration.sides import turn_camera
 from worldpose.tracking import locate_feet
+from worldpose.video import median_picture, open_video
 
 SIZE = (1280, 720)
 """Width, height of the images of drawn lines [px]."""
@@ -71,6 +87,8 @@ GOOD_M = 0.05
 """Median ground error at the players of a good camera [m]."""
 WRONG_M = 0.5
 """Median ground error from which an accepted camera is wrong [m]."""
+CHI2_95 = 5.99
+"""95 % quantile of chi-square with two degrees of freedom [1]."""
 SIDE_FRAMES = 12
 """Frames whose people decide the sides, as many as the stage `proposal` takes [1]."""
 SIDES = {"top": "far", "bottom": "near"}
@@ -320,6 +338,49 @@ def compare_runs(folder: Path, out: Path) -> None:
         )
 
 
+def compare_pair(data: Path) -> None:
+    """Print how well the two real cameras agree without and with clicks."""
+    folder, level = data / "static_pair", PitchTemplate.from_spec(PitchSpec(crown=CROWN))
+    places = np.stack(np.meshgrid(np.arange(-52.0, 53.0, 3.0), np.arange(-34.0, 35.0, 3.0)), -1)
+    places = places.reshape(-1, 2)
+
+    def see(found: StaticCalibration) -> tuple[Floats, Floats]:
+        """Return pixels (n, 2) of the places and their covariances (n, 2, 2) [px^2]."""
+        assert found.report.lines is not None
+        known = found.report.lines.estimate
+        height = level.with_surface(known.surface).height(*places.T)
+        seen = known.camera.project_with_jacobians(np.column_stack([places, height]))
+        shape = surface_shape(places[:, 0], places[:, 1], (level.length, level.width))
+        steps = (by_step(known.camera, seen), seen.d_points[..., 2:] * shape[:, None])
+        rows = np.concatenate(steps, axis=-1)
+        return seen.points_image, rows @ known.covariance @ np.swapaxes(rows, 1, 2)
+
+    for side, offset in static_pair.SIDES.items():
+        with open_video(folder / f"{side}_camera.mp4") as video:
+            numbers = (offset + np.linspace(8, 47, 25)).astype(int).tolist()
+            shown = (image for n in numbers for _, image in video.frames(n, n + 1))
+            still = median_picture(shown, len(numbers))
+        world, pixels = static_pair.read_clicks(folder, side)
+        points = {name: tuple(place) for name, place in world.items()}
+        named = PitchTemplate.from_spec(PitchSpec(crown=CROWN, points=points))
+        clicks = tuple(ClickedPoint(name=name, xy=pixel) for name, pixel in pixels.items())
+        (first, one), (second, two) = (
+            see(calibrate_without_clicks(level, still, side="near")),
+            see(
+                calibrate_camera(
+                    named, ClickedMarkings(points=clicks), static_pair.SIZE, picture=still
+                )
+            ),
+        )
+        inside = np.asarray(((first > 0.0) & (first < static_pair.SIZE)).all(axis=1))
+        away = (second - first)[inside]
+        squared = (away * np.linalg.solve((one + two)[inside], away[..., None])[..., 0]).sum(axis=1)
+        print(
+            f"{side}: {np.median(np.linalg.norm(away, axis=1)):.2f} px apart (median), "
+            f"{(squared < CHI2_95).mean():.0%} in both regions"
+        )
+
+
 def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
     """Print the share that is accepted, the errors among those, and why others are not."""
     accepted = np.array([each.accepted for each in outcomes])
@@ -346,7 +407,7 @@ def summarize(outcomes: Sequence[Outcome], limit: float, unit: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("simulation", "lines", "images", "sides", "match"))
+    parser.add_argument("part", choices=("simulation", "lines", "images", "sides", "match", "pair"))
     parser.add_argument("names", nargs="*")
     parser.add_argument("--surveys", type=int, default=4)
     parser.add_argument("--first", type=int, default=0)
@@ -356,6 +417,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--duration", type=float, default=4.0)
     arguments = parser.parse_args()
+    if arguments.part == "pair":
+        compare_pair(Path(arguments.names[0]))
+        return
     if arguments.part == "match":
         compare_runs(Path(arguments.names[0]), arguments.out or Path("build/match"))
         return

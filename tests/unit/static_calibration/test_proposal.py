@@ -149,7 +149,7 @@ def test_lines_that_many_cameras_explain_are_not_clear():
     assert f"another camera explains it nearly as well (margin {proposal.margin:.0f})" in message
     assert "Click four or more named points" in message
     named = message.rpartition("it sees ")[2].rstrip(".").split(", ")
-    assert len(named) == 4
+    assert 1 <= len(named) <= 4
     pixels = proposal.camera.project(PITCH.positions(named))
     assert ((pixels >= 0.0) & (pixels <= proposal.camera.image_size - 1.0)).all()
 
