@@ -81,7 +81,7 @@ if (task.run) {
       if (!seen.out && state.waiting.some((each) => each.unit.startsWith("bundle_adjustment/"))) {
         await page.waitForSelector("[data-outlier]", { timeout: 60000 });
         await page.locator("body").press("x");
-        await page.waitForSelector('[data-outlier="0"] >> text=✕ out', { timeout: 60000 });
+        await page.waitForSelector('[data-outlier="0"] >> text=✕ removed', { timeout: 60000 });
         seen.out = await page.locator('[data-outlier="0"] td').allTextContents();
         await shot("outliers");
       }
