@@ -13,6 +13,7 @@ from data_contracts.camera_consistency import CameraFault
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
+from worldpose.camera_consistency.hypotheses import OFF_AXIS
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
@@ -165,6 +166,8 @@ def _reason(fault: Fault, cameras: Sequence[str], offset: int, fps: float) -> st
 def _cause(fault: Fault, kind: str, detail: str, other: str, offset: int, fps: float) -> str:
     """Return the fault and its correction in words."""
     value = fault.value or 1.0
+    if detail == OFF_AXIS:
+        return f"{OFF_AXIS}: calibrate it again"
     if kind == "clock":
         late = "later" if value < 0 else "earlier"
         return (

@@ -31,8 +31,10 @@ LENS_ORDERS: Final = (
 )
 """Possible positions of k1 k2 p1 p2 k3 among the five stated numbers."""
 MAX_TANGENTIAL: Final = 0.01
-"""Largest shift of an image corner by p1 and p2, relative to the image width [1]: an order of
-coefficients that needs more is none. The four cameras of Pose2Sim's demo have 0.0007 to 0.002."""
+"""Largest shift of an image corner by p1 and p2 of a real lens, relative to the image width [1].
+The four cameras of Pose2Sim's demo have 0.0007 to 0.002."""
+OFF_AXIS: Final = "its principal point or orientation is off"
+"""What an order of coefficients with larger shifts stands for: no such lens exists."""
 LENGTH_UNITS: Final = {
     "millimetres": 1e-3,
     "centimetres": 1e-2,
@@ -155,8 +157,8 @@ def pose_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
 def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     """Yield possible misreadings of lens coefficients: other order, inverted, absent.
 
-    Only lenses that exist: large tangential coefficients would stand for an error of the principal
-    point.
+    Orders with large tangential coefficients move the image nearly as a whole: they show an error
+    of the principal point or the orientation.
     """
     stated = camera.distortion
     tried = [stated]
@@ -169,9 +171,10 @@ def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
     choices.append((-stated, "the coefficients have the opposite sign"))
     choices.append((np.zeros(5), "the images have no distortion"))
     for values, detail in choices:
-        plausible = tangential_shift(camera, values) <= MAX_TANGENTIAL
-        if plausible and not any(np.array_equal(values, other) for other in tried):
+        if not any(np.array_equal(values, other) for other in tried):
             tried.append(values)
+            if tangential_shift(camera, values) > MAX_TANGENTIAL:
+                detail = OFF_AXIS
             yield Hypothesis("lens", detail, replace(camera, distortion=values))
 
 
