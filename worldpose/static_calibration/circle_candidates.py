@@ -75,7 +75,8 @@ def _painted_arcs(pitch: PitchTemplate) -> list[_PaintedArc]:
     x_lines, y_lines = (np.unique(lines[:, 0]) for lines in straight_lines(pitch))
     for name, arc in pitch.arcs.items():
         x, y = pitch.points[arc.center][:2].tolist()
-        if x > 0.0 or arc.radius < _MIN_RADIUS:
+        # A surveyed centre mark lies millimetres off the middle.
+        if x > arc.radius or arc.radius < _MIN_RADIUS:
             continue
         places = pitch.marking_points(name, 0.25)[:, 0]
         for line in y_lines.tolist():

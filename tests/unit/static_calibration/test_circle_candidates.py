@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration import calibrate_without_clicks
 from worldpose.static_calibration.camera_candidates import refine_candidates
-from worldpose.static_calibration.circle_candidates import name_circles
+from worldpose.static_calibration.circle_candidates import _painted_arcs, name_circles
 from worldpose.static_calibration.line_samples import sample_markings
 from worldpose.static_calibration.paint_segments import (
     Ridges,
@@ -136,3 +137,11 @@ def test_faint_paint_counts_where_the_grass_is_even(noise, kept):
     ridges = thin_ridges(strength, np.full(strength.shape, 0.5 * np.pi))
     on_line = (ridges.points[:, 1] == 100.0) & (ridges.points[:, 0] >= 50.0)
     assert bool(np.count_nonzero(on_line) > 250) is kept
+
+
+@pytest.mark.parametrize("x", [-0.011, 0.011])
+def test_a_surveyed_centre_mark_beside_the_middle_keeps_the_centre_circle(x):
+    surveyed = PitchTemplate.from_spec(PitchSpec(points={"center_mark": (x, 0.003, 0.0)}))
+    laws = [arc._replace(center=0.0, line=0.0, depth=0.0) for arc in _painted_arcs(PITCH)]
+    found = [arc._replace(center=0.0, line=0.0, depth=0.0) for arc in _painted_arcs(surveyed)]
+    assert found == laws
