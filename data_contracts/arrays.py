@@ -96,7 +96,7 @@ class GroupLayout(Record):
     attributes: dict[str, str] = {}
     """Group attributes that a writer must give, with their meaning."""
     optional: tuple[str, ...] = ()
-    """Names of arrays that may be absent."""
+    """Names of arrays and attributes that may be absent."""
 
     def layout(self, name: str) -> ArrayLayout:
         """The layout of the array or coordinate `name`.

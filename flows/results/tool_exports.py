@@ -79,14 +79,18 @@ def describe_clip(origin: Origin, clip: str) -> dict[str, str]:
         model = str(origin.run[unit].attrs["body_model"])
         terms = "CC0 1.0" if model.startswith(OPEN_BODY) else "the terms of its publisher apply"
         notes["body_model"] = f"{model} ({terms})"
-        offsets = np.round(1e3 * origin.run[unit]["joint_offsets"].values) + 0.0  # no -0
-        notes["joint_offsets_mm"] = "forward, left, up in the body, from model to detector: " + (
-            ", ".join(
-                f"{joint} " + " ".join(f"{number:.0f}" for number in offset)
-                for joint, offset in zip(COCO17, offsets, strict=True)
-            )
-        )
+        if "joint_offsets" in origin.run[unit]:  # a monocular method's bodies have none
+            notes["joint_offsets_mm"] = _describe_offsets(origin.run[unit]["joint_offsets"].values)
     return notes
+
+
+def _describe_offsets(offsets: Floats) -> str:
+    """Return the offsets (17, 3) [m] from a body's joints to the detector's, in millimetres."""
+    rounded = np.round(1e3 * offsets) + 0.0  # no -0
+    return "forward, left, up in the body, from model to detector: " + ", ".join(
+        f"{joint} " + " ".join(f"{number:.0f}" for number in offset)
+        for joint, offset in zip(COCO17, rounded, strict=True)
+    )
 
 
 def _keypoint_source(run: Run) -> str:

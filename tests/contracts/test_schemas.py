@@ -41,7 +41,7 @@ def test_match_schema_accepts_what_the_record_accepts_and_refuses_unknown_keys()
 def test_layouts_are_complete(layout):
     names = [array.name for array in (*layout.coordinates, *layout.arrays)]
     assert len(names) == len(set(names))
-    assert set(layout.optional) <= set(names)
+    assert set(layout.optional) <= {*names, *layout.attributes}
     for array in (*layout.coordinates, *layout.arrays):
         assert len(array.dims) == len(set(array.dims)), "labelled arrays need distinct dimensions"
         assert array.chunk_dim is None or array.chunk_dim in array.dims

@@ -133,6 +133,7 @@ def prepared(store, work, first, places):
     arrays = {
         array.name: np.zeros([sizes[dim] for dim in array.dims], dtype=array.dtype)
         for array in BODY_FITTING.arrays
+        if array.name not in BODY_FITTING.optional
     }
     frames = np.arange(first, first + COUNT)
     arrays["joints"] = places
