@@ -26,7 +26,7 @@ from worldpose.ingest import read_match
 
 ANGLES = np.array([not name.startswith("pelvis_t") for name in OPENSIM_COORDINATES])
 ANGLES[OPENSIM_COORDINATES.index("pelvis_tilt")] = True
-"""Which coordinates are angles [deg]; the others are positions [m]."""
+"""(27,) whether a coordinate is an angle [deg] or a position [m]."""
 NEAR_M = 0.3
 """Largest median distance of a body from the true person's [m]."""
 

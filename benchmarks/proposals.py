@@ -339,7 +339,7 @@ def compare_runs(folder: Path, out: Path) -> None:
 
 
 def compare_pair(data: Path) -> None:
-    """Print how well the two real cameras agree without and with clicks."""
+    """Print the agreement of the two real cameras without and with clicks."""
     folder, level = data / "static_pair", PitchTemplate.from_spec(PitchSpec(crown=CROWN))
     places = np.stack(np.meshgrid(np.arange(-52.0, 53.0, 3.0), np.arange(-34.0, 35.0, 3.0)), -1)
     places = places.reshape(-1, 2)

@@ -127,11 +127,17 @@ def track_sides(
     """Return metrics of the calibrations, and where each camera alone places people.
 
     Without clicks both cameras are proposed from their videos. Places are (frames, persons, 2) [m]
-    of each side; NaN where missing.
+    of each side; NaN where missing. If a camera is refused: the reason, and no places.
     """
     match = work / "match"
     static_pair.write_static_pair(folder, match, first_frame=0, frame_count=frames, clicked=clicked)
     store = Store.create(work / "project")
+    name, (keys,) = run_in_process(store, match, "static_calibration", 1, {})
+    for side in static_pair.SIDES:
+        key = keys[f"static_calibration/{side}"]
+        left_out = store.manifest(name, "static_calibration", side, key).left_out
+        if left_out:
+            return {"not_calibrated": left_out[side]}, []
     name, (keys,) = run_in_process(store, match, "detection", 1, {})
 
     def result(stage: str, unit: str) -> Any:
@@ -195,8 +201,9 @@ def score_static_pair(folder: Path, frames: int | None) -> Metrics:
     metrics: Metrics = {side: score_clicks(folder, side, frames) for side in static_pair.SIDES}
     for clicked in (True, False):
         with tempfile.TemporaryDirectory() as temporary:
-            found, (left, right) = track_sides(folder, count, Path(temporary), clicked=clicked)
-        found |= _score_feet(left, right)
+            found, places = track_sides(folder, count, Path(temporary), clicked=clicked)
+        if places:
+            found |= _score_feet(*places)
         metrics |= found if clicked else {"without_clicks": found}
     return metrics
 
@@ -438,7 +445,7 @@ def show(value: Any) -> str:
     """Return a value as the table has it."""
     if isinstance(value, list):
         return ", ".join(f"{each:.2f}" for each in value)
-    if isinstance(value, int):
+    if isinstance(value, (int, str)):
         return str(value)
     if not math.isfinite(value):
         return "-"

@@ -463,9 +463,10 @@ def _rank_rolled(
     samples = sample_markings(pitch, _SAMPLED[0])
     # The vote for circles is coarse: bins of 8 to 15 %.
     near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
-    found = _keep_best(paint, samples, join_candidates(found, near), prior, _SAMPLED[1])
+    # Apart: circles are refined already, and would crowd out better ones of three lines.
+    found, near = (_keep_best(paint, samples, each, prior, _SAMPLED[1]) for each in (found, near))
+    found = join_candidates(_thin_out(found[: 10 * _REFINED]), _thin_out(near[: 10 * _REFINED]))
     samples = sample_markings(pitch, _FINE[0])
-    found = _thin_out(found[: 10 * _REFINED])
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
         found = refine_candidates(paint, samples, found[:count], radii, free)
