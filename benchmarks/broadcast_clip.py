@@ -134,6 +134,11 @@ def estimated_pitch(found: BroadcastCalibration) -> PitchTemplate:
     return PitchTemplate.standard() if spec is None else PitchTemplate.from_spec(spec)
 
 
+def estimated_surface(found: BroadcastCalibration) -> PitchTemplate:
+    """Return the Laws' markings on the surface that the fit shows."""
+    return PitchTemplate.standard().with_surface(found.report.pitch.surface)
+
+
 def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrames) -> list[Row]:
     """Return frame, marking, signed distance and its stated deviation of every drawn pixel.
 
@@ -194,6 +199,7 @@ def score(data: Path, proposed: bool) -> None:
     print(f"expected error {np.nanmedian(found.report.reprojection_error):.2f} px of {SIZE[0]}")
     for title, pitch in (
         ("the Laws' markings", PitchTemplate.standard()),
+        ("the Laws' markings on the estimated surface", estimated_surface(found)),
         ("the estimated markings", estimated_pitch(found)),
     ):
         drawings = [distances(found, pitch, read_drawn(name)) for name in (FIRST, SECOND)]

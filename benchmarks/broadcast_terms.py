@@ -78,7 +78,7 @@ def rows_of(
         "true camera": true,
     }
     # The same lines and people for all variants, searched around the true camera.
-    samples = FieldSamples.of(pitch, PitchErrors.of(pitch, whole))
+    samples = FieldSamples.of(pitch, PitchErrors.of(pitch, whole), pitch.surface)
     lines = follow_lines(true, samples, pictures(), people.boxes, whole)
     players, _ = player_evidence(true, people, match_players(true, people), whole)
     evidence = together([lines.evidence, players])

@@ -10,7 +10,8 @@ DATA is a folder with any of these; what is absent is skipped:
 - `shelf_dev`: see shelf.py;
 - `moving_clip`: one video of a moving broadcast camera, `key_frames.json` (clicks in the form of
   annotations/broadcast_calibration), optionally `lines.json` (drawn lines in the same form, which
-  are scored and not fitted; without it those of the key frames are scored) and `pitch.json`;
+  are scored and not fitted; without it those of the key frames are scored) and `pitch.json`.
+  Markings are where the Laws or pitch.json have them, at the height of the fit's crown and end fall;
 - `stills`: images, and one JSON file with boxes and 17 joints of people in COCO form;
 - `mvor`: see mvor.py.
 
@@ -289,13 +290,14 @@ def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
         where=str(folder / "key_frames.json"),
     )
     calibration = calibrate_broadcast(pitch, clip)
+    shown = pitch.with_surface(calibration.report.pitch.surface)
     off = []
     for key in drawn.key_frames:
         if key.frame >= count:
             continue
         camera = calibration.camera.camera[key.frame]
         for marking in key.markings.drawn:
-            line = camera.project(pitch.marking_points(marking.name, 0.1))
+            line = camera.project(shown.marking_points(marking.name, 0.1))
             off.append(distances_to_polyline(np.array(marking.xy), line))
     if not off:
         raise InputError(

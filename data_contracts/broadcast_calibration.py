@@ -162,8 +162,9 @@ BROADCAST_CALIBRATION = GroupLayout(
         "markings_off": "median distance of painted lines from their projection [px], before and "
         "after the joint fit with players",
         "players_off": "the same for people, by the mean over a person's keypoints",
-        "pitch": "the pitch that the fit shows: `length`, `width`, `crown` and `points` as in "
-        "pitch.json, and `std_m` of the first three, 0 where they are given; null if all is given",
+        "pitch": "the pitch that the fit shows: `length`, `width`, `crown`, `end_fall` and "
+        "`points` as in pitch.json, and `std_m` of the first four, 0 where they are given; null if "
+        "all is given",
         "noise": "`paint_m`, the spread of markings without survey about the Laws, and the "
         "deviations of samples of `lines` and of `clicks` over their assumed ones",
         "decisions": "choices made, with the metrics that decided",

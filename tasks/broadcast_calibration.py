@@ -27,6 +27,7 @@ from worldpose.broadcast_calibration import (
     calibrate_broadcast,
     propose_key_frames,
 )
+from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
 from worldpose.video import open_video
@@ -141,9 +142,7 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
     offset = report.feed_offset
     if offset is not None and offset.determined:
         figures["feed_offset_frames"] = offset.frames
-    for name, value, std in zip(
-        ("length", "width", "crown"), report.pitch.size, report.pitch.size_std, strict=True
-    ):
+    for name, value, std in zip(SIZES, report.pitch.size, report.pitch.size_std, strict=True):
         if std > 0.0:
             figures |= {f"{name}_m": float(value), f"{name}_std_m": float(std)}
     return figures | {"weak": float(bool(report.reasons))}

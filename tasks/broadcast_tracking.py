@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -19,13 +19,11 @@ from data_contracts.tracking import Track
 from data_contracts.work import Work
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
+from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Store
 from worldpose.tracking import GroundPositions, locate_feet, measure_shirts, track_on_plane
 from worldpose.video import open_video
-
-SURFACE: Final = ("length", "width", "crown")
-"""Entries of pitch.json that give the surface under the feet."""
 
 
 @unit_task
@@ -111,7 +109,7 @@ def open_broadcast(store: Store, work: Work) -> BroadcastInputs:
     detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
     detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
     # The surface that the calibration found: people stand on it as the markings lie on it.
-    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SURFACE}
+    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SIZES}
     known = {name: value for name, value in surface.items() if value is not None}
     pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"] | known))
     return BroadcastInputs(detections, moving, pitch)

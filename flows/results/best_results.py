@@ -355,7 +355,8 @@ def estimated_pitch(
     seen = f"broadcast_calibration/{clip}"
     found = run[seen].attrs["pitch"] if clip is not None and seen in run else None
     if found is not None:
-        sizes = {name: found[name] for name in ("length", "width", "crown", "points")}
+        names = ("length", "width", "crown", "end_fall", "points")
+        sizes = {name: found[name] for name in names if name in found}
         given = pitch.model_dump(mode="json") | sizes
         return PitchSpec.model_validate(given | {"any_size": True})
     if ADJUSTED in run:

@@ -22,7 +22,7 @@ from worldpose.broadcast_calibration.evidence import (
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
-from worldpose.broadcast_calibration.pitch_errors import PitchErrors, PitchFit
+from worldpose.broadcast_calibration.pitch_errors import SIZES, PitchErrors, PitchFit
 from worldpose.broadcast_calibration.players import (
     FeedOffset,
     People,
@@ -201,11 +201,12 @@ def refine(
         tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
     )
     noise, matches = PlayerNoise(0.0, 0.0), None
+    surface = tracked.keys.surface
     solution: Solution | None = None
     offset: FeedOffset | None = None
     points, before = clicks, camera
     for number in range(settings.passes):
-        samples = FieldSamples.of(pitch, learned.errors)
+        samples = FieldSamples.of(pitch, learned.errors, surface)
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
         parts = [learned.errors.rescale(clicks, first_errors), lines.evidence]
@@ -230,6 +231,8 @@ def refine(
             if learned.is_near(before_learning):
                 break
             points = learned.errors.rescale(points, before_learning.errors)
+        shown = problem.of_size(solution.paint_offsets)
+        surface = pitch.surface + (learned.errors.size_m * shown)[2:]
     assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
@@ -306,20 +309,19 @@ class _Learned:
 
     def describe(self, pitch: PitchTemplate, problem: Problem, solution: Solution) -> PitchFit:
         """Return the pitch and the noise for the report."""
-        offset, std = np.zeros(3), np.zeros(3)
-        if problem.size_row >= 0:
-            offset = solution.paint_offsets[problem.size_row]
-            std = np.sqrt(paint_variance(solution)[problem.size_row])
+        offset = problem.of_size(solution.paint_offsets)
+        std = np.sqrt(problem.of_size(paint_variance(solution)))
         rows = np.flatnonzero(~self.errors.surveyed[problem.painted])
         points = problem.painted[rows]
         names, places = list(pitch.points), np.array(list(pitch.points.values()))[points]
         own = np.column_stack([points, np.full(len(points), -1)])
         by_size = self.errors.displacement_by_size(own, np.ones(own.shape), places)
         places = places + self.errors.point_m[points, None] * solution.paint_offsets[rows]
-        places = places + by_size * offset
+        places = places + by_size[:, 0] * offset[:3]
+        places[:, 2] += by_size[:, 1, 2] * offset[3]
         return PitchFit(
             points={names[point]: place for point, place in zip(points, places, strict=True)},
-            size=np.array([pitch.length, pitch.width, pitch.crown]) + self.errors.size_m * offset,
+            size=np.array([getattr(pitch, name) for name in SIZES]) + self.errors.size_m * offset,
             size_std=self.errors.size_m * std,
             paint_m=0.0 if self.errors.surveyed.all() else self.errors.paint_m,
             line_noise=self.lines,
@@ -512,7 +514,7 @@ def _pitch(fit: PitchFit) -> dict[str, Any] | None:
     spec = fit.spec
     if spec is None:
         return None
-    chosen = spec.model_dump(mode="json", include={"length", "width", "crown", "points"})
+    chosen = spec.model_dump(mode="json", include={*SIZES, "points"})
     return {**chosen, "std_m": fit.size_std.tolist()}
 
 

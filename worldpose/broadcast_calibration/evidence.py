@@ -32,8 +32,9 @@ class ObservedPoints:
             None = no survey error.
         shares: (n, 2) [m] displacement of the world point per standard deviation of the survey
             error of `ends`; None without `ends`.
-        by_size: (n, 3) [m] displacement of the world point along x, y, z per standard deviation of
-            the pitch's length, width and crown; None = length, width and crown are known.
+        by_size: (n, 2, 3) [m] displacement of the world point along x, y, z per standard deviation
+            of the pitch's length, width and crown, and along z per that of its end fall; None = all
+            four are known.
     """
 
     frame: Integers
@@ -63,8 +64,8 @@ class PointEvidence:
         ends: (n, 2) indices of the template's points that define the place; -1 = none.
         shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
             error.
-        by_size: (n, 3) [m] displacement of the place per standard deviation of the pitch's length,
-            width and crown.
+        by_size: (n, 2, 3) [m] displacement of the place per standard deviation of the pitch's size,
+            as in `ObservedPoints`.
     """
 
     frame: Integers
@@ -94,7 +95,7 @@ class PointEvidence:
             index,
             np.empty((0, ENDS), dtype=np.int64),
             np.empty((0, ENDS)),
-            np.empty((0, 3)),
+            np.empty((0, 2, 3)),
         )
 
     @classmethod
@@ -147,7 +148,7 @@ class PointEvidence:
             source=observed.source,
             ends=ends,
             shares=shares,
-            by_size=np.zeros((count, 3)) if observed.by_size is None else observed.by_size,
+            by_size=np.zeros((count, 2, 3)) if observed.by_size is None else observed.by_size,
         )
 
     def arrays(self, ends: Integers, size_row: int = -1) -> Points:
@@ -155,7 +156,7 @@ class PointEvidence:
 
         Args:
             ends: (n, 2) rows of the paint errors that define a point; -1 = none.
-            size_row: row that holds the pitch's size; -1 = known.
+            size_row: first row that holds the pitch's size; -1 = known.
         """
         return Points(
             self.world,

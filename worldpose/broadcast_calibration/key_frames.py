@@ -189,6 +189,7 @@ class Keys:
     Attributes:
         frames: (k,) indices in the clip, from 0, rising.
         camera: cameras (k,).
+        surface: (2,) crown and end fall of the pitch that they show [m].
         clicks: evidence of points and drawn markings; `frame` counts key frames.
         refused: unusable frames and the reasons.
         wrong: names of outliers among clicks and markings, by frame.
@@ -196,6 +197,7 @@ class Keys:
 
     frames: NDArray[np.int64]
     camera: MovingCamera
+    surface: Floats
     clicks: PointEvidence
     refused: Mapping[int, str]
     wrong: Mapping[int, tuple[str, ...]]
@@ -248,9 +250,10 @@ def calibrate_keys(
     estimates = [each.estimate for each in found.values()]
     camera = _of_one_place(estimates)
     errors = PitchErrors.of(pitch, settings)
-    samples = FieldSamples.of(pitch, errors)
+    surface = pitch.surface
     clicks = PointEvidence.none()
     for _ in range(_ROUNDS):
+        samples = FieldSamples.of(pitch, errors, surface)
         parts, lines = [], []
         for index, frame in enumerate(found):
             single = camera.frames(slice(index, index + 1))
@@ -274,8 +277,11 @@ def calibrate_keys(
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
-        camera = solve(camera, problem, settings.max_iterations).camera
-    return Keys(np.array(list(found)), camera, clicks, refused, wrong)
+        solution = solve(camera, problem, settings.max_iterations)
+        camera = solution.camera
+        shown = problem.of_size(solution.paint_offsets)
+        surface = pitch.surface + (errors.size_m * shown)[2:]
+    return Keys(np.array(list(found)), camera, surface, clicks, refused, wrong)
 
 
 def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:

@@ -22,6 +22,7 @@ from worldpose.broadcast_calibration.normal_equations import add_points, empty_e
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import surface_shape
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
@@ -55,19 +56,36 @@ class FieldSamples:
     """Samples of the template's markings for the line search.
 
     Attributes:
-        lines: samples of the painted markings.
+        lines: samples of the painted markings, on the surface where they are searched.
         whites: all white structures, for the clearance test.
         errors: errors of the pitch.
+        raised: (2,) crown and end fall of that surface less those of the template [m]. Evidence has
+            the places of the template, which the fit displaces.
     """
 
     lines: LineSamples
     whites: WhiteStructures
     errors: PitchErrors
+    raised: Floats
 
     @classmethod
-    def of(cls, pitch: PitchTemplate, errors: PitchErrors) -> FieldSamples:
-        """Return the samples of a pitch with its errors."""
-        return cls(sample_markings(pitch, _SPACING), white_structures(pitch), errors)
+    def of(cls, pitch: PitchTemplate, errors: PitchErrors, surface: Floats) -> FieldSamples:
+        """Return the samples of a pitch with its errors.
+
+        Args:
+            pitch: the template.
+            errors: its errors.
+            surface: (2,) crown and end fall of the surface to search on [m].
+        """
+        there = pitch.with_surface(surface)
+        raised = np.asarray(surface - pitch.surface)
+        return cls(sample_markings(there, _SPACING), white_structures(there), errors, raised)
+
+    def lower(self, found: PointEvidence) -> PointEvidence:
+        """Return evidence at the places of the template."""
+        world = found.world.copy()
+        world[:, 2] -= surface_shape(world[:, 0], world[:, 1], self.errors.size) @ self.raised
+        return replace(found, world=world)
 
 
 def find_lines(
@@ -92,7 +110,7 @@ def find_lines(
     if len(first) < _FEW:
         return PointEvidence.none(), camera
     corrected = _correct_camera(camera, first)
-    return _look(corrected, samples, picture, people, settings, _FINE), corrected
+    return samples.lower(_look(corrected, samples, picture, people, settings, _FINE)), corrected
 
 
 def _look(

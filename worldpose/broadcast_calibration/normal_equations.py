@@ -62,9 +62,10 @@ class Points(NamedTuple):
     shares: Floats
     """(n, 2) [m] displacement of the point per unit of these."""
     by_size: Floats
-    """(n, 3) [m] displacement along x, y, z per unit of the pitch's length, width, crown."""
+    """(n, 2, 3) [m] displacement along x, y, z per unit of the pitch's length, width and crown, and
+    along z per unit of its end fall."""
     size_row: int
-    """Row of the paint errors that holds the pitch's size; -1 = the size is known."""
+    """First of two rows of the paint errors that hold the pitch's size; -1 = the size is known."""
 
 
 class Flow(NamedTuple):
@@ -178,8 +179,10 @@ def displace_point(points: Points, i: int, paint_offsets: Floats, place: Floats)
             for j in range(3):
                 place[j] += points.shares[i, end] * paint_offsets[row, j]
     if points.size_row >= 0:
-        for j in range(3):
-            place[j] += points.by_size[i, j] * paint_offsets[points.size_row, j]
+        for kind in range(2):
+            for j in range(3):
+                offset = paint_offsets[points.size_row + kind, j]
+                place[j] += points.by_size[i, kind, j] * offset
 
 
 @compile_kernel
@@ -189,11 +192,13 @@ def displacement(points: Points, i: int, one: int) -> tuple[int, float]:
     Args:
         points: the points.
         i: number of the point.
-        one: 3 * source + axis; sources are two template points, and the pitch's size.
+        one: 3 * source + axis; sources are two template points, and two rows of the pitch's size.
     """
-    if one < 6:
-        return points.ends[i, one // 3], points.shares[i, one // 3]
-    return points.size_row, points.by_size[i, one - 6]
+    source, axis = one // 3, one % 3
+    if source < 2:
+        return points.ends[i, source], points.shares[i, source]
+    share = points.by_size[i, source - 2, axis]
+    return (points.size_row + source - 2 if share != 0.0 else -1), share
 
 
 @compile_kernel
@@ -219,8 +224,8 @@ def add_points(
     right, right_corner = equations.right, equations.right_corner
     cost = 0.0
     pixel, rows = np.empty(2), np.empty((2, 12))
-    place, moved, row_of = np.empty(3), np.empty(9), np.empty(9, dtype=np.int64)
-    sources = 6 if points.size_row < 0 else 9
+    place, moved, row_of = np.empty(3), np.empty(12), np.empty(12, dtype=np.int64)
+    sources = 6 if points.size_row < 0 else 12
     normal, gradient = np.empty((12, 12)), np.empty(12)
     white = np.empty(12)
     for t in range(len(rotation)):

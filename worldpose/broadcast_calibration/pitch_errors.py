@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,10 @@ from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import law_points
+from worldpose.pitch.template import law_points, surface_shape
 
+SIZES: Final = ("length", "width", "crown", "end_fall")
+"""Entries of pitch.json that a clip's fit estimates."""
 _PRIOR_COUNT = 6.0
 """Coordinates that the prior spread of the paint is worth in its estimate [1]."""
 
@@ -32,9 +35,9 @@ class PitchErrors:
         surveyed: (points,) mask of the template's points whose place is surveyed.
         survey_m: standard deviation of a surveyed point, each axis [m].
         paint_m: standard deviation of any other point, each axis [m].
-        size_m: (3,) standard deviations of length, width, crown [m]; 0 = known.
+        size_m: (4,) standard deviations of length, width, crown, end fall [m]; 0 = known.
         by_size: (points, 2) change of x by the length, and of y by the width [1].
-        half_width: half of the width of the pitch [m].
+        size: length, width of the pitch [m].
     """
 
     surveyed: NDArray[np.bool_]
@@ -42,7 +45,7 @@ class PitchErrors:
     paint_m: float
     size_m: Floats
     by_size: Floats
-    half_width: float
+    size: tuple[float, float]
 
     @classmethod
     def of(cls, pitch: PitchTemplate, settings: BroadcastCalibrationSettings) -> PitchErrors:
@@ -56,6 +59,7 @@ class PitchErrors:
             "length": settings.pitch_size_std_m,
             "width": settings.pitch_size_std_m,
             "crown": settings.crown_std_m,
+            "end_fall": settings.end_fall_std_m,
         }
         return cls(
             surveyed=np.array([name in pitch.surveyed for name in pitch.points]),
@@ -65,7 +69,7 @@ class PitchErrors:
                 [each if name in pitch.assumed else 0.0 for name, each in spread.items()]
             ),
             by_size=np.array(change)[:, :2],
-            half_width=0.5 * pitch.width,
+            size=(pitch.length, pitch.width),
         )
 
     @property
@@ -83,7 +87,9 @@ class PitchErrors:
         return np.where(ends >= 0, self.point_m[ends] * shares, 0.0)
 
     def displacement_by_size(self, ends: Integers, shares: Floats, world: Floats) -> Floats:
-        """Return displacements (n, 3) [m] of places per standard deviation of the pitch's size.
+        """Return displacements (n, 2, 3) [m] of places per standard deviation of the pitch's size.
+
+        The first row is by length, width and crown, the second by the end fall.
 
         Args:
             ends: (n, 2) indices of the points that define a place; -1 = none.
@@ -91,9 +97,10 @@ class PitchErrors:
             world: (n, 3) the places [m], world.
         """
         weight = np.where(ends >= 0, shares, 0.0)
-        plan = (weight[..., None] * self.by_size[ends]).sum(axis=1)
-        sink = -((world[:, 1:2] / self.half_width) ** 2)
-        return np.concatenate([plan, sink], axis=1) * self.size_m
+        moved = np.zeros((len(world), 2, 3))
+        moved[:, 0, :2] = (weight[..., None] * self.by_size[ends]).sum(axis=1) * self.size_m[:2]
+        moved[:, :, 2] = surface_shape(world[:, 0], world[:, 1], self.size) * self.size_m[2:]
+        return moved
 
     def rescale(self, points: PointEvidence, before: PitchErrors) -> PointEvidence:
         """Return evidence of other errors of the same pitch with the spreads of these."""
@@ -127,8 +134,8 @@ class PitchFit:
     Attributes:
         points: places (3,) [m], world, of the template's points without survey that the clip's
             markings rest on.
-        size: (3,) length, width, crown [m].
-        size_std: (3,) standard deviations of `size` [m]; 0 = given.
+        size: (4,) length, width, crown, end fall [m].
+        size_std: (4,) standard deviations of `size` [m]; 0 = given.
         paint_m: spread of markings without survey about the Laws, each axis [m]; 0 = all surveyed.
         line_noise: deviation of a line's sample over its assumed one [1].
         click_noise: the same ratio for clicks [1].
@@ -142,24 +149,33 @@ class PitchFit:
     click_noise: float
 
     @property
+    def surface(self) -> Floats:
+        """(2,) estimated or given crown and end fall [m]."""
+        return self.size[2:]
+
+    @property
     def spec(self) -> PitchSpec | None:
         """The pitch of the estimated size with the estimated markings; None if all is given."""
         if not (self.size_std.any() or self.points):
             return None
-        length, width, crown = self.size.tolist()
+        length, width, crown, end_fall = self.size.tolist()
         points = {name: tuple(place.tolist()) for name, place in self.points.items()}
         return PitchSpec(
-            length=length, width=width, crown=max(crown, 0.0), points=points, any_size=True
+            length=length,
+            width=width,
+            crown=max(crown, 0.0),
+            end_fall=end_fall,
+            points=points,
+            any_size=True,
         )
 
     @property
     def describe(self) -> tuple[str, ...]:
         """Sentences for the report."""
         said = [
-            f"the {name} of the pitch is {value:.2f} m with a standard deviation of {std:.2f} m"
-            for name, value, std in zip(
-                ("length", "width", "crown"), self.size, self.size_std, strict=True
-            )
+            f"the {name.replace('_', ' ')} of the pitch is {value:.2f} m "
+            f"with a standard deviation of {std:.2f} m"
+            for name, value, std in zip(SIZES, self.size, self.size_std, strict=True)
             if std > 0.0
         ]
         if self.paint_m > 0.0:

@@ -29,7 +29,7 @@ class Prior:
         principal_point: (2,) [px].
         principal_std: (2,) [px].
         log_focal: (frames,) mean of the logarithm of the focal length [px].
-        log_focal_std: standard deviation of this logarithm.
+        log_focal_std: standard deviation of this logarithm in one of the frames.
         distortion: (frames, 3).
         distortion_std: (frames, 3).
     """
@@ -49,6 +49,9 @@ def build_prior(
 ) -> Prior:
     """Return the prior of frames with given approximate focal lengths.
 
+    All frames have one lens: its departure from the prior lasts for the whole clip, so that the
+    frames count as one together, however many there are.
+
     Args:
         settings: means and standard deviations.
         focal: (frames,) [px], approximate.
@@ -65,9 +68,9 @@ def build_prior(
         principal_point=middle + width * np.array(settings.principal_point),
         principal_std=width * np.array(settings.principal_point_std),
         log_focal=np.full(len(focal), np.log(settings.focal * width)),
-        log_focal_std=settings.log_focal_std,
+        log_focal_std=settings.log_focal_std * float(np.sqrt(len(focal))),
         distortion=growth * np.array([settings.k1, settings.k2, 0.0]),
-        distortion_std=growth * spread,
+        distortion_std=growth * spread * np.sqrt(len(focal)),
     )
 
 

@@ -28,6 +28,8 @@ _START_DAMPING: Final = 1e-4
 _MAX_DAMPING: Final = 1e9
 _SETTLED: Final = 1e-7
 """Relative decrease of the cost that ends the iterations."""
+_OF_SIZE: Final = np.array([0, 1, 2, 5])
+"""Places of length, width, crown and end fall in the last two rows of the paint errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +73,23 @@ class Problem:
 
     @cached_property
     def size_row(self) -> int:
-        """Row of the paint errors that holds the pitch's size, the last; -1 if it is known."""
+        """First of the two last rows of the paint errors, of the pitch's size; -1 if known."""
         return len(self.painted) if self.points.by_size.any() else -1
 
     @property
     def paint_count(self) -> int:
         """Rows of the paint errors: template points, and the pitch's size."""
-        return len(self.painted) + (self.size_row >= 0)
+        return len(self.painted) + 2 * (self.size_row >= 0)
+
+    def of_size(self, rows: Floats) -> Floats:
+        """Return the entries (4,) of length, width, crown and end fall in rows of paint errors.
+
+        Args:
+            rows: (paint_count, 3).
+        """
+        if self.size_row < 0:
+            return np.zeros(4)
+        return np.asarray(rows[self.size_row :].ravel()[_OF_SIZE])
 
     @cached_property
     def ends(self) -> Integers:
@@ -192,7 +204,8 @@ def displace(points: PointEvidence, problem: Problem, paint_offsets: Floats) -> 
     """
     padded = np.concatenate([paint_offsets, np.zeros((1, 3))])
     world = points.world + (points.shares[..., None] * padded[problem.ends]).sum(axis=1)
-    world += points.by_size * padded[problem.size_row]
+    if problem.size_row >= 0:
+        world += (points.by_size * paint_offsets[problem.size_row :]).sum(axis=1)
     return replace(points, world=world)
 
 

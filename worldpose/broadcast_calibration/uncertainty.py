@@ -288,7 +288,7 @@ def _add_gradients(
                 by_frame[t, j, column] += x * rows[0, j] + y * rows[1, j]
             for j in range(5):
                 by_shared[j, column] += x * rows[0, 7 + j] + y * rows[1, 7 + j]
-            for one in range(9):
+            for one in range(12):
                 row, share = displacement(points, i, one)
                 if row >= 0:
                     moved = -(x * rows[0, 7 + one % 3] + y * rows[1, 7 + one % 3]) * share

@@ -176,8 +176,8 @@ class PitchTemplate:
     leveled: frozenset[str] = frozenset()
     """Names of those with a surveyed height; the others lie on the surface."""
     assumed: frozenset[str] = frozenset()
-    """Those of `length`, `width`, `crown` without a measurement: there is no surveyed point, and
-    they have the values of the standard pitch."""
+    """Those of `length`, `width`, `crown`, `end_fall` without a measurement: there is no surveyed
+    point, and they have the values of the standard pitch."""
 
     @classmethod
     def standard(cls) -> PitchTemplate:
@@ -215,7 +215,7 @@ class PitchTemplate:
         arcs = {**law_arcs(), **spec.arcs}
         _check_markings(points, every, arcs)
         usual = PitchSpec()
-        sizes = ("length", "width", "crown")
+        sizes = ("length", "width", "crown", "end_fall")
         assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
         return cls(
             spec.length,
@@ -270,7 +270,7 @@ class PitchTemplate:
             points=points,
             crown=crown,
             end_fall=end_fall,
-            assumed=self.assumed - {"crown"},
+            assumed=self.assumed - {"crown", "end_fall"},
         )
 
     def positions(self, names: Sequence[str]) -> NDArray[np.float64]:
