@@ -2,6 +2,7 @@
 
     python benchmarks/broadcast_clip.py fetch DATA
     python benchmarks/broadcast_clip.py score DATA [--proposed]
+    python benchmarks/broadcast_clip.py cut DATA [--proposed] [--side left] [--move pan]
 
 The clip: 51 frames of a league match from the repository of narya (MIT), squeezed to 512 x 512
 there; `fetch` gets them by git, checks the digest of the folder and restores 16:9. Key frames
@@ -10,6 +11,13 @@ there; `fetch` gets them by git, checks the digest of the folder and restores 16
 the lines, in the columns of the squeezed images; `score` also prints what the camera states there.
 `--proposed` takes no click: key frames are proposed in eight frames, as the stage does, with the
 side `near`.
+
+`cut` takes moving cameras cut out of the two real static ones in DATA/static_pair, 150 frames each
+(tests/real/cut_clip.py): they pan, zoom or do both. Key frames have the static cameras' own clicks.
+One line per clip: distance of the centre from the true one, and the stated one; distance of
+markings from those of the static camera, which its clicks and lines place on a surface of its own,
+along the estimated surface; distance of visible places of the pitch, and the stated one. Pixels are
+of 1280 columns.
 """
 
 from __future__ import annotations
@@ -17,11 +25,17 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
+import cut_clip
+from common import distances_to_polyline
 
 from data_contracts.arrays import Floats
 from data_contracts.broadcast_calibration import KeyFrames
@@ -33,6 +47,7 @@ from worldpose.broadcast_calibration import (
     propose_key_frames,
 )
 from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.ingest.validation import validate_record
 from worldpose.pitch import PitchTemplate
 from worldpose.video import open_video
 
@@ -215,17 +230,82 @@ def score(data: Path, proposed: bool) -> None:
     print(f"repeatability of a drawn marking {repeatability(drawings[0], drawings[1]):.2f} px")
 
 
+def calibrate_cut(
+    folder: Path, *, proposed: bool = False
+) -> tuple[BroadcastCalibration, KeyFrames]:
+    """Return the camera of a clip that `cut_clip` wrote, and the clip's lines."""
+    video = folder / "clip.mp4"
+    keys, lines = (
+        validate_record(KeyFrames, json.loads((folder / f"{name}.json").read_text()), name)
+        for name in ("key_frames", "lines")
+    )
+    chosen, pitch = [*keys.key_frames], PitchTemplate.standard()
+    with open_video(video) as opened:
+        pictures = [picture for _, picture in opened.frames(grey=True)]
+        if proposed:
+            numbers = np.linspace(0, len(pictures) - 1, PROPOSED_FRAMES).astype(int).tolist()
+            shown = [next(opened.frames(number, number + 1)) for number in numbers]
+            chosen = propose_key_frames(shown, pitch, side="near", where=str(video))
+    clip = BroadcastClip(chosen, lambda: iter(pictures), cut_clip.FPS)
+    return calibrate_broadcast(pitch, clip), lines
+
+
+def errors_of_cut(
+    found: BroadcastCalibration, lines: KeyFrames, true: cut_clip.CutClip
+) -> tuple[float, Floats, Floats]:
+    """Return errors of the centre [m], of lines (n,) and of visible places (m,) [px]."""
+    shown = PitchTemplate.standard().with_surface(found.report.pitch.surface)
+    places = np.stack(np.meshgrid(np.arange(-52.0, 53.0, 3.0), np.arange(-33.0, 34.0, 3.0)), -1)
+    places = places.reshape(-1, 2)
+    places = np.column_stack([places, true.pitch.height(*places.T)])
+    off_lines, off_places = [], []
+    for key in lines.key_frames:
+        camera = found.camera.camera[key.frame]
+        for marking in key.markings.drawn:
+            line = camera.project(shown.marking_points(marking.name, 0.1))
+            off_lines.append(distances_to_polyline(np.array(marking.xy), line))
+        seen = true.cameras[key.frame].project(places)
+        seen, at = (each[cut_clip.inside(seen, cut_clip.SIZE)] for each in (seen, places))
+        off_places.append(np.linalg.norm(camera.project(at) - seen, axis=1))
+    center = float(np.linalg.norm(found.camera.center - true.static.center))
+    return center, np.concatenate(off_lines), np.concatenate(off_places)
+
+
+def score_cuts(data: Path, sides: list[str], moves: list[str], proposed: bool) -> None:
+    """Print one line for each clip that is cut out of the static cameras."""
+    for side in sides:
+        for move in moves:
+            with tempfile.TemporaryDirectory() as scratch:
+                folder = Path(scratch)
+                true = cut_clip.write_moving_clip(data / "static_pair", side, move, folder)
+                found, lines = calibrate_cut(folder, proposed=proposed)
+            center, off_lines, off_places = errors_of_cut(found, lines, true)
+            std = float(np.sqrt(np.trace(found.uncertainty.clip[:3, :3])))
+            stated = float(np.nanmedian(found.report.reprojection_error))
+            print(
+                f"{side} {move}: centre {center:.2f} m, stated {std:.2f}; lines "
+                f"{off_lines.mean():.2f} px mean, {np.quantile(off_lines, 0.95):.2f} 95 %; places "
+                f"{np.median(off_places):.2f} px median, stated {stated:.2f}",
+                flush=True,
+            )
+
+
 def main() -> None:
-    """Run one of the two commands."""
+    """Run one of the commands."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("command", choices=("fetch", "score"))
+    parser.add_argument("command", choices=("fetch", "score", "cut"))
     parser.add_argument("data", type=Path)
     parser.add_argument("--repository", default=REPOSITORY)
     parser.add_argument("--proposed", action="store_true")
+    parser.add_argument("--side", action="append", choices=("left", "right"))
+    parser.add_argument("--move", action="append", choices=tuple(cut_clip.MOVES))
     options = parser.parse_args()
     if options.command == "fetch":
         options.data.mkdir(parents=True, exist_ok=True)
         fetch(options.data, options.repository)
+    elif options.command == "cut":
+        sides, moves = options.side or ["left", "right"], options.move or [*cut_clip.MOVES]
+        score_cuts(options.data, sides, moves, options.proposed)
     else:
         score(options.data, options.proposed)
 

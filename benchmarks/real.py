@@ -11,7 +11,7 @@ DATA is a folder with any of these; what is absent is skipped:
 - `moving_clip`: one video of a moving broadcast camera, `key_frames.json` (clicks in the form of
   annotations/broadcast_calibration), optionally `lines.json` (drawn lines in the same form, which
   are scored and not fitted; without it those of the key frames are scored) and `pitch.json`.
-  Markings are where the Laws or pitch.json have them, at the height of the fit's crown and end fall;
+  Markings are where the Laws or pitch.json have them, on the surface that the fit shows;
 - `stills`: images, and one JSON file with boxes and 17 joints of people in COCO form;
 - `mvor`: see mvor.py.
 

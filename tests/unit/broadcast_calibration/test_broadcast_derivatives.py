@@ -93,7 +93,8 @@ def test_the_gradient_is_the_slope_of_the_cost():
     # On nothing, one point, two points, or one twice, as arcs do.
     ends = rng.integers(-1, 4, (len(points), 2))
     shares = 0.01 * rng.uniform(0.2, 1.0, ends.shape)
-    by_size = 0.01 * rng.standard_normal((len(points), 3))
+    by_size = 0.01 * rng.standard_normal((len(points), 2, 3))
+    by_size[:, 1, :2] = 0.0  # the end fall moves places along z alone
     known = {"ends": ends, "shares": shares, "by_size": by_size}
     robust = replace(points, loss=np.full(len(points), 3.0), **known)
     problem = Problem(

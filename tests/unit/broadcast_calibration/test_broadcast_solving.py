@@ -55,6 +55,17 @@ def test_exact_evidence_gives_the_exact_camera():
     assert np.median(bearing_error(found, true)) < 1e-5
 
 
+def test_the_prior_of_the_lens_counts_once_however_many_frames_a_clip_has():
+    size = np.array([1280, 720])
+    one, many = (build_prior(BroadcastPrior(), np.full(n, 1500.0), size) for n in (1, 150))
+    for name in ("log_focal", "distortion"):
+        costs = [
+            np.square((1.0 - getattr(each, name)) / getattr(each, f"{name}_std")).sum()
+            for each in (one, many)
+        ]
+        assert costs[0] == pytest.approx(costs[1])
+
+
 def test_noisy_evidence_gives_the_camera_within_its_covariance():
     true = clip.moving(30)
     ratios = []

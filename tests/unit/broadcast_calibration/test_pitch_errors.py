@@ -24,10 +24,10 @@ def pitch(**known):
 
 def test_only_what_nobody_measured_has_an_error():
     usual = PitchErrors.of(pitch(), SETTINGS)
-    np.testing.assert_allclose(usual.size_m, [0.1, 0.1, 0.1])
+    np.testing.assert_allclose(usual.size_m, [0.1, 0.1, 0.1, 0.25])
     assert (usual.point_m == 0.03).all()
     given = PitchErrors.of(pitch(length=104.0, crown=0.12), SETTINGS)
-    np.testing.assert_allclose(given.size_m, [0.0, 0.1, 0.0])
+    np.testing.assert_allclose(given.size_m, [0.0, 0.1, 0.0, 0.25])
     corner = {"corner_left_near": (-52.51, -34.02, -0.19)}
     surveyed = PitchErrors.of(pitch(points=corner), SETTINGS)
     assert not surveyed.size_m.any()
@@ -36,19 +36,20 @@ def test_only_what_nobody_measured_has_an_error():
     assert surveyed.point_m[names.index("center_mark")] == 0.03
 
 
-def test_a_larger_pitch_moves_corners_and_a_higher_crown_lowers_touch_lines():
+def test_a_larger_pitch_moves_corners_and_a_fall_lowers_touch_lines_and_ends():
     errors, names = PitchErrors.of(pitch(), SETTINGS), list(pitch().points)
     ends = np.array([[names.index(name), -1] for name in ("corner_right_near", "center_mark")])
     world = pitch().positions(["corner_right_near", "center_mark"])
     moved = errors.displacement_by_size(ends, np.ones(ends.shape), world)
-    np.testing.assert_allclose(moved, [[0.05, -0.05, -0.1], [0.0, 0.0, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(moved[0], [[0.05, -0.05, -0.1], [0.0, 0.0, -0.25]], atol=1e-12)
+    np.testing.assert_allclose(moved[1], 0.0, atol=1e-12)
 
 
-def crowned_clip(rng, crown):
-    """Points of a pitch with another crown than the template's, and a camera at the truth."""
+def fallen_clip(rng, crown, end_fall):
+    """Points of a pitch with another surface than the template's, and a camera at the truth."""
     true = clip.moving(20, pan=(-12.0, 15.0))
     points = clip.ground_points(true, rng, each=60)
-    place, truth = points.world, pitch(crown=crown)
+    place, truth = points.world, pitch(crown=crown, end_fall=end_fall)
     moved = np.stack([place[:, 0], place[:, 1], truth.height(place[:, 0], place[:, 1])], axis=-1)
     image = np.empty_like(points.image)
     for frame in range(len(true)):
@@ -61,10 +62,10 @@ def crowned_clip(rng, crown):
     return true, replace(points, image=image, by_size=by_size), errors
 
 
-def test_the_crown_is_found_within_what_is_stated():
+def test_the_surface_is_found_within_what_is_stated():
     off = []
     for seed in range(4):
-        true, points, errors = crowned_clip(np.random.default_rng(seed), 0.05)
+        true, points, errors = fallen_clip(np.random.default_rng(seed), 0.05, 0.4)
         problem = Problem(
             points,
             FlowEvidence.none(),
@@ -72,13 +73,15 @@ def test_the_crown_is_found_within_what_is_stated():
         )
         solution = solve(true, problem, 30)
         assert problem.size_row == 0
-        crown = 0.2 + errors.size_m[2] * solution.paint_offsets[0, 2]
-        std = errors.size_m[2] * np.sqrt(paint_variance(solution)[0, 2])
-        assert std < 0.05
-        off.append((crown - 0.05) / std)
+        shape = [0.2, 0.0] + (errors.size_m * problem.of_size(solution.paint_offsets))[2:]
+        std = (errors.size_m * np.sqrt(problem.of_size(paint_variance(solution))))[2:]
+        assert (std < 0.05).all()
+        off.append((shape - [0.05, 0.4]) / std)
         shifted = displace(problem.points, problem, solution.paint_offsets)
         assert (
-            np.abs(shifted.world[:, 2] - pitch(crown=crown).height(0.0, points.world[:, 1])).max()
+            np.abs(
+                shifted.world[:, 2] - pitch().with_surface(shape).height(*points.world[:, :2].T)
+            ).max()
             < 1e-9
         )
     assert np.sqrt(np.mean(np.square(off))) < 2.0
