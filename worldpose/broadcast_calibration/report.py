@@ -38,6 +38,8 @@ _LATE: Final = 0.5
 """Clock offset above which the report warns [frame]."""
 _GRID: Final = 4.0
 """Grid spacing of places on the pitch for expected errors [m]."""
+_MISPLACED_M: Final = 0.3
+"""Spread of markings about the Laws that asks for a review [m]: no painter errs by that much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +175,11 @@ def report_calibration(
     bridged = int((status == FRAME_STATUS.index("bridged")).sum())
     if bridged:
         reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
+    if fit.pitch.paint_m > _MISPLACED_M:
+        reasons.append(
+            f"markings differ from the Laws by {fit.pitch.paint_m:.2f} m per axis: the pitch has "
+            "another size, or clicks have wrong names"
+        )
     reasons += [
         f"key frame {first + frame} is not used: {why}" for frame, why in keys.refused.items()
     ]
