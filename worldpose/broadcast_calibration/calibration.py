@@ -16,6 +16,7 @@ from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
     PointEvidence,
+    drop_measured,
     spread_noise,
     together,
 )
@@ -209,7 +210,8 @@ def refine(
         samples = FieldSamples.of(pitch, learned.errors, surface)
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
-        parts = [learned.errors.rescale(clicks, first_errors), lines.evidence]
+        kept = drop_measured(clicks, lines.evidence)
+        parts = [learned.errors.rescale(kept, first_errors), lines.evidence]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
                 # Before any fit includes these players.

@@ -18,6 +18,7 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
+    drop_measured,
     together,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
@@ -273,7 +274,7 @@ def calibrate_keys(
                 lines.append(seen.in_frame(index))
         clicks = together(parts)
         problem = Problem(
-            points=together([clicks, *lines]),
+            points=together([drop_measured(clicks, together(lines)), *lines]),
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
@@ -379,6 +380,8 @@ def _clicks(
         )
     ]
     numbers = camera.camera[0].numbers
+    # As `PitchTemplate.sample_lines` numbers them.
+    painted = {name: number for number, name in enumerate((*pitch.lines, *pitch.arcs))}
     for marking in drawn:
         pixels = np.array(marking.xy).reshape(-1, 2)
         samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
@@ -403,7 +406,7 @@ def _clicks(
                     world=place[known],
                     image=pixels[known],
                     kind=CLICK,
-                    source=np.full(int(known.sum()), -1),
+                    source=np.full(int(known.sum()), painted.get(marking.name, -1)),
                     ends=ends,
                     shares=errors.shares(ends, shares),
                     by_size=errors.displacement_by_size(ends, shares, place[known]),
