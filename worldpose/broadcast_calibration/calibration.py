@@ -16,6 +16,7 @@ from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
     PointEvidence,
+    clicked_points,
     drop_measured,
     spread_noise,
     together,
@@ -233,6 +234,7 @@ def refine(
             if learned.is_near(before_learning):
                 break
             points = learned.errors.rescale(points, before_learning.errors)
+        assert solution is not None
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (learned.errors.size_m * shown)[2:]
     assert solution is not None  # settings require one iteration or more
@@ -295,7 +297,9 @@ class _Learned:
         """Return evidence of the assumed noise with the learned noise."""
         factor = np.ones(len(points))
         factor[points.kind == MARKING] = self.lines
-        factor[points.kind == CLICK] = self.clicks
+        # Drawn pixels of one marking scatter less than the marking as a whole is off.
+        factor[points.kind == CLICK] = max(self.clicks, 1.0)
+        factor[clicked_points(points)] = self.clicks
         whitening = points.whitening / factor[:, None, None]
         return spread_noise(replace(points, whitening=whitening), self.lasting)
 
@@ -340,7 +344,7 @@ def _learn(problem: Problem, solution: Solution, learned: _Learned) -> _Learned:
     across = white[points.kind == MARKING, 0]
     if len(across):
         lines = max(1.0, lines * 1.4826 * float(np.median(across)) * np.sqrt(learned.lasting))
-    clicked = points.kind == CLICK
+    clicked = clicked_points(points)
     used = white[clicked][np.abs(points.whitening[clicked]).any(axis=-1)]
     if len(used):
         squares = float((np.minimum(used, points.loss[clicked].max()) ** 2).sum())

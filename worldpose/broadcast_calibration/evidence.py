@@ -217,12 +217,17 @@ _POINT_PARTS = (
 _FLOW_PARTS = ("frame", "start", "end", "deviation")
 
 
-def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
-    """Return evidence in which `lasting` samples of lines count as one; losses stay in pixels."""
-    root = np.where(points.kind == MARKING, np.sqrt(lasting), 1.0)
+def spread_noise(points: PointEvidence, lasting: float, kind: int = MARKING) -> PointEvidence:
+    """Return evidence in which `lasting` samples of a kind count as one; losses stay in pixels."""
+    root = np.where(points.kind == kind, np.sqrt(lasting), 1.0)
     return replace(
         points, whitening=points.whitening / root[:, None, None], loss=points.loss / root
     )
+
+
+def clicked_points(points: PointEvidence) -> NDArray[np.bool_]:
+    """Return the mask of clicked points, which count along both axes, unlike drawn pixels."""
+    return np.asarray((points.kind == CLICK) & points.whitening[:, 1].any(axis=-1))
 
 
 def drop_measured(clicks: PointEvidence, lines: PointEvidence) -> PointEvidence:

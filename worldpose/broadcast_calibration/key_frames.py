@@ -19,6 +19,7 @@ from worldpose.broadcast_calibration.evidence import (
     ObservedPoints,
     PointEvidence,
     drop_measured,
+    spread_noise,
     together,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
@@ -399,23 +400,23 @@ def _clicks(
         known = np.isfinite(place).all(axis=-1)
         names, shares = _locate_on_marking(pitch, marking.name, place[known])
         ends = np.tile([template[name] for name in names], (int(known.sum()), 1))
-        parts.append(
-            PointEvidence.across_lines(
-                ObservedPoints(
-                    frame=np.full(int(known.sum()), index),
-                    world=place[known],
-                    image=pixels[known],
-                    kind=CLICK,
-                    source=np.full(int(known.sum()), painted.get(marking.name, -1)),
-                    ends=ends,
-                    shares=errors.shares(ends, shares),
-                    by_size=errors.displacement_by_size(ends, shares, place[known]),
-                ),
-                normal[known],
-                np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
-                settings.loss_scale,
-            )
+        line = PointEvidence.across_lines(
+            ObservedPoints(
+                frame=np.full(int(known.sum()), index),
+                world=place[known],
+                image=pixels[known],
+                kind=CLICK,
+                source=np.full(int(known.sum()), painted.get(marking.name, -1)),
+                ends=ends,
+                shares=errors.shares(ends, shares),
+                by_size=errors.displacement_by_size(ends, shares, place[known]),
+            ),
+            normal[known],
+            np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
+            settings.loss_scale,
         )
+        # Two numbers say where a straight line is; further pixels of it err as these do.
+        parts.append(spread_noise(line, max(1.0, 0.5 * len(line)), CLICK))
     return together(parts)
 
 
