@@ -138,7 +138,7 @@ def calibrate(
         keys = propose_key_frames(shown, pitch, side="near", where=str(data))
         took = time.perf_counter() - start
         print(f"key frames proposed in frames {[key.frame for key in keys]}, {took:.0f} s")
-    clip = BroadcastClip(keys, lambda: iter(pictures), FPS)
+    clip = BroadcastClip(keys, lambda: iter(pictures), FPS, proposed=proposed)
     settings = settings or BroadcastCalibrationSettings()
     return calibrate_broadcast(PitchTemplate.standard(), clip, settings)
 
@@ -246,7 +246,7 @@ def calibrate_cut(
             numbers = np.linspace(0, len(pictures) - 1, PROPOSED_FRAMES).astype(int).tolist()
             shown = [next(opened.frames(number, number + 1)) for number in numbers]
             chosen = propose_key_frames(shown, pitch, side="near", where=str(video))
-    clip = BroadcastClip(chosen, lambda: iter(pictures), cut_clip.FPS)
+    clip = BroadcastClip(chosen, lambda: iter(pictures), cut_clip.FPS, proposed=proposed)
     return calibrate_broadcast(pitch, clip), lines
 
 

@@ -83,6 +83,7 @@ def broadcast_calibration(work: Work) -> str:
                 boxes=boxes,
                 where=file,
                 first=start,
+                proposed="side" in sources,
             ),
             BroadcastCalibrationSettings.model_validate(work.recipe.settings),
         )

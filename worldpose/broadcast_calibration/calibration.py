@@ -16,8 +16,6 @@ from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
     PointEvidence,
-    clicked_points,
-    drop_measured,
     spread_noise,
     together,
 )
@@ -106,6 +104,8 @@ class BroadcastClip:
         where: clip or file, for messages.
         first: number of the clip's first frame in its video; key frames and messages use the
             numbers of the video.
+        proposed: the key frames are proposals: they start the fit and are no evidence in it, since
+            they come from the paint that the fit measures in every frame.
     """
 
     key_frames: Sequence[KeyFrame]
@@ -115,6 +115,7 @@ class BroadcastClip:
     boxes: Floats | None = None
     where: str = "broadcast clip"
     first: int = 0
+    proposed: bool = False
 
     @property
     def moving_boxes(self) -> Floats | None:
@@ -198,6 +199,8 @@ def refine(
         # Smoothness of the rotation still bridges frames without evidence.
         spread[3:] = np.inf
     clicks = replace(tracked.keys.clicks, frame=tracked.keys.frames[tracked.keys.clicks.frame])
+    if clip.proposed:
+        clicks = PointEvidence.none()
     deviation = float(tracked.flow.deviation[0]) if len(tracked.flow) else 0.0
     share = estimate_flow_share(
         tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
@@ -211,8 +214,7 @@ def refine(
         samples = FieldSamples.of(pitch, learned.errors, surface)
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
-        kept = drop_measured(clicks, lines.evidence)
-        parts = [learned.errors.rescale(kept, first_errors), lines.evidence]
+        parts = [learned.errors.rescale(clicks, first_errors), lines.evidence]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
                 # Before any fit includes these players.
@@ -234,7 +236,7 @@ def refine(
             if learned.is_near(before_learning):
                 break
             points = learned.errors.rescale(points, before_learning.errors)
-        assert solution is not None
+        assert solution is not None  # _LEARNING is one or more
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (learned.errors.size_m * shown)[2:]
     assert solution is not None  # settings require one iteration or more
@@ -297,9 +299,7 @@ class _Learned:
         """Return evidence of the assumed noise with the learned noise."""
         factor = np.ones(len(points))
         factor[points.kind == MARKING] = self.lines
-        # Drawn pixels of one marking scatter less than the marking as a whole is off.
-        factor[points.kind == CLICK] = max(self.clicks, 1.0)
-        factor[clicked_points(points)] = self.clicks
+        factor[points.kind == CLICK] = self.clicks
         whitening = points.whitening / factor[:, None, None]
         return spread_noise(replace(points, whitening=whitening), self.lasting)
 
@@ -344,7 +344,7 @@ def _learn(problem: Problem, solution: Solution, learned: _Learned) -> _Learned:
     across = white[points.kind == MARKING, 0]
     if len(across):
         lines = max(1.0, lines * 1.4826 * float(np.median(across)) * np.sqrt(learned.lasting))
-    clicked = clicked_points(points)
+    clicked = points.kind == CLICK
     used = white[clicked][np.abs(points.whitening[clicked]).any(axis=-1)]
     if len(used):
         squares = float((np.minimum(used, points.loss[clicked].max()) ** 2).sum())

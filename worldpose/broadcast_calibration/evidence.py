@@ -27,7 +27,7 @@ class ObservedPoints:
         world: (n, 3) [m], world.
         image: (n, 2) [px].
         kind: CLICK, MARKING or PLAYER.
-        source: (n,) index of the marking or person, -1 for clicked points.
+        source: (n,) index of the marking or person, -1 for clicks.
         ends: (n, 2) indices of the template's points that define the world point, -1 = none;
             None = no survey error.
         shares: (n, 2) [m] displacement of the world point per standard deviation of the survey
@@ -60,7 +60,7 @@ class PointEvidence:
         weight: (n,) factor on the loss [1].
         loss: (n,) scale of the Geman-McClure loss [standard deviations]; infinite = squares.
         kind: (n,) CLICK, MARKING or PLAYER.
-        source: (n,) index of the marking or person, -1 for clicked points.
+        source: (n,) index of the marking or person, -1 for clicks.
         ends: (n, 2) indices of the template's points that define the place; -1 = none.
         shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
             error.
@@ -217,32 +217,12 @@ _POINT_PARTS = (
 _FLOW_PARTS = ("frame", "start", "end", "deviation")
 
 
-def spread_noise(points: PointEvidence, lasting: float, kind: int = MARKING) -> PointEvidence:
-    """Return evidence in which `lasting` samples of a kind count as one; losses stay in pixels."""
-    root = np.where(points.kind == kind, np.sqrt(lasting), 1.0)
+def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
+    """Return evidence in which `lasting` samples of lines count as one; losses stay in pixels."""
+    root = np.where(points.kind == MARKING, np.sqrt(lasting), 1.0)
     return replace(
         points, whitening=points.whitening / root[:, None, None], loss=points.loss / root
     )
-
-
-def clicked_points(points: PointEvidence) -> NDArray[np.bool_]:
-    """Return the mask of clicked points, which count along both axes, unlike drawn pixels."""
-    return np.asarray((points.kind == CLICK) & points.whitening[:, 1].any(axis=-1))
-
-
-def drop_measured(clicks: PointEvidence, lines: PointEvidence) -> PointEvidence:
-    """Return clicks without the drawn pixels of markings whose paint is measured in the frame.
-
-    The pixels of a drawn marking err together, and paint is located ten times as exactly.
-
-    Args:
-        clicks: of key frames.
-        lines: painted lines, with the same numbers of frames.
-    """
-    drawn, paint = (np.stack([each.frame, each.source]) for each in (clicks, lines))
-    base = 1 + max(drawn[1].max(initial=0), paint[1].max(initial=0))
-    measured = np.isin(drawn[0] * base + drawn[1], paint[0] * base + paint[1])
-    return clicks[~(measured & (drawn[1] >= 0))]
 
 
 def together(parts: Sequence[PointEvidence]) -> PointEvidence:

@@ -18,8 +18,6 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
-    drop_measured,
-    spread_noise,
     together,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
@@ -275,7 +273,7 @@ def calibrate_keys(
                 lines.append(seen.in_frame(index))
         clicks = together(parts)
         problem = Problem(
-            points=together([drop_measured(clicks, together(lines)), *lines]),
+            points=together([clicks, *lines]),
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
@@ -381,8 +379,6 @@ def _clicks(
         )
     ]
     numbers = camera.camera[0].numbers
-    # As `PitchTemplate.sample_lines` numbers them.
-    painted = {name: number for number, name in enumerate((*pitch.lines, *pitch.arcs))}
     for marking in drawn:
         pixels = np.array(marking.xy).reshape(-1, 2)
         samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
@@ -400,23 +396,23 @@ def _clicks(
         known = np.isfinite(place).all(axis=-1)
         names, shares = _locate_on_marking(pitch, marking.name, place[known])
         ends = np.tile([template[name] for name in names], (int(known.sum()), 1))
-        line = PointEvidence.across_lines(
-            ObservedPoints(
-                frame=np.full(int(known.sum()), index),
-                world=place[known],
-                image=pixels[known],
-                kind=CLICK,
-                source=np.full(int(known.sum()), painted.get(marking.name, -1)),
-                ends=ends,
-                shares=errors.shares(ends, shares),
-                by_size=errors.displacement_by_size(ends, shares, place[known]),
-            ),
-            normal[known],
-            np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
-            settings.loss_scale,
+        parts.append(
+            PointEvidence.across_lines(
+                ObservedPoints(
+                    frame=np.full(int(known.sum()), index),
+                    world=place[known],
+                    image=pixels[known],
+                    kind=CLICK,
+                    source=np.full(int(known.sum()), -1),
+                    ends=ends,
+                    shares=errors.shares(ends, shares),
+                    by_size=errors.displacement_by_size(ends, shares, place[known]),
+                ),
+                normal[known],
+                np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
+                settings.loss_scale,
+            )
         )
-        # Two numbers say where a straight line is; further pixels of it err as these do.
-        parts.append(spread_noise(line, max(1.0, 0.5 * len(line)), CLICK))
     return together(parts)
 
 

@@ -131,6 +131,31 @@ def test_a_stored_camera_comes_back_with_its_covariance(calibrated):
     np.testing.assert_array_equal(uncertainty.clip, calibrated.uncertainty.clip)
 
 
+def test_proposed_key_frames_start_the_fit_and_do_not_bias_it(true, pictures):
+    keys = []
+    for frame in (3, 12):
+        drawn = clicks(true, frame).markings.model_dump()["drawn"]
+        for marking in drawn:
+            marking["xy"] = [(x, y + 3.0) for x, y in marking["xy"]]
+        markings = ClickedMarkings.model_validate({"drawn": drawn})
+        keys.append(KeyFrame(frame=frame, markings=markings))
+    errors = {
+        proposed: np.median(
+            place_errors(
+                calibrate_broadcast(
+                    clip.PITCH,
+                    BroadcastClip(keys, lambda: iter(pictures), FPS, proposed=proposed),
+                    SETTINGS,
+                ).camera,
+                true,
+            )
+        )
+        for proposed in (False, True)
+    }
+    assert errors[True] < 0.7
+    assert errors[True] < errors[False]
+
+
 def test_one_key_frame_is_still_usable(true, pictures):
     found = calibrate_broadcast(
         clip.PITCH, BroadcastClip([clicks(true, 8)], lambda: iter(pictures), FPS), SETTINGS

@@ -8,14 +8,7 @@ import turning_clip as clip
 
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings, BroadcastPrior
-from worldpose.broadcast_calibration.evidence import (
-    CLICK,
-    MARKING,
-    FlowEvidence,
-    PointEvidence,
-    drop_measured,
-    spread_noise,
-)
+from worldpose.broadcast_calibration.evidence import MARKING, FlowEvidence, spread_noise
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.solver import Problem, displace, solve
@@ -105,26 +98,6 @@ def test_errors_that_last_count_as_one_sample():
     spread = spread_noise(points, 4.0)
     np.testing.assert_allclose(spread.whitening, 0.5 * points.whitening)
     np.testing.assert_allclose(spread.loss, 0.5 * points.loss)
-
-
-def test_drawn_pixels_of_a_marking_do_not_count_where_its_paint_is_measured():
-    rng = np.random.default_rng(2)
-    points = clip.ground_points(clip.moving(3), rng, each=6)
-    drawn = replace(points, kind=np.full(len(points), CLICK), source=np.arange(len(points)) % 6)
-    clicked = drawn.source == 5
-    drawn.source[clicked] = -1  # a named point
-    paint = points[:6]
-    paint = replace(paint, source=np.array([0, 0, 1, 1, 2, 9]), frame=np.array([0, 0, 0, 1, 1, 2]))
-    kept = drop_measured(drawn, paint)
-    gone = {(0, 0), (0, 1), (1, 1), (1, 2)}
-    want = [
-        row
-        for row in zip(drawn.frame.tolist(), drawn.source.tolist(), strict=True)
-        if row not in gone
-    ]
-    assert list(zip(kept.frame.tolist(), kept.source.tolist(), strict=True)) == want
-    assert len(kept) == len(drawn) - 4
-    assert len(drop_measured(drawn, PointEvidence.none())) == len(drawn)
 
 
 def test_the_spread_of_the_paint_follows_the_offsets_that_the_clip_determines():
