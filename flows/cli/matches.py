@@ -195,7 +195,10 @@ def import_command(
     out: Annotated[Path, typer.Option("--out", help="Match folder to create or to extend.")],
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Cameras: Anipose, Pose2Sim or caliscope TOML, or Qualisys XML."),
+        typer.Option(
+            help="Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys, Vicon, "
+            "OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera."
+        ),
     ] = None,
     detections: Annotated[
         Path | None, typer.Option(help="Folder of COCO keypoint results, <camera>.json.")
