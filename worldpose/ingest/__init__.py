@@ -28,13 +28,14 @@ if TYPE_CHECKING:
         unclicked_clips,
     )
     from worldpose.ingest.registration import register_match
-    from worldpose.ingest.writing import MatchAnnotations, write_match
+    from worldpose.ingest.writing import MatchAnnotations, import_boxes, write_match
 
 __all__ = [
     "ImportedClicks",
     "MatchAnnotations",
     "MatchFolder",
     "UnitFrames",
+    "import_boxes",
     "import_clicks",
     "import_lenses",
     "import_match",
@@ -82,6 +83,7 @@ __getattr__ = import_on_use(
         "worldpose.ingest.registration": ("register_match",),
         "worldpose.ingest.writing": (
             "MatchAnnotations",
+            "import_boxes",
             "write_match",
         ),
     },

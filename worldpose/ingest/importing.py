@@ -21,13 +21,13 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml, whole_file
 from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
-from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video import FrameIndex, VideoReader, index_frames
 
 SAME_SHAPE: Final = 0.002
@@ -168,6 +168,7 @@ def import_videos(
     out: Path,
     fps: float | None = None,
     match_id: str | None = None,
+    boxes: Path | None = None,
 ) -> MatchSpec:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
@@ -182,6 +183,8 @@ def import_videos(
         out: the match folder, absent or empty.
         fps: frame rate of all videos [1/s]; None = from the videos.
         match_id: id of the match; None = the name of `out`.
+        boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
+            estimated, for some of the cameras or all; None = people are detected.
 
     Returns:
         Content of match.yaml.
@@ -221,6 +224,8 @@ def import_videos(
         (folder / "videos").mkdir()
         for file in files.values():
             shutil.copyfile(file, folder / "videos" / file.name)
+        if boxes is not None:
+            copy_boxes(boxes, indices, folder)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec
@@ -290,7 +295,7 @@ def _fit_to_video(
     own, shown = np.array(camera.image_size), np.array(index.size)
     if is_part and np.all(shown <= own):
         corner = 0.5 * (own - shown)
-        notes.append("{}: the middle {} x {} px of the sensor".format(file.name, *index.size))
+        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
         middle = np.array(camera.principal_point_px) - corner
         return camera.model_copy(
             update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.detection_files import read_boxes
 from worldpose.formats.files import whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
@@ -28,6 +30,7 @@ from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.validation import require_local, validate_record
+from worldpose.video import FrameIndex, index_video
 
 
 @dataclass(frozen=True)
@@ -235,3 +238,64 @@ def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:
     validate_record(MatchSpec, yaml.safe_load(text), str(file))
     with whole_file(file) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def import_boxes(boxes: Path, folder: Path) -> dict[str, int]:
+    """Copy boxes of people into a match folder; return the number of each camera or clip.
+
+    Args:
+        boxes: folder with `<camera>.txt` or `<clip>.txt` (`read_boxes`).
+        folder: the match folder, with the videos.
+
+    Raises:
+        InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
+            nothing is written then.
+    """
+    match = read_match(folder)
+    open_to = {name for name in match.videos if name not in match.detections}
+    known = sorted(name for name in match.boxes if (boxes / f"{name}.txt").exists())
+    if known:
+        raise InputError(
+            str(folder / "boxes" / f"{known[0]}.txt"),
+            expected=f"no boxes of {known[0]} yet",
+            found="a file",
+            todo="Remove it first.",
+        )
+    asked = [file.stem for file in sorted(boxes.glob("*.txt"))]
+    indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
+    return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder)
+
+
+def copy_boxes(
+    boxes: Path, indices: Mapping[str, FrameIndex | None], folder: Path
+) -> dict[str, int]:
+    """Check all files of boxes against the videos, then copy them; return their numbers.
+
+    Args:
+        boxes: folder with a file of boxes for some of the cameras.
+        indices: frames of the video of each camera that may have boxes.
+        folder: the match folder.
+
+    Raises:
+        InputError: there are no files, one of an unknown camera, or an invalid one.
+    """
+    files = [file for file in sorted(boxes.glob("*.txt")) if not file.name.startswith(".")]
+    other = [file.name for file in files if file.stem not in indices]
+    if not files or other:
+        raise InputError(
+            str(boxes),
+            expected="<camera>.txt of cameras with a video and without 2D poses: "
+            + (", ".join(sorted(indices)) or "(none)"),
+            found=", ".join(other) or "no .txt file",
+            todo="Rename the files as the cameras.",
+        )
+    counts = {}
+    for file in files:
+        index = indices[file.stem]
+        assert index is not None
+        counts[file.stem] = len(read_boxes(file, index.size, len(index)).frame)
+    (folder / "boxes").mkdir(exist_ok=True)
+    for file in files:
+        with whole_file(folder / "boxes" / file.name) as draft:
+            shutil.copyfile(file, draft)
+    return counts

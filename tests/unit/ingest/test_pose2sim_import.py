@@ -12,7 +12,7 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest import import_pose2sim, read_calibration, read_match, write_calibration_toml
 from worldpose.ingest.footage import read_unit
 from worldpose.video import write_video
