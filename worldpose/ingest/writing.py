@@ -23,7 +23,7 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
-from worldpose.formats.files import whole_file
+from worldpose.formats.files import FULL, whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
 from worldpose.ingest.footage import write_still
@@ -72,7 +72,8 @@ def write_match(
         further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
-        InputError: the folder exists and is not empty, or the arguments contradict each other.
+        InputError: the folder exists and is not empty, its disk is full, or the arguments
+            contradict each other.
     """
     annotations = annotations or MatchAnnotations()
     clicked, key_frames = annotations.clicked, annotations.key_frames
@@ -82,32 +83,42 @@ def write_match(
         require_local(_still_name(spec, camera_id), f"match.yaml: camera {camera_id}: still")
     _require_empty(folder)
     _make_parent(folder)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
-        # One level down: the temporary folder is private, the match has the usual permissions.
-        building = Path(workshop) / folder.name
-        (building / "detections").mkdir(parents=True)
-        (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
-        if calibrations:
-            write_calibration_toml(building / "calibration.toml", calibrations)
-        for name, people in observations.items():
-            file = building / "detections" / f"{name}.npz"
-            write_keypoint_arrays(file, people)
-            read_keypoint_arrays(file)
-        if pitch is not None:
-            _write_pitch(building, spec, pitch)
-        write_clicked_markings(building, clicked)
-        write_key_frames(building, key_frames)
-        for camera_id, picture in stills.items():
-            write_still(building / _still_name(spec, camera_id), picture)
-        if further is not None:
-            further(building)
-        read_match(building)
-        _sync(building)
-        try:
-            building.rename(folder)  # replaces an empty folder, fails on any other
-        except OSError:
-            _require_empty(folder)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
+            # One level down: the temporary folder is private, the match has the usual permissions.
+            building = Path(workshop) / folder.name
+            (building / "detections").mkdir(parents=True)
+            (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
+            if calibrations:
+                write_calibration_toml(building / "calibration.toml", calibrations)
+            for name, people in observations.items():
+                file = building / "detections" / f"{name}.npz"
+                write_keypoint_arrays(file, people)
+                read_keypoint_arrays(file)
+            if pitch is not None:
+                _write_pitch(building, spec, pitch)
+            write_clicked_markings(building, clicked)
+            write_key_frames(building, key_frames)
+            for camera_id, picture in stills.items():
+                write_still(building / _still_name(spec, camera_id), picture)
+            if further is not None:
+                further(building)
+            read_match(building)
+            _sync(building)
+            try:
+                building.rename(folder)  # replaces an empty folder, fails on any other
+            except OSError:
+                _require_empty(folder)
+                raise
+    except OSError as error:
+        if error.errno not in FULL:
             raise
+        raise InputError(
+            str(folder),
+            expected="space for the match folder",
+            found=error.strerror or str(error),
+            todo="Free some, or choose another place; nothing was written.",
+        ) from error
     _sync_folder(folder.parent)
 
 
