@@ -233,7 +233,7 @@ def _refine(
 def _disagreement(
     cameras: Camera, people: KeypointDetections, fps: float, late: Floats, error: Floats
 ) -> Floats:
-    """Return by how much each camera's offset depends on which other cameras there are [frame].
+    """Return the standard error of each offset from the choice of the other cameras [frame].
 
     Other errors of an offset are the same at all times and in all people, such as a place of the
     camera that is not where the calibration has it, and no scatter shows them. But they are not
