@@ -32,8 +32,8 @@ import worldpose
 from data_contracts.conventions import COCO17
 from flows.results.best_results import static_cameras
 from worldpose.formats import read_joints
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import on_frames
-from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.geometry import Camera
 from worldpose.ingest import read_match
 

@@ -36,7 +36,7 @@ from worldpose.body_fitting import (
     perceived_joints,
     perceived_points,
 )
-from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.geometry import Camera
 from worldpose.ingest.importing import import_pose2sim
 from worldpose.triangulation import Triangulation, TriangulationSettings, reconstruct_joints

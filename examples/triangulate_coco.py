@@ -2,8 +2,8 @@
 
     python examples/triangulate_coco.py calibration.toml detections 25 joints.npz
 
-The calibration is a TOML file of Anipose, Pose2Sim or caliscope, or a Qualisys file, in metres and
-with z up. The folder has one COCO results file per camera, `<camera>.json`.
+The calibration has one of the forms of docs/reference/formats.md#calibrations, such as Anipose's
+TOML. The folder has one COCO results file per camera, `<camera>.json`.
 """
 
 import sys

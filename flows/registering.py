@@ -9,6 +9,7 @@ from data_contracts.match import MatchSpec, Registration, SourceFile
 from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
+from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest import (
     MatchFolder,
     read_match,
@@ -162,6 +163,12 @@ def _read_new_files(
     for unit, path in match.videos.items():
         if unit not in match.detections and (path.is_dir() or is_new(path)):
             require_footage(match.spec, unit, path)
+    for unit, path in match.boxes.items():
+        if is_new(path):
+            from worldpose.video import index_video  # late: few matches have such files
+
+            index = index_video(match.videos[unit])
+            read_boxes(path, index.size, len(index))
     for path in filter(is_new, match.estimates.values()):
         from worldpose.body_fitting import read_monocular  # late: few matches have such files
 

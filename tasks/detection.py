@@ -21,6 +21,7 @@ from tasks.spool import Spool, open_spool
 from tasks.unit import open_input, open_uncorrected, require_registered, unit_task
 from worldpose.detection import (
     DetectionSettings,
+    People,
     PeopleFinder,
     Place,
     load_detectors,
@@ -29,6 +30,7 @@ from worldpose.detection import (
     weights_of,
 )
 from worldpose.errors import InputError
+from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import stretches
 from worldpose.pitch import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
@@ -95,12 +97,16 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     """Run the detection nets."""
     sources: dict[str, Any] = work.recipe.sources
     settings = DetectionSettings.model_validate(work.recipe.settings)
+    given = _given_people(store, work) if "boxes" in sources else None
     finder = PeopleFinder(
-        load_detectors(settings), load_pose(settings), settings, load_score_map(settings)
+        load_detectors(settings) if given is None else (),
+        load_pose(settings),
+        settings,
+        load_score_map(settings) if given is None else None,
     )
     require_weights(settings, sources["weights"])
     most = 0
-    for chunk in finder.find(_read_frames(store, work), _open_place(store, work)):
+    for chunk in finder.find(_read_frames(store, work), _open_place(store, work), given):
         spool.add(chunk.arrays())
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
@@ -128,6 +134,30 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
         },
         (reason,) if (reason := report.why_no_person()) else (),
     )
+
+
+def _given_people(store: Store, work: Work) -> dict[int, People]:
+    """Return the given boxes of the clip's video by match frame.
+
+    Raises:
+        InputError: the file is invalid, or not the registered one.
+    """
+    sources: dict[str, Any] = work.recipe.sources
+    first, count = sources["first_frame"], sources["frame_count"]
+    footage = open_input(store, work, f"ingest/{sources['camera']}")
+    index = footage_index(footage)
+    path = Path(work.folder) / sources["boxes"]
+    given = read_boxes(path, index.size, len(index))
+    require_registered(path, sources["boxes_sha256"])
+    shown = footage["picture_of_frame"].sel(frame=slice(first, first + count - 1))
+    pictures = shown.values
+    begins = np.searchsorted(given.frame, pictures, side="left")
+    ends = np.searchsorted(given.frame, pictures, side="right")
+    return {
+        int(frame): People(given.box[begin:end], given.score[begin:end])
+        for frame, begin, end in zip(shown["frame"].values, begins, ends, strict=True)
+        if end > begin
+    }
 
 
 def _read_frames(store: Store, work: Work) -> Iterator[tuple[int, Image | None]]:

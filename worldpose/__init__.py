@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from worldpose.formats import JointTracks as JointTracks
     from worldpose.formats import read_joints as read_joints
     from worldpose.formats import write_joints as write_joints
-    from worldpose.formats.calibration_files import read_cameras as read_cameras
+    from worldpose.formats.calibration_forms import read_cameras as read_cameras
     from worldpose.geometry import Camera as Camera
     from worldpose.geometry import Rigid as Rigid
     from worldpose.ingest import MatchFolder as MatchFolder
@@ -101,7 +101,7 @@ _MODULES: Final = {
     "fit_bodies": "worldpose.body_fitting",
     "open_run": "worldpose.store.store",
     "open_video": "worldpose.video",
-    "read_cameras": "worldpose.formats.calibration_files",
+    "read_cameras": "worldpose.formats.calibration_forms",
     "read_joints": "worldpose.formats",
     "read_match": "worldpose.ingest",
     "read_observations": "worldpose.ingest",

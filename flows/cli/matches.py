@@ -27,6 +27,7 @@ from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.ingest import (
+    import_boxes,
     import_clicks,
     import_lenses,
     import_match,
@@ -195,13 +196,23 @@ def import_command(
     out: Annotated[Path, typer.Option("--out", help="Match folder to create or to extend.")],
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Cameras: Anipose, Pose2Sim or caliscope TOML, or Qualisys XML."),
+        typer.Option(
+            help="Cameras: a file of Anipose, Pose2Sim, caliscope, FreeMoCap, Qualisys, Vicon, "
+            "OptiTrack, OpenCap, EasyMocap or bioCV, or the folder of one file per camera."
+        ),
     ] = None,
     detections: Annotated[
         Path | None, typer.Option(help="Folder of COCO keypoint results, <camera>.json.")
     ] = None,
     videos: Annotated[
         Path | None, typer.Option(help="Folder of videos in place of 2D poses, <camera>.mp4.")
+    ] = None,
+    boxes: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --videos, or for the videos of a match folder: people's boxes, in which "
+            "only poses are estimated: folder of MOTChallenge lines, <camera>.txt."
+        ),
     ] = None,
     pose2sim: Annotated[
         Path | None,
@@ -244,10 +255,17 @@ def import_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Import calibration and 2D poses or videos, clicks, lenses or a pitch into a match folder.
+    """Import calibration and 2D poses or videos, boxes, clicks, lenses or a pitch into a folder.
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
+    if boxes is not None and videos is None:
+        if calibration or detections or pose2sim or fps or match_id or pitch or left_handed:
+            raise _boxes_alone()
+        if clicks or lens or camera:
+            raise _boxes_alone()
+        _import_boxes(boxes, out, as_json=as_json)
+        return
     if pose2sim is not None:
         if calibration or detections or videos or pitch or left_handed or clicks or lens or camera:
             raise UsageError(
@@ -297,7 +315,7 @@ def import_command(
         import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
         return
     if videos is not None and detections is None:
-        spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id)
+        spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
@@ -323,6 +341,25 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
         f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
         f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
     )
+
+
+def _boxes_alone() -> UsageError:
+    return UsageError(
+        "--boxes",
+        expected="--boxes with --videos, or with --out alone",
+        found="options of another import",
+        todo="Import the match first, then the boxes into its folder.",
+    )
+
+
+def _import_boxes(boxes: Path, out: Path, *, as_json: bool) -> None:
+    """Copy boxes into a match folder, and print how many there are."""
+    counts = import_boxes(boxes, out)
+    if as_json:
+        print_json({"folder": str(out), "boxes": counts})
+        return
+    for name, count in counts.items():
+        line(f"wrote {out / 'boxes' / name}.txt: {count} boxes")
 
 
 def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:

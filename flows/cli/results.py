@@ -19,7 +19,7 @@ from flows.cli.console import (
     line,
     print_json,
 )
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 from worldpose.store import Store, open_run
 
 
@@ -108,7 +108,7 @@ def export(
         surface=surface,
         definition=definition,
         footage=Footage(store, open_match(store, name)) if video else None,
-        licence=None if licence is None else licence.read_text(encoding="utf-8").strip(),
+        licence=None if licence is None else _read_licence(licence),
     )
     if release is None or origin.licence is None:
         written = export_formats(origin, forms, out)
@@ -121,6 +121,28 @@ def export(
         for path in written:
             size = f", {path.stat().st_size / 1e6:.1f} MB" if path.suffix == ".html" else ""
             line(f"wrote {path}{size}")
+
+
+def _read_licence(file: Path) -> str:
+    """Return the text of a data licence.
+
+    Raises:
+        InputError: the file is unreadable, empty, or no text.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig").strip()
+    except (OSError, ValueError) as error:
+        text, found = "", str(error)
+    else:
+        found = "nothing"
+    if not text:
+        raise InputError(
+            f"--licence {file}",
+            expected="the text of the data licence, in UTF-8",
+            found=found,
+            todo="Give a text file.",
+        )
+    return text
 
 
 _LISTED = "\n".join(f"  {name:15} {purpose}" for name, purpose in EXPORT_PURPOSES.items())

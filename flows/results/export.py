@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +31,8 @@ from flows.results.best_results import (
 )
 from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset.manifest import (
+    FRAME_RATES,
+    KINDS,
     ORIGINS,
     origins_of,
     read_manifest,
@@ -37,7 +42,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baselines.result import (
     write_baseline_settings,
@@ -55,6 +60,7 @@ from worldpose.formats.challenge import (
     write_static_camera,
     write_submission,
 )
+from worldpose.formats.files import FULL
 from worldpose.formats.joints_file import write_poses
 from worldpose.formats.tables import write_positions
 from worldpose.ingest import read_match
@@ -290,18 +296,97 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
     Raises:
         UsageError: an unknown format, two with the same file names, or a file in place of a folder.
+        InputError: the folder cannot be written, or a format's results are missing. Nothing is
+            written then.
     """
     if out.suffix == VIEWER_SUFFIX and set(forms) != {"viewer"}:
         raise _file_for_folder(out, forms)
-    written = _export(origin, forms, out)
-    for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
-        tracks = origin.tracks(clip)
-        written.append(out / "origins" / f"{clip}.npz")
-        write_origins(written[-1], tracks, origins_of(tracks))
-    if not COUNTED & set(forms):
-        return written
-    rates = dict.fromkeys(origin.clips, origin.spec.fps)
-    return [*written, write_frame_rates(out, rates)]
+
+    def write(place: Path) -> list[Path]:
+        written = _export(origin, forms, place)
+        for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
+            tracks = origin.tracks(clip)
+            written.append(place / "origins" / f"{clip}.npz")
+            write_origins(written[-1], tracks, origins_of(tracks))
+        if not COUNTED & set(forms):
+            return written
+        rates = dict.fromkeys(origin.clips, origin.spec.fps)
+        return [*written, write_frame_rates(place, rates)]
+
+    return _write_whole(out, write)
+
+
+def _write_whole(out: Path, write: Callable[[Path], list[Path]]) -> list[Path]:
+    """Write files to a temporary place next to `out`, then move all of them; return them there.
+
+    An error while they are written leaves `out` as it was.
+
+    Args:
+        out: a folder, or a file of the viewer.
+        write: writes into a folder, or a file, and returns the files.
+
+    Raises:
+        InputError: `out` cannot be written, or one of its files is a folder.
+    """
+    is_file = out.suffix == VIEWER_SUFFIX
+    if out.exists() and out.is_dir() == is_file:
+        raise _unwritable(out, "a folder" if is_file else "a file")
+    above = out if out.is_dir() else out.parent
+    absent = [place for place in (above, *above.parents) if not place.exists()]
+    try:
+        above.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=above) as workshop:
+            place = Path(workshop) / out.name
+            if not is_file:
+                place.mkdir()
+                for name in (FRAME_RATES, KINDS):  # further clips are added to them
+                    if (out / name).is_file():
+                        shutil.copyfile(out / name, place / name)
+            try:
+                written = write(place)
+            except InputError as error:
+                # A message about a file names it where it was to be.
+                where = error.where.replace(str(place), str(out))
+                raise type(error)(
+                    where, expected=error.expected, found=error.found, todo=error.todo
+                ) from error
+            targets = {path: out / path.relative_to(place) for path in written}
+            if is_file:
+                targets = dict.fromkeys(written, out)
+            for target in targets.values():
+                if target.is_dir():
+                    raise _unwritable(target, "a folder")
+                target.parent.mkdir(parents=True, exist_ok=True)
+            for path, target in targets.items():
+                path.replace(target)
+    except OSError as error:
+        _remove_empty(absent)
+        named = str(error.filename or "")
+        if error.errno in FULL or named.startswith((str(above), str(out))):
+            raise _unwritable(out, error.strerror or str(error)) from error
+        raise
+    except BaseException:
+        _remove_empty(absent)
+        raise
+    return list(targets.values())
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that were made, the innermost first, up to one with content."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+
+
+def _unwritable(out: Path, found: str) -> InputError:
+    return InputError(
+        f"--out {out}",
+        expected="a folder that can be written, or with --format viewer a file FILE.html",
+        found=found,
+        todo="Choose another place, or free space and rights there; nothing was written.",
+    )
 
 
 def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
@@ -364,7 +449,8 @@ def release(
 
     Raises:
         UsageError: the folder holds another release.
-        InputError: another run of the match was released under this name.
+        InputError: another run of the match was released under this name, or the folder cannot be
+            written.
     """
     if out.suffix == VIEWER_SUFFIX:
         raise _file_for_folder(out, forms)
@@ -389,6 +475,14 @@ def release(
         )
     # First, so that the run cannot be collected while its files are written.
     _keep(store, origin, name)
+    return _write_whole(out, lambda place: _write_release(origin, forms, place, ours))
+
+
+def _write_release(
+    origin: Origin, forms: list[str], out: Path, ours: Mapping[str, Any]
+) -> list[Path]:
+    """Write the files of a release; the manifest, with these entries, is the last."""
+    record, spec = origin.run.record, origin.spec
     written = _export(origin, forms, out)
     clips = {}
     for clip in origin.clips:

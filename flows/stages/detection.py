@@ -75,7 +75,7 @@ def _stages(match: Match, footage: str) -> tuple[str, ...]:
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
-    """Return the video, the clip, the pitch that separates the crowd, and people's corrections."""
+    """Return the video, the clip, the pitch that separates the crowd, given boxes, corrections."""
     footage, clip_id = _units(match)[unit]
     clip, pitch = match.folder.spec.clip(clip_id), match.folder.pitch
     known = len(_stages(match, footage)) > 1
@@ -87,8 +87,18 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
         "pitch": pitch.model_dump(mode="json") if known and pitch is not None else None,
+        **_boxes_of(match, footage),
         **ingest.edits_of(match, footage, clip.first_frame, clip.frame_count),
     }
+
+
+def _boxes_of(match: Match, footage: str) -> dict[str, JsonValue]:
+    """Return the given boxes of a video; empty if there are none, so that keys stay."""
+    file = match.folder.boxes.get(footage)
+    if file is None:
+        return {}
+    path = file.relative_to(match.folder.folder).as_posix()
+    return {"boxes": path, "boxes_sha256": match.registration.digest_of(path)}
 
 
 def outside(settings: DetectionSettings) -> dict[str, JsonValue]:

@@ -1,11 +1,15 @@
 """A bad file of each form of import is one error that names the file."""
 
+import errno
+import json
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from flows.cli.app import app
 from worldpose.errors import InputError
+from worldpose.video import write_video
 
 CALIBRATION = """
 [cam_0]
@@ -52,7 +56,13 @@ def lab(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["bad.toml", "bad.qca.txt", "bad.xml", "bad.json", "bad.yml"])
+CALIBRATIONS = [
+    *("bad.toml", "bad.qca.txt", "bad.xml", "bad.json", "bad.yml", "bad.xcp", "bad.mcal"),
+    *("bad.calib", "bad.pickle", "intri.yml"),
+]
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
 @pytest.mark.parametrize("content", [b"", NOISE], ids=["empty", "noise"])
 def test_calibrations(lab, name, content):
     file = lab / name
@@ -124,3 +134,69 @@ def test_surveys(lab, content):
     (lab / "bad.csv").write_bytes(content)
     assert "bad.csv" in refuse("--pitch", lab / "bad.csv", "--out", lab / "match")
     assert not (lab / "match" / "pitch.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "found an empty file"),
+        (NOISE, "a.txt"),
+        (b"0,1,5,5,5,5,1\n", "line 1: frame"),
+        (b"1,1,900,5,5,5,1\n", "line 1: left, top"),
+        (b"1,1,5,5,5,5,1\n1,1,9,5,5,5,1\n", "line 2: id"),
+    ],
+)
+def test_boxes(lab, content, told):
+    (lab / "videos").mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        frame = np.zeros((48, 64, 3), np.uint8)
+        write_video(lab / "videos" / name, [frame] * 5, 25.0)
+    (lab / "boxes").mkdir()
+    (lab / "boxes" / "a.txt").write_bytes(content)
+    given = ("--videos", lab / "videos", "--boxes", lab / "boxes", "--out", lab / "out")
+    assert told in refuse(*given)
+    assert not (lab / "out").exists()
+    (lab / "boxes" / "a.txt").rename(lab / "boxes" / "c.txt")
+    assert "found c.txt" in refuse(*given)
+    assert "--boxes with --videos" in refuse("--boxes", lab, "--fps", 25, "--out", lab / "match")
+
+
+def test_places_for_a_match(lab):
+    np.savez(lab / "poses" / "a.npz", a=1)
+    cases = {
+        lab / "match": "nothing, or an empty folder",
+        lab / "calibration.toml": "nothing, or an empty folder",
+        lab / "calibration.toml" / "below": "a place where a folder can be made",
+        "/proc/nothing/out": "a place where a folder can be made",
+    }
+    (lab / "poses" / "a.npz").unlink()
+    for name in ("a", "b"):
+        people = [
+            {"image_id": 0, "category_id": 1, "keypoints": [9.0, 9.0, 1.0] * 17, "score": 0.9}
+        ]
+        (lab / "poses" / f"{name}.json").write_text(json.dumps(people))
+    given = ("--calibration", lab / "calibration.toml", "--detections", lab / "poses")
+    for out, told in cases.items():
+        assert told in refuse(*given, "--fps", "25", "--out", out)
+    assert (
+        CliRunner()
+        .invoke(app, ["import", *map(str, given), "--fps", "25", "--out", str(lab / "out")])
+        .exit_code
+        == 0
+    )
+
+
+def test_a_full_disk_leaves_no_match(lab, monkeypatch):
+    (lab / "videos").mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        write_video(lab / "videos" / name, [np.zeros((48, 64, 3), np.uint8)] * 5, 25.0)
+
+    def full(source, target):
+        raise OSError(errno.ENOSPC, "No space left on device", str(target))
+
+    monkeypatch.setattr("worldpose.ingest.importing.shutil.copyfile", full)
+    given = ["import", "--videos", str(lab / "videos"), "--out", str(lab / "new" / "out")]
+    result = CliRunner().invoke(app, given)
+    assert isinstance(result.exception, InputError), result.exception
+    assert "No space left on device" in str(result.exception)
+    assert not (lab / "new").exists() or not list((lab / "new").iterdir())

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from data_contracts.cameras import LensCalibration
 from flows.cli.app import app
 from worldpose.errors import InputError, UsageError
-from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.lens_files import write_lens_toml
 from worldpose.geometry import Camera, align
 

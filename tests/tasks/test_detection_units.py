@@ -18,6 +18,7 @@ from flows.run_plan import RunPlan
 from tasks.clip_inputs import open_clip, open_frames
 from worldpose.detection import People
 from worldpose.errors import InputError
+from worldpose.ingest import import_boxes
 from worldpose.store import Store
 
 OFFSETS = {"left": 0, "right": 3}
@@ -183,3 +184,59 @@ def test_a_video_that_is_not_what_match_yaml_says_is_refused_at_once(filmed, tmp
             register(store, filmed)
         if old.startswith("width"):
             (filmed / "away").rename(filmed / "calibration.toml")
+
+
+def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, monkeypatch):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    stages = [stage.name for stage in METHOD].index("detection") + 1
+    before = computed(store, match, stages)
+    (tmp_path / "boxes").mkdir()
+    # Two people in every other image of `right`, whose offset is 3 frames; images count from 1.
+    lines = [
+        f"{image + 1},{person},{image + 1.5},{10 * person + 1.5},8,20,0.9,-1,-1,-1"
+        for image in range(0, 31, 2)
+        for person in (1, 2)
+    ]
+    (tmp_path / "boxes" / "right.txt").write_text("\n".join(lines))
+    assert import_boxes(tmp_path / "boxes", filmed) == {"right": 32}
+    match, changed = register(store, filmed)
+    assert changed
+    after = computed(store, match, stages)
+    assert {name for name in after if after[name] != before[name]} == {
+        *("detection/right.early", "detection/right.late")
+    }
+    seen = store.open_result("filmed", "detection", "right.early", after["detection/right.early"])
+    images = np.arange(2, 14) + 3
+    expected = np.where((images % 2 == 0)[:, None], np.stack([images, images], axis=1), np.nan)
+    found = seen["keypoints"].values[:, :, 0]
+    np.testing.assert_array_equal(found[..., 0], expected)
+    np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
+    manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
+    assert manifest.figures["empty_share"] == 0.5
+
+
+def test_boxes_belong_to_a_video_without_2d_poses(filmed, tmp_path):
+    boxes = tmp_path / "boxes"
+    boxes.mkdir()
+    with pytest.raises(InputError, match=r"without 2D poses: left, right, found no .txt file"):
+        import_boxes(boxes, filmed)
+    (boxes / "middle.txt").write_text("1,1,5,5,5,5,1\n")
+    with pytest.raises(InputError, match=r"left, right, found middle.txt"):
+        import_boxes(boxes, filmed)
+    (boxes / "middle.txt").rename(boxes / "right.txt")
+    (boxes / "left.txt").write_text("41,1,5,5,5,5,1\n")
+    with pytest.raises(InputError, match=r"left.txt: line 1: frame: .* from 1 to 40"):
+        import_boxes(boxes, filmed)
+    assert not (filmed / "boxes").exists()
+    (boxes / "left.txt").unlink()
+    import_boxes(boxes, filmed)
+    with pytest.raises(InputError, match=r"right.txt: expected no boxes of right yet"):
+        import_boxes(boxes, filmed)
+    # A file that was edited afterwards is refused when the match is registered.
+    (filmed / "boxes" / "right.txt").write_text("1,1,5,5,5,-5,1\n")
+    with pytest.raises(InputError, match="more than 0 px"):
+        register(Store.create(tmp_path / "project"), filmed)
+    (filmed / "boxes" / "right.txt").rename(filmed / "boxes" / "main.txt")
+    with pytest.raises(InputError, match=r"main.txt: expected a camera or clip with a video"):
+        register(Store.create(tmp_path / "other"), filmed)

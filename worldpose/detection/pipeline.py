@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -75,6 +75,8 @@ def on_pitch(
 
 CHUNK: Final = 64
 """Frames per chunk."""
+NOBODY: Final = People(np.empty((0, 4)), np.empty(0))
+"""A frame without people."""
 LONG_CLIP: Final = 20
 """Frames without any person that are suspicious."""
 
@@ -94,6 +96,7 @@ class DetectionReport:
         flickers: boxes of tracks with too few sightings.
         unsure: people without a single keypoint, or with the pose of a better box.
         beside: occluded people found next to others; later steps may drop some.
+        is_given: whether the boxes were given, not detected.
     """
 
     frames: int = 0
@@ -106,6 +109,7 @@ class DetectionReport:
     flickers: int = 0
     unsure: int = 0
     beside: int = 0
+    is_given: bool = False
 
     def why_no_person(self) -> str | None:
         """Return the likely reason why a clip of `LONG_CLIP` frames or more shows no person.
@@ -116,6 +120,11 @@ class DetectionReport:
         if self.detections or frames < LONG_CLIP:
             return None
         found = f"no person in {frames} frames: "
+        if self.is_given:
+            return found + (
+                f"the given file has {self.boxes} boxes in them. Check that its frames are those "
+                "of this camera's video, from 1 on, and detection.pose"
+            )
         if not self.boxes:
             return found + (
                 "the detector gave no box from detection.low_score_threshold on. Check that "
@@ -182,29 +191,40 @@ class PeopleFinder:
         self.report = DetectionReport()
 
     def find(
-        self, frames: Iterable[tuple[int, Image | None]], place: Place | None = None
+        self,
+        frames: Iterable[tuple[int, Image | None]],
+        place: Place | None = None,
+        given: Mapping[int, People] | None = None,
     ) -> Iterator[KeypointDetections]:
         """Yield the people of a video in chunks of frames.
 
         Args:
             frames: numbers that rise by one, each with its image; None where there is none.
             place: camera and pitch; None keeps the crowd.
+            given: known people by frame, in place of those of the detectors, all of whom stay: no
+                box is added, left out because of its score or its place, or tracked. None = detect.
         """
-        self.report = DetectionReport()
+        self.report = DetectionReport(is_given=given is not None)
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):
             margin = self._settings.pitch_margin_m
             self._parts = expect_parts(place.camera, place.pitch, margin)
-        detected_frames = detect_strided(
-            frames,
-            lambda images: self._people(images, place),
-            self._settings.stride,
-            self._settings.batch,
-        )
+        if given is None:
+            found = cleaner.clean(
+                detect_strided(
+                    frames,
+                    lambda images: self._people(images, place),
+                    self._settings.stride,
+                    self._settings.batch,
+                )
+            )
+        else:
+            found = ((number, image, given.get(number, NOBODY)) for number, image in frames)
+            self.report.boxes = sum(len(people.scores) for people in given.values())
         rows: list[KeypointDetections] = []
         numbers: list[int] = []
-        for number, image, people in cleaner.clean(detected_frames):
+        for number, image, people in found:
             numbers.append(number)
             if image is None:
                 self.report.unreadable.append(number)

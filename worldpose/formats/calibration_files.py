@@ -1,20 +1,20 @@
-"""Readers and a writer of camera calibrations: TOML, and Qualisys XML (`.qca.txt`).
+"""Cameras of a calibration file: checks that all forms share, and Anipose's TOML.
 
-Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim and caliscope.
+Reader and writer of calibrated cameras as TOML of Anipose, Pose2Sim, caliscope and FreeMoCap; the
+other forms are in `calibration_systems` and `calibration_forms`.
 
 One table per camera with `size`, `matrix`, `distortions` (k1 k2 p1 p2 k3, as OpenCV), `rotation`
 (Rodrigues vector [rad], or 3x3) and `translation` [m] of x_cam = R x_world + t. A camera's id is
 its `name`, else its table. caliscope's own file has the tables under `cameras`, by number: camera 3
-is `cam_3`, as in its Anipose export. The reader ignores `metadata` and further keys.
+is `cam_3`, as in its Anipose export. FreeMoCap's file, known by its `metadata`, is in millimetres.
+The reader ignores further keys.
 """
 
 from __future__ import annotations
 
-import os
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,7 @@ from pydantic import ValidationError
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats.files import SETTINGS_BYTES, read_toml, require_file
-
-if TYPE_CHECKING:
-    from worldpose.geometry import Camera
+from worldpose.formats.files import read_toml
 
 SIZE_LIMIT: Final = 1 << 16
 """Maximum width and height of an image [px]; OpenCV's own limit for most operations."""
@@ -46,6 +43,26 @@ DISTANCE_LIMIT: Final = 1e7
 
 ROTATION_TOLERANCE: Final = 1e-4
 """Maximum rounding error of R R^T = I [1]; four decimals give less."""
+
+MILLIMETRE: Final = 1e-3
+"""[m]"""
+
+FARTHEST_M: Final = 1000.0
+"""Maximum distance of a camera from the middle of all [m]: around a stadium it is 200 m."""
+
+NEAREST_M: Final = 0.1
+"""Minimum of the largest distance from the middle, where the file is in millimetres [m]: cameras
+that see a person from several sides are some metres apart, not some millimetres."""
+
+FREEMOCAP: Final = (
+    "charuco_square_size",
+    "charuco_board_object",
+    "groundplane_calibration",
+    "groundplane_applied",
+    "recording_info",
+    "path_to_recorded_videos",
+)
+"""Keys of `metadata` that FreeMoCap alone writes."""
 
 
 def build_camera(
@@ -136,16 +153,18 @@ def require_optics(
 
 
 def index_by_name(
-    path: Path, cameras: list[tuple[str, CameraCalibration]]
+    path: Path, cameras: list[tuple[str, CameraCalibration]], unit_m: float = 1.0
 ) -> dict[str, CameraCalibration]:
     """Return the cameras by id, in file order.
 
     Args:
         path: the file, for messages.
         cameras: pairs of place in the file and camera.
+        unit_m: unit of length in the file [m].
 
     Raises:
-        InputError: there is no camera, or two cameras have one name.
+        InputError: there is no camera, two cameras have one name, or the cameras are so near each
+            other, or so far apart, that the file has another unit.
     """
     by_name: dict[str, CameraCalibration] = {}
     for where, camera in cameras:
@@ -154,7 +173,28 @@ def index_by_name(
         by_name[camera.id] = camera
     if not by_name:
         raise calibration_error(str(path), "at least one camera", "none")
+    _require_unit(path, list(by_name.values()), unit_m)
     return by_name
+
+
+def _require_unit(path: Path, cameras: list[CameraCalibration], unit_m: float) -> None:
+    """Raise InputError if the cameras' distances contradict the unit of the file."""
+    if len(cameras) < 2:
+        return
+    rotations = np.array([camera.rotation for camera in cameras])
+    centers = -np.einsum("cij,ci->cj", rotations, [camera.translation for camera in cameras])
+    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=-1).max())
+    in_millimetres = unit_m == MILLIMETRE
+    if distance <= FARTHEST_M and not (in_millimetres and distance < NEAREST_M):
+        return
+    raise InputError(
+        f"{path}: translation",
+        expected=f"positions in {'millimetres' if in_millimetres else 'metres'}",
+        found=f"a camera {distance:.3g} m from the middle of all cameras",
+        todo="Multiply the positions by 1000 if they are in metres."
+        if distance < NEAREST_M
+        else "Divide the positions by 1000 if they are in millimetres.",
+    )
 
 
 def calibration_error(where: str, expected: str, found: str) -> InputError:
@@ -173,25 +213,56 @@ def read_calibration_toml(path: Path) -> dict[str, CameraCalibration]:
 
     Raises:
         InputError: the file is unreadable or has a missing, misshapen or infinite entry, no
-            rotation, a fisheye camera, no camera, or two cameras of one name; the error names file
+            rotation, a fisheye camera, no camera, two cameras of one name, or another unit of
+            length; or the world of FreeMoCap's file is not that of the ground. The error names file
             and key.
     """
-    return index_by_name(
-        path,
-        [
-            (where, _read_toml_camera(where, name, table))
-            for where, name, table in camera_tables(path)
-        ],
-    )
+    content = read_toml(path)
+    unit_m = MILLIMETRE if _is_freemocap(path, content) else 1.0
+    cameras = []
+    for where, name, table in camera_tables(path, content):
+        if "matrix" in table and not {"rotation", "translation"} & table.keys():
+            raise InputError(
+                f"{where}.rotation",
+                expected="the pose of the camera, rotation and translation",
+                found="a lens alone",
+                todo="Import lenses with worldpose import --lens FILE --out MATCH, and click the "
+                "pose.",
+            )
+        cameras.append((where, read_camera_table(where, name, table, unit_m=unit_m)))
+    return index_by_name(path, cameras, unit_m)
 
 
-def camera_tables(path: Path) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+def _is_freemocap(path: Path, content: Mapping[str, Any]) -> bool:
+    """Return whether a TOML file is FreeMoCap's, whose world must have the ground as z = 0."""
+    metadata = content.get("metadata")
+    if not isinstance(metadata, dict) or not any(key in metadata for key in FREEMOCAP):
+        return False
+    if not (metadata.get("groundplane_calibration") or metadata.get("groundplane_applied")):
+        raise InputError(
+            f"{path}: metadata.groundplane_calibration",
+            expected="true: the world's z axis points up from the ground",
+            found="no ground plane: the world is that of the first camera",
+            todo="Process the calibration again in FreeMoCap with the board on the ground ('Use "
+            "Charuco as groundplane'), or import the lenses (worldpose import --lens) and locate "
+            "the cameras from people (worldpose locate-cameras).",
+        )
+    return True
+
+
+def camera_tables(
+    path: Path, content: Mapping[str, Any] | None = None
+) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     """Yield the place, the camera's id and the table of each camera of a TOML file.
+
+    Args:
+        path: the file.
+        content: its tables; None = read them.
 
     Raises:
         InputError: the file is unreadable, or has an entry that is no table.
     """
-    content = read_toml(path)
+    content = read_toml(path) if content is None else content
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) and "size" not in nested else content
     for key, table in tables.items():
@@ -212,8 +283,23 @@ class Optics(NamedTuple):
     distortion: NDArray[np.float64]
 
 
-def read_optics(where: str, table: Mapping[str, Any]) -> Optics:
+class Keys(NamedTuple):
+    """Names of a camera's entries in a form; the defaults are Anipose's."""
+
+    size: str = "size"
+    matrix: str = "matrix"
+    distortions: str = "distortions"
+    rotation: str = "rotation"
+    translation: str = "translation"
+
+
+def read_optics(where: str, table: Mapping[str, Any], keys: Keys = Keys()) -> Optics:  # noqa: B008
     """Return size, matrix and distortion of a camera's table.
+
+    Args:
+        where: file and camera, for messages.
+        table: entries by key.
+        keys: the form's names of the entries.
 
     Raises:
         InputError: an entry is missing or misshapen, or the lens has another model.
@@ -225,35 +311,54 @@ def read_optics(where: str, table: Mapping[str, Any]) -> Optics:
             found=_shorten(table["fisheye"]),
             todo="Calibrate this camera with the standard model, or undistort its pictures first.",
         )
-    matrix = _read_numbers(table, where, "matrix", (3, 3))
-    size = _read_numbers(table, where, "size", (2,))
-    distortion = np.ravel(_read_numbers(table, where, "distortions", None))
+    matrix = _read_numbers(table, where, keys.matrix, (3, 3))
+    size = _read_numbers(table, where, keys.size, (2,))
+    distortion = np.ravel(_read_numbers(table, where, keys.distortions, None))
     if len(distortion) not in (4, 5, 8, 12, 14):
         found = f"{len(distortion)} numbers"
-        raise calibration_error(f"{where}.distortions", "4 or 5: k1 k2 p1 p2 (k3)", found)
+        raise calibration_error(f"{where}.{keys.distortions}", "4 or 5: k1 k2 p1 p2 (k3)", found)
     if np.any(distortion[5:] != 0):
         raise calibration_error(
-            f"{where}.distortions",
+            f"{where}.{keys.distortions}",
             "zero beyond the fifth, k3",
             f"{distortion[5:].tolist()}, a lens model with more terms",
         )
     off_diagonal = [matrix[0, 1], matrix[1, 0], *matrix[2, :2], matrix[2, 2] - 1]
     if np.any(np.abs(off_diagonal) > 1e-9):
         raise calibration_error(
-            f"{where}.matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", str(matrix.tolist())
+            f"{where}.{keys.matrix}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", str(matrix.tolist())
         )
     return Optics(size, np.diag(matrix)[:2], matrix[:2, 2], np.append(distortion, 0.0)[:5])
 
 
-def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> CameraCalibration:
-    if "matrix" in table and not {"rotation", "translation"} & table.keys():
-        raise InputError(
-            f"{where}.rotation",
-            expected="the pose of the camera, rotation and translation",
-            found="a lens alone",
-            todo="Import lenses with worldpose import --lens FILE --out MATCH, and click the pose.",
-        )
-    optics = read_optics(where, table)
+def read_camera_table(
+    where: str,
+    name: str,
+    table: Mapping[str, Any],
+    *,
+    keys: Keys = Keys(),  # noqa: B008
+    unit_m: float = 1.0,
+    axes: NDArray[np.float64] | None = None,
+    where_pose: str | None = None,
+) -> CameraCalibration:
+    """Return the camera of a table.
+
+    Args:
+        where: file and camera, for messages.
+        name: id of the camera.
+        table: entries by key, as numbers and lists of them.
+        keys: the form's names of the entries.
+        unit_m: unit of the translation [m].
+        axes: (3, 3) rotation A from the world of the file to one with z up, x' = A x; None = none.
+        where_pose: as `where`, for the pose, if it is in another file.
+
+    Raises:
+        InputError: an entry is missing, misshapen, infinite or impossible.
+    """
+    optics = read_optics(where, table, keys)
+    where_pose = where if where_pose is None else where_pose
+    rotation = _read_rotation(table, where_pose, keys.rotation)
+    translation = unit_m * _read_numbers(table, where_pose, keys.translation, (3,))
     return build_camera(
         where,
         name,
@@ -261,23 +366,23 @@ def _read_toml_camera(where: str, name: str, table: Mapping[str, Any]) -> Camera
         focal=optics.focal,
         principal_point=optics.principal_point,
         distortion=optics.distortion,
-        rotation=_read_rotation(table, where),
-        translation=_read_numbers(table, where, "translation", (3,)),
+        rotation=rotation if axes is None else rotation @ axes.T,
+        translation=translation,
     )
 
 
-def _read_rotation(table: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    given = _read_numbers(table, where, "rotation", None)
+def _read_rotation(table: Mapping[str, Any], where: str, key: str) -> NDArray[np.float64]:
+    given = _read_numbers(table, where, key, None)
     if given.shape == (3, 3):
         return given
     if given.size != 3:
         raise calibration_error(
-            f"{where}.rotation", "3 numbers (Rodrigues vector) or 3x3", f"shape {given.shape}"
+            f"{where}.{key}", "3 numbers (Rodrigues vector) or 3x3", f"shape {given.shape}"
         )
     angle = float(np.linalg.norm(given))
     if angle > 2.0 * np.pi + ROTATION_TOLERANCE:
         raise InputError(
-            f"{where}.rotation",
+            f"{where}.{key}",
             expected="a Rodrigues vector in radians, no longer than 2 pi",
             found=f"one of length {angle:g}",
             todo="If these are degrees, multiply them by pi / 180.",
@@ -353,125 +458,3 @@ def write_calibration_toml(path: Path, calibrations: Mapping[str, CameraCalibrat
         ]
     lines += ["[metadata]", "adjusted = false", "error = 0.0", ""]
     path.write_text("\n".join(lines), encoding="utf-8")
-
-
-def read_calibration_qualisys(path: Path) -> dict[str, CameraCalibration]:
-    """Return the active cameras of a Qualisys calibration by serial, in file order.
-
-    Raises:
-        InputError: the file is unreadable, or has a missing attribute, no finite number, no
-            rotation, no camera, or two cameras of one serial; the error names file, camera and
-            attribute.
-    """
-    size = require_file(path)
-    if size > SETTINGS_BYTES:
-        raise calibration_error(str(path), f"at most {SETTINGS_BYTES} bytes", f"{size} bytes")
-    try:
-        root = ET.fromstring(path.read_bytes(), ET.XMLParser(target=_PlainTree()))
-    except (ET.ParseError, ValueError, LookupError, OSError) as error:
-        raise calibration_error(str(path), "Qualisys XML", str(error)) from error
-    cameras = []
-    for index, element in enumerate(root.iterfind("cameras/camera")):
-        where = f"{path}: camera[{index}]"
-        if element.get("active", "1") != "0":
-            cameras.append((where, _read_qualisys_camera(where, element)))
-    return index_by_name(path, cameras)
-
-
-class _PlainTree(ET.TreeBuilder):
-    """A tree builder that rejects entities, which could expand a small file without limit."""
-
-    def doctype(self, name: str, pubid: str, system: str) -> None:
-        raise ValueError(f"a DOCTYPE ({name}), which no calibration has")
-
-
-def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
-    """Return one `<camera>` of a Qualisys calibration, with its `serial` as name.
-
-    `<transform>`: x y z is the camera centre C [mm]; r11..r33 is A, row by row, whose rows are the
-    camera's axes in the world: x right, y up, z backward. So R = diag(1, -1, -1) A, t = -R C.
-
-    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor; `<fov_video>` (px,
-    both ends included) is the part of the sensor in the video. The radial and tangential (in the
-    file: tangental) coefficients act on the normalised image plane and have no unit, so that they
-    need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
-    by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
-    QTM; the function ignores it.
-    """
-    parts = {}
-    for tag in ("transform", "intrinsic", "fov_video"):
-        part = element.find(tag)
-        if part is None:
-            raise calibration_error(where, f"<{tag}>", "nothing")
-        parts[tag] = part
-
-    def read(tag: str, *keys: str) -> NDArray[np.float64]:
-        values = []
-        for key in keys:
-            text = parts[tag].get(key)
-            try:
-                values.append(float(text if text is not None else "nothing"))
-            except ValueError as error:
-                raise calibration_error(f"{where}.{tag}.{key}", "a number", repr(text)) from error
-            if not abs(values[-1]) <= NUMBER_LIMIT:
-                raise calibration_error(
-                    f"{where}.{tag}.{key}", f"up to {NUMBER_LIMIT:g}", repr(text)
-                )
-        return np.array(values)
-
-    left, top, right, bottom = read("fov_video", "left", "top", "right", "bottom")
-    skew = parts["intrinsic"].get("skew", "0")
-    if skew.strip("0.+-") != "":
-        raise calibration_error(f"{where}.intrinsic.skew", "0", repr(skew))
-    axes = read("transform", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(3, 3)
-    center = read("transform", "x", "y", "z") / 1000.0
-    rotation = np.diag([1.0, -1.0, -1.0]) @ axes
-    k1, k2, k3 = read("intrinsic", "radialDistortion1", "radialDistortion2", "radialDistortion3")
-    p1, p2 = read("intrinsic", "tangentalDistortion1", "tangentalDistortion2")
-    return build_camera(
-        where,
-        element.get("serial", ""),
-        size=np.array([right - left + 1, bottom - top + 1]),
-        focal=read("intrinsic", "focalLengthU", "focalLengthV") / 64.0,
-        principal_point=read("intrinsic", "centerPointU", "centerPointV") / 64.0 - [left, top],
-        distortion=np.array([k1, k2, p1, p2, k3]),
-        rotation=rotation,
-        translation=-rotation @ center,
-    )
-
-
-def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
-    """Return the cameras of a calibration file by name, in file order.
-
-    Args:
-        path: file as in `read_calibration`.
-
-    Raises:
-        InputError: an unknown file type, or an invalid entry, with file and key.
-    """
-    from worldpose.geometry import Camera  # late: most commands only check calibrations
-
-    given = read_calibration(Path(path))
-    return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}
-
-
-def read_calibration(path: Path) -> dict[str, CameraCalibration]:
-    """Return the cameras of a calibration file by name, in file order.
-
-    Args:
-        path: `.toml` of Anipose, Pose2Sim or caliscope (`read_calibration_toml`); `.txt` or `.xml`
-            of Qualisys (`read_calibration_qualisys`).
-
-    Raises:
-        InputError: an unknown file type, or an invalid entry, with file and key.
-    """
-    if path.suffix.lower() == ".toml":
-        return read_calibration_toml(path)
-    if path.suffix.lower() in (".txt", ".xml"):
-        return read_calibration_qualisys(path)
-    raise InputError(
-        str(path),
-        expected="a calibration: .toml (Anipose, Pose2Sim, caliscope) or .qca.txt (Qualisys)",
-        found=f"a file that ends in {path.suffix!r}",
-        todo="Export the calibration in one of these forms.",
-    )

@@ -8,6 +8,7 @@ parsed file of a gigabyte would end the process.
 from __future__ import annotations
 
 import codecs
+import errno
 import json
 import os
 import tempfile
@@ -46,6 +47,9 @@ def _sync(path: Path) -> None:
     finally:
         os.close(descriptor)
 
+
+FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of a disk to which nothing more can be written."""
 
 SETTINGS_BYTES: Final = 1 << 21
 """Maximum size of match.yaml, calibration.toml or pitch.json [byte].

@@ -149,7 +149,7 @@ def _read_file(file: Path) -> dict[str, Any]:
     if suffix == ".npz":
         return dict(read_npz(file, ARRAY_BYTES))
     if suffix in (".xml", ".yml", ".yaml", ".json"):
-        return _read_file_storage(file)
+        return read_file_storage(file)
     raise InputError(
         str(file),
         expected="a lens file: .toml, OpenCV's .xml, .yml, .yaml or .json, .npy or .npz",
@@ -158,7 +158,15 @@ def _read_file(file: Path) -> dict[str, Any]:
     )
 
 
-def _read_file_storage(file: Path) -> dict[str, Any]:
+def read_file_storage(file: Path) -> dict[str, Any]:
+    """Return matrices, numbers and lists of text of a file of OpenCV's FileStorage, by name.
+
+    Raises:
+        InputError: the file is too large, or not of that kind, or has none of these.
+    """
+    size = require_file(file)
+    if size > SETTINGS_BYTES:
+        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{size}")
     import cv2  # late: it takes 0.2 s, and few commands read such a file
 
     try:
@@ -171,9 +179,14 @@ def _read_file_storage(file: Path) -> dict[str, Any]:
                 found[name] = np.asarray(node.mat(), dtype=np.float64)
             elif node.isInt() or node.isReal():
                 found[name] = float(node.real())
+            elif node.isSeq():
+                parts = [node.at(index) for index in range(node.size())]
+                found[name] = [
+                    part.string() if part.isString() else f"{part.real():g}" for part in parts
+                ]
         storage.release()
     except (cv2.error, SystemError) as error:
-        said = str(error).splitlines()[0]
+        said = str(error.__cause__ or error).strip().splitlines()[0][:200]
         raise calibration_error(str(file), "a file of OpenCV's FileStorage", said) from error
     if not found:
         raise calibration_error(str(file), "matrices of OpenCV's FileStorage", "none")

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
-    from worldpose.formats.calibration_files import read_calibration, write_calibration_toml
+    from worldpose.formats.calibration_files import write_calibration_toml
+    from worldpose.formats.calibration_forms import read_calibration
     from worldpose.formats.keypoint_files import read_observations
     from worldpose.ingest.clicks import ImportedClicks, import_clicks
     from worldpose.ingest.footage import UnitFrames, read_unit, unit_frames
@@ -27,13 +28,14 @@ if TYPE_CHECKING:
         unclicked_clips,
     )
     from worldpose.ingest.registration import register_match
-    from worldpose.ingest.writing import MatchAnnotations, write_match
+    from worldpose.ingest.writing import MatchAnnotations, import_boxes, write_match
 
 __all__ = [
     "ImportedClicks",
     "MatchAnnotations",
     "MatchFolder",
     "UnitFrames",
+    "import_boxes",
     "import_clicks",
     "import_lenses",
     "import_match",
@@ -54,10 +56,8 @@ __all__ = [
 __getattr__ = import_on_use(
     __name__,
     {
-        "worldpose.formats.calibration_files": (
-            "read_calibration",
-            "write_calibration_toml",
-        ),
+        "worldpose.formats.calibration_files": ("write_calibration_toml",),
+        "worldpose.formats.calibration_forms": ("read_calibration",),
         "worldpose.formats.keypoint_files": ("read_observations",),
         "worldpose.ingest.clicks": (
             "ImportedClicks",
@@ -83,6 +83,7 @@ __getattr__ = import_on_use(
         "worldpose.ingest.registration": ("register_match",),
         "worldpose.ingest.writing": (
             "MatchAnnotations",
+            "import_boxes",
             "write_match",
         ),
     },

@@ -15,14 +15,19 @@ from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.calibration_forms import (
+    TOML,
+    calibrations_in,
+    find_calibration,
+    read_calibration,
+)
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.files import read_toml, whole_file
 from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
-from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
-from worldpose.ingest.writing import write_match
+from worldpose.ingest.writing import copy_boxes, write_match
 from worldpose.video import FrameIndex, VideoReader, index_frames
 
 SAME_SHAPE: Final = 0.002
@@ -45,7 +50,7 @@ def import_match(
     numbers from the files. The function validates all 2D poses and stores them as npz.
 
     Args:
-        calibration: a file that `read_calibration` reads.
+        calibration: a file or folder that `read_calibration` reads.
         detections: folder with `<camera>.json` or `.npz` for each camera of the calibration.
         fps: frame rate of all cameras [1/s].
         out: the match folder, absent or empty.
@@ -163,6 +168,7 @@ def import_videos(
     out: Path,
     fps: float | None = None,
     match_id: str | None = None,
+    boxes: Path | None = None,
 ) -> MatchSpec:
     """Write a match folder with the cameras of a calibration and copies of their videos.
 
@@ -172,11 +178,13 @@ def import_videos(
     in match.yaml can shift them afterwards.
 
     Args:
-        calibration: a file that `read_calibration` reads; None = not known.
+        calibration: a file or folder that `read_calibration` reads; None = not known.
         videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
         out: the match folder, absent or empty.
         fps: frame rate of all videos [1/s]; None = from the videos.
         match_id: id of the match; None = the name of `out`.
+        boxes: folder with `<camera>.txt` of people's boxes (`read_boxes`), in which only poses are
+            estimated, for some of the cameras or all; None = people are detected.
 
     Returns:
         Content of match.yaml.
@@ -216,6 +224,8 @@ def import_videos(
         (folder / "videos").mkdir()
         for file in files.values():
             shutil.copyfile(file, folder / "videos" / file.name)
+        if boxes is not None:
+            copy_boxes(boxes, indices, folder)
 
     write_match(out, spec, calibrations=cameras, observations={}, further=copy)
     return spec
@@ -260,9 +270,22 @@ def _wrong_size(file: Path, camera: CameraCalibration, index: FrameIndex) -> Inp
 
 
 def _fit_to_video(
-    file: Path, camera: CameraCalibration, index: FrameIndex, notes: list[str]
+    file: Path,
+    camera: CameraCalibration,
+    index: FrameIndex,
+    notes: list[str],
+    *,
+    is_part: bool = False,
 ) -> CameraCalibration:
     """Return a camera in the pixels of its video, which may be resized, or have black bars.
+
+    Args:
+        file: the video.
+        camera: the camera in the calibrated pixels.
+        index: the video's frames.
+        notes: sentences for the user, to which a change is added.
+        is_part: whether a smaller video is the middle part of the image, as Vicon's video modes
+            are of the sensor to which the calibration belongs.
 
     Raises:
         InputError: the video is neither what was calibrated nor the same picture resized.
@@ -270,6 +293,13 @@ def _fit_to_video(
     if index.size == camera.image_size:
         return camera
     own, shown = np.array(camera.image_size), np.array(index.size)
+    if is_part and np.all(shown <= own):
+        corner = 0.5 * (own - shown)
+        notes.append(f"{file.name}: the middle {index.size[0]} x {index.size[1]} px of the sensor")
+        middle = np.array(camera.principal_point_px) - corner
+        return camera.model_copy(
+            update={"image_size": index.size, "principal_point_px": tuple(middle.tolist())}
+        )
     scale = float((shown / own).min())
     bar = 0.5 * (shown - scale * own)
     if (shown / own).max() > (1.0 + SAME_SHAPE) * scale:
@@ -315,8 +345,9 @@ def import_pose2sim(
 ) -> tuple[MatchSpec, list[str]]:
     """Write a match folder with cameras, 2D poses and videos of a trial of Pose2Sim.
 
-    The calibration is the one file `Calib*.toml` or `*.qca.txt` in `calibration/`, of the trial or
-    of the folder above it, as in Pose2Sim's batches; without it each video is a camera. 2D poses
+    The calibration is the one in `calibration/`, of the trial or of the folder above it, as in
+    Pose2Sim's batches, in any form that `read_calibration` reads; without it each video is a
+    camera. 2D poses
     are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each camera; without them
     people are detected in the videos of `videos/`. Poses and videos belong to the cameras of their
     names, or, as in Pose2Sim, in alphabetical order to the cameras in the calibration's order.
@@ -364,12 +395,15 @@ def import_pose2sim(
     else:
         notes = [f"cameras: {calibration}"]
         names, source = list(cameras), calibration
+    is_part = calibration is not None and calibration.suffix.lower() == ".xcp"
     poses = _assign(places, names, source, notes) if places else {}
     videos = _assign(films, names, source, notes) if films else {}
     indices = {name: index_frames(file) for name, file in videos.items()}
     for name, file in videos.items():
         if name in cameras:
-            cameras[name] = _fit_to_video(file, cameras[name], indices[name], notes)
+            cameras[name] = _fit_to_video(
+                file, cameras[name], indices[name], notes, is_part=is_part
+            )
     sizes = {name: index.size for name, index in indices.items()}
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
@@ -477,9 +511,10 @@ def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _find_pose2sim_calibration(project: Path) -> Path | None:
-    """Return the calibration of a trial, or else of the folder above it.
+    """Return the calibration of a trial, or else of the folder above it; TOML before others.
 
-    None if there is no calibration but videos, whose cameras are then to be located.
+    Pose2Sim writes its TOML next to the file that it converts. None if there is no calibration but
+    videos, whose cameras are then to be located.
     """
     folders = [
         folder
@@ -488,22 +523,25 @@ def _find_pose2sim_calibration(project: Path) -> Path | None:
         if folder.is_dir() and "calib" in folder.name.lower()
     ]
     for folder in folders:
-        for pattern in ("*.toml", "*.qca.txt"):
-            files = [file for file in sorted(folder.glob(pattern)) if file.is_file()]
-            if len(files) > 1:
-                raise InputError(
-                    str(folder),
-                    expected=f"one calibration {pattern}",
-                    found=", ".join(file.name for file in files),
-                    todo="Move the others elsewhere.",
-                )
-            if files:
-                return files[0]
+        found = calibrations_in(folder)
+        written = [files[0] for form, files in found if form is TOML]
+        if len(written) > 1:
+            raise InputError(
+                str(folder),
+                expected="one calibration *.toml",
+                found=", ".join(file.name for file in written),
+                todo="Move the others elsewhere.",
+            )
+        if written:
+            return written[0]
+        if found:
+            _, files = find_calibration(folder)
+            return files[0] if len(files) == 1 else folder
     if (project / "videos").is_dir():
         return None
     raise InputError(
         str(project),
-        expected="calibration/Calib.toml or calibration/Calib.qca.txt, or videos",
+        expected="calibration/Calib.toml or another form of calibration, or videos",
         found=", ".join(map(str, folders)) or "no folder called calibration",
         todo="Run Pose2Sim.calibration() first.",
     )

@@ -14,7 +14,7 @@ from data_contracts.match import MatchSpec, Side
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.calibration_files import read_calibration_toml
 from worldpose.formats.files import read_yaml
 from worldpose.formats.lens_files import read_lens_toml
 from worldpose.ingest.annotations import (
@@ -47,6 +47,7 @@ class MatchFolder:
         lenses: given lenses without a pose, by id of a static camera; may lack some.
         estimates: monocular body estimates of the broadcast camera, by id of a clip; may lack
             some.
+        boxes: given boxes of people, by id of a static camera or clip with a video; may lack some.
     """
 
     folder: Path
@@ -60,6 +61,7 @@ class MatchFolder:
     key_frames: Mapping[str, KeyFrames]
     lenses: Mapping[str, LensCalibration] = field(default_factory=dict)
     estimates: Mapping[str, Path] = field(default_factory=dict)
+    boxes: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def to_click(self) -> tuple[str, ...]:
@@ -163,6 +165,7 @@ def _read_match(folder: Path) -> MatchFolder:
         key_frames=read_key_frames(folder, spec, pitch),
         lenses=_lenses(folder, spec, calibrations),
         estimates=_estimates(folder, spec),
+        boxes=_boxes(folder, videos, detections),
     )
 
 
@@ -231,7 +234,7 @@ def _calibrations(folder: Path, spec: MatchSpec) -> dict[str, CameraCalibration]
     if not (folder / "calibration.toml").exists():
         return {}
     file = existing_file(folder, "calibration.toml", str(folder))
-    calibrations = read_calibration(file)
+    calibrations = read_calibration_toml(file)
     static = {camera.id: camera for camera in spec.static_cameras}
     extra = [name for name in calibrations if name not in static]
     if extra:
@@ -330,6 +333,23 @@ def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
                 todo="Rename or remove the file, or add the clip to match.yaml.",
             )
         found[file.stem] = existing_file(folder, f"estimates/{file.name}", str(folder))
+    return found
+
+
+def _boxes(
+    folder: Path, videos: Mapping[str, Path], detections: Mapping[str, Path]
+) -> dict[str, Path]:
+    found = {}
+    for file in sorted((folder / "boxes").glob("*.txt")):
+        if file.stem not in videos or file.stem in detections:
+            raise InputError(
+                str(file),
+                expected="a camera or clip with a video and without 2D poses: "
+                + (", ".join(name for name in videos if name not in detections) or "(none)"),
+                found=repr(file.stem),
+                todo="Rename or remove the file, or add the video to match.yaml.",
+            )
+        found[file.stem] = existing_file(folder, f"boxes/{file.name}", str(folder))
     return found
 
 

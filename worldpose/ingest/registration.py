@@ -22,7 +22,7 @@ def register_match(match: MatchFolder, previous: Registration | None) -> Registr
     """Return the match with the SHA-256 of its files, and its identity.
 
     The registration covers match.yaml, calibration.toml, lenses.toml, the pitch file, videos,
-    stills, detections, estimates and annotations; `reference/` is not part of the match. The
+    stills, detections, boxes, estimates and annotations; `reference/` is not part of the match. The
     identity covers only the paths and contents of videos, detections and pitch, so that neither the
     folder's name nor an edited click, still, roster, estimate or calibration changes it.
 
@@ -81,7 +81,7 @@ def _identifying_files(match: MatchFolder) -> set[str]:
 def _further_files(match: MatchFolder) -> set[str]:
     names = ("match.yaml", "calibration.toml", LENS_FILE, "annotations")
     roots = [*(match.folder / name for name in names), *match.stills.values()]
-    roots += match.estimates.values()
+    roots += [*match.estimates.values(), *match.boxes.values()]
     return {path for root in roots for path in _files_under(match.folder, root)}
 
 

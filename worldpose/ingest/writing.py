@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,13 +22,15 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
-from worldpose.formats.files import whole_file
+from worldpose.formats.detection_files import read_boxes
+from worldpose.formats.files import FULL, whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
 from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.validation import require_local, validate_record
+from worldpose.video import FrameIndex, index_video
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,8 @@ def write_match(
         further: called with the temporary match folder, to add videos and `reference/`.
 
     Raises:
-        InputError: the folder exists and is not empty, or the arguments contradict each other.
+        InputError: the folder exists and is not empty, its disk is full, or the arguments
+            contradict each other.
     """
     annotations = annotations or MatchAnnotations()
     clicked, key_frames = annotations.clicked, annotations.key_frames
@@ -79,32 +83,42 @@ def write_match(
         require_local(_still_name(spec, camera_id), f"match.yaml: camera {camera_id}: still")
     _require_empty(folder)
     _make_parent(folder)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
-        # One level down: the temporary folder is private, the match has the usual permissions.
-        building = Path(workshop) / folder.name
-        (building / "detections").mkdir(parents=True)
-        (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
-        if calibrations:
-            write_calibration_toml(building / "calibration.toml", calibrations)
-        for name, people in observations.items():
-            file = building / "detections" / f"{name}.npz"
-            write_keypoint_arrays(file, people)
-            read_keypoint_arrays(file)
-        if pitch is not None:
-            _write_pitch(building, spec, pitch)
-        write_clicked_markings(building, clicked)
-        write_key_frames(building, key_frames)
-        for camera_id, picture in stills.items():
-            write_still(building / _still_name(spec, camera_id), picture)
-        if further is not None:
-            further(building)
-        read_match(building)
-        _sync(building)
-        try:
-            building.rename(folder)  # replaces an empty folder, fails on any other
-        except OSError:
-            _require_empty(folder)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workshop:
+            # One level down: the temporary folder is private, the match has the usual permissions.
+            building = Path(workshop) / folder.name
+            (building / "detections").mkdir(parents=True)
+            (building / "match.yaml").write_text(_yaml(spec), encoding="utf-8")
+            if calibrations:
+                write_calibration_toml(building / "calibration.toml", calibrations)
+            for name, people in observations.items():
+                file = building / "detections" / f"{name}.npz"
+                write_keypoint_arrays(file, people)
+                read_keypoint_arrays(file)
+            if pitch is not None:
+                _write_pitch(building, spec, pitch)
+            write_clicked_markings(building, clicked)
+            write_key_frames(building, key_frames)
+            for camera_id, picture in stills.items():
+                write_still(building / _still_name(spec, camera_id), picture)
+            if further is not None:
+                further(building)
+            read_match(building)
+            _sync(building)
+            try:
+                building.rename(folder)  # replaces an empty folder, fails on any other
+            except OSError:
+                _require_empty(folder)
+                raise
+    except OSError as error:
+        if error.errno not in FULL:
             raise
+        raise InputError(
+            str(folder),
+            expected="space for the match folder",
+            found=error.strerror or str(error),
+            todo="Free some, or choose another place; nothing was written.",
+        ) from error
     _sync_folder(folder.parent)
 
 
@@ -235,3 +249,64 @@ def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:
     validate_record(MatchSpec, yaml.safe_load(text), str(file))
     with whole_file(file) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def import_boxes(boxes: Path, folder: Path) -> dict[str, int]:
+    """Copy boxes of people into a match folder; return the number of each camera or clip.
+
+    Args:
+        boxes: folder with `<camera>.txt` or `<clip>.txt` (`read_boxes`).
+        folder: the match folder, with the videos.
+
+    Raises:
+        InputError: a file is invalid, its camera has no video, or has 2D poses or boxes already;
+            nothing is written then.
+    """
+    match = read_match(folder)
+    open_to = {name for name in match.videos if name not in match.detections}
+    known = sorted(name for name in match.boxes if (boxes / f"{name}.txt").exists())
+    if known:
+        raise InputError(
+            str(folder / "boxes" / f"{known[0]}.txt"),
+            expected=f"no boxes of {known[0]} yet",
+            found="a file",
+            todo="Remove it first.",
+        )
+    asked = [file.stem for file in sorted(boxes.glob("*.txt"))]
+    indices = {name: index_video(match.videos[name]) for name in asked if name in open_to}
+    return copy_boxes(boxes, {name: indices.get(name) for name in open_to}, folder)
+
+
+def copy_boxes(
+    boxes: Path, indices: Mapping[str, FrameIndex | None], folder: Path
+) -> dict[str, int]:
+    """Check all files of boxes against the videos, then copy them; return their numbers.
+
+    Args:
+        boxes: folder with a file of boxes for some of the cameras.
+        indices: frames of the video of each camera that may have boxes.
+        folder: the match folder.
+
+    Raises:
+        InputError: there are no files, one of an unknown camera, or an invalid one.
+    """
+    files = [file for file in sorted(boxes.glob("*.txt")) if not file.name.startswith(".")]
+    other = [file.name for file in files if file.stem not in indices]
+    if not files or other:
+        raise InputError(
+            str(boxes),
+            expected="<camera>.txt of cameras with a video and without 2D poses: "
+            + (", ".join(sorted(indices)) or "(none)"),
+            found=", ".join(other) or "no .txt file",
+            todo="Rename the files as the cameras.",
+        )
+    counts = {}
+    for file in files:
+        index = indices[file.stem]
+        assert index is not None
+        counts[file.stem] = len(read_boxes(file, index.size, len(index)).frame)
+    (folder / "boxes").mkdir(exist_ok=True)
+    for file in files:
+        with whole_file(folder / "boxes" / file.name) as draft:
+            shutil.copyfile(file, draft)
+    return counts

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
 
@@ -73,8 +73,11 @@ ROUNDS: Final = 6
 """Most rounds of whole and remaining offsets."""
 RUNNING_M_S: Final = 1.0
 """Least speed of people whose places tell clocks [m/s]."""
+GROUPS: Final = 6
+"""Most groups of cameras that are left out in turn; more cost more time than they tell."""
 SEED: Final = 0
 UNCLEAR: Final = "no offset stands out: its people move too little, or no other camera shows them"
+UNSURE: Final = "its people move too little, or other cameras contradict each other about it"
 WINDOW_S: Final = 0.5
 """Length of an interval [s]; a person's errors within an interval count as one."""
 UNKNOWN_CLOCK: Final = 10.0
@@ -159,7 +162,7 @@ def synchronize(
         known &= std <= MAX_ERROR
         known &= np.abs(late - whole) <= MAX_SPAN
     for camera in np.flatnonzero(~known & np.isfinite(span)):
-        reasons[camera] = "its people move too little"
+        reasons[camera] = UNSURE
     std[~known] = np.inf
     if not known.any() and pitch is not None:
         late, std = _compare_places(cameras, detections, fps, pitch, max_offset_s)
@@ -224,7 +227,50 @@ def _refine(
         late = steps + rest
         if (np.rint(late) == steps).all():
             break
-    return late, error
+    return late, np.hypot(error, _disagreement(cameras, people, fps, rest, error))
+
+
+def _disagreement(
+    cameras: Camera, people: KeypointDetections, fps: float, late: Floats, error: Floats
+) -> Floats:
+    """Return the standard error of each offset from the choice of the other cameras [frame].
+
+    Other errors of an offset are the same at all times and in all people, such as a place of the
+    camera that is not where the calibration has it, and no scatter shows them. But they are not
+    the same towards all other cameras. The standard error is that of the jackknife over groups of
+    cameras, of the part of each change that the smaller number of cameras does not explain.
+
+    Args:
+        cameras: batch (cameras,).
+        people: detections of tracked people, shifted by whole frames.
+        fps: frames per second [1/s].
+        late: (cameras,) offsets found with all cameras [frame].
+        error: (cameras,) their standard errors [frame].
+
+    Returns:
+        (cameras,), 0 where fewer than two groups of other cameras tell the offset.
+    """
+    count = len(late)
+    group = np.arange(count) % min(count, GROUPS)
+    changes = np.full((int(group.max()) + 1, count), np.nan)
+    for one in range(len(changes)):
+        rest = np.flatnonzero(group != one)
+        if len(rest) < 2:
+            continue
+        arrays = {name: array[:, rest] for name, array in people.arrays().items()}
+        index = people.detection_index[:, rest]
+        seen = replace(people.with_arrays(arrays, people.frame), detection_index=index)
+        found, uncertain = _estimate_fractions(cameras[rest], seen, fps)
+        told = np.isfinite(uncertain) & np.isfinite(error[rest])
+        if np.count_nonzero(told) < 2:
+            continue
+        rest, found, uncertain = rest[told], found[told], uncertain[told]
+        change = found - found.mean() - (late[rest] - late[rest].mean())
+        explained = np.maximum(uncertain**2 - error[rest] ** 2, 0.0)
+        changes[one, rest] = np.maximum(change**2 - explained, 0.0)
+    known = np.isfinite(changes).sum(axis=0)
+    total = np.nansum(changes, axis=0) * (known - 1) / np.maximum(known, 1)
+    return np.asarray(np.where(known >= 2, np.sqrt(np.maximum(total, 0.0)), 0.0))
 
 
 def _estimate_fractions(

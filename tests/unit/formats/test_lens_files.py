@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import read_calibration
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
 
 MATRIX = np.array([[1400.0, 0.0, 970.0], [0.0, 1404.0, 530.0], [0.0, 0.0, 1.0]])

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats.calibration_files import read_calibration, write_calibration_toml
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_forms import read_calibration
 
 ANIPOSE = """
 [cam_0]

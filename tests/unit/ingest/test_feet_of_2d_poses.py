@@ -12,8 +12,8 @@ from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import StoredArray, _align_points
 from worldpose.errors import InputError
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.formats.openpose_files import read_openpose_folder
 from worldpose.store.groups import checked_arrays, checked_attributes
 
 PLACES = {

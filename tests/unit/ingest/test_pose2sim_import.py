@@ -12,7 +12,7 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats.openpose_files import read_openpose_folder
+from worldpose.formats.detection_files import read_openpose_folder
 from worldpose.ingest import import_pose2sim, read_calibration, read_match, write_calibration_toml
 from worldpose.ingest.footage import read_unit
 from worldpose.video import write_video
@@ -141,6 +141,25 @@ def test_a_resized_video_scales_the_calibration(trial, tmp_path):
     assert "cam02.mp4: 544 x 960 px, calibrated are 1088 x 1920: the calibration is scaled" in str(
         notes
     )
+
+
+XCP = """<Cameras><Camera DEVICEID="{}" ISDV="1" SENSOR_SIZE="1088 1920"><KeyFrames>
+<KeyFrame FOCAL_LENGTH="1500" ORIENTATION="0 0 0 1" POSITION="{} 0 0" PRINCIPAL_POINT="540 960"
+ VICON_RADIAL="0 0"/></KeyFrames></Camera>{}</Cameras>"""
+
+
+def test_a_smaller_video_of_vicon_is_the_middle_of_the_sensor(trial, tmp_path):
+    (trial / "calibration" / "Calib.toml").unlink()
+    one, two = (XCP.format(name, 5000.0 * x, "") for x, name in enumerate(CAMERAS))
+    text = one.replace("</Cameras>", two.removeprefix("<Cameras>"))
+    (trial / "calibration" / "Calib.xcp").write_text(text)
+    film(trial, (1088, 1080))
+    _, notes = import_pose2sim(trial, tmp_path / "m")
+    found = read_calibration(tmp_path / "m" / "calibration.toml")["cam02"]
+    assert (found.image_size, found.focal_px) == ((1088, 1080), (1500.0, 1500.0))
+    assert found.principal_point_px == (540.0, 540.0)
+    assert found.translation == (-5.0, 0.0, 0.0)
+    assert "cam02.mp4: the middle 1088 x 1080 px of the sensor" in notes
 
 
 def test_black_bars_shift_the_calibration(trial, tmp_path):

@@ -20,8 +20,12 @@ from worldpose.formats.annotations.annotated_images import (
     coco_bytes,
     read_coco,
 )
-from worldpose.formats.annotations.cvat import cvat_bytes, read_cvat
-from worldpose.formats.annotations.label_studio import label_studio_bytes, read_label_studio
+from worldpose.formats.annotations.programs import (
+    cvat_bytes,
+    label_studio_bytes,
+    read_cvat,
+    read_label_studio,
+)
 
 __all__ = [
     "FORMATS",

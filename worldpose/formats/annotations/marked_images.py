@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from data_contracts.arrays import Floats
 from worldpose.errors import InputError
 from worldpose.formats.annotations.annotated_images import CORNER, ContentError
-from worldpose.formats.annotations.cvat import read_xml
+from worldpose.formats.annotations.programs import read_xml
 
 MAX_BYTES: Final = 1 << 26
 """Maximum file size [bytes]."""

@@ -13,22 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel
-from worldpose.formats.baselines.fields import (
+from worldpose.formats.baselines.result import (
+    MethodResult,
+    Track,
     as_floats,
+    boxes_around,
     floats,
     format_error,
     get_part,
     integer,
     integers,
-    read_pickled,
-    require_ascending,
-)
-from worldpose.formats.baselines.result import (
-    MethodResult,
-    Track,
-    boxes_around,
     merge_people,
     pose_track,
+    read_pickled,
+    require_ascending,
     rotation_vectors,
 )
 

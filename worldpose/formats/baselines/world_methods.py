@@ -15,23 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldpose.body import BodyModel, is_open_body
-from worldpose.formats.baselines.fields import (
+from worldpose.formats.baselines.result import (
+    MethodResult,
+    Track,
+    boxes_around,
     floats,
     format_error,
     get_part,
     integer,
     integers,
-    read_arrays,
-    read_pickled,
-    require_ascending,
-)
-from worldpose.formats.baselines.result import (
-    MethodResult,
-    Track,
-    boxes_around,
     merge_people,
     pose_track,
     project_boxes,
+    read_arrays,
+    read_pickled,
+    require_ascending,
     rotation_vectors,
 )
 from worldpose.formats.joints_file import read_poses

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.baselines.fields import as_floats, integer, read_pickled
+from worldpose.formats.baselines.result import as_floats, integer, read_pickled
 
 rng = np.random.default_rng(0)
 CONTENT = {
@@ -174,7 +174,7 @@ def test_too_little_memory_is_no_fault_of_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr("worldpose.formats.baselines.fields.plain", full)
+    monkeypatch.setattr("worldpose.formats.baselines.result.plain", full)
     with pytest.raises(MemoryError):
         read_pickled(tmp_path / "a.pkl")
 

@@ -1,4 +1,7 @@
-"""2D poses in OpenPose's JSON, one file per frame, as OpenPose and Pose2Sim write them."""
+"""Detections of other programs: 2D poses in OpenPose's JSON, and boxes in MOTChallenge's text.
+
+OpenPose and Pose2Sim write one file per frame, trackers such as ByteTrack one line per box.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
-from worldpose.formats.files import read_json
+from worldpose.formats.files import read_json, require_file
 from worldpose.formats.keypoint_files import COORDINATE_LIMIT, PEOPLE_LIMIT
 
 KEYPOINTS_KEY: Final = "pose_keypoints_2d"
@@ -39,6 +42,12 @@ PLACES: Final = {
     136: PointOrder("HALPE-136", tuple(range(17)), (20, 22, 24, 21, 23, 25)),
 }
 """Sets of keypoints by their size."""
+BOX_BYTES: Final = 1 << 28
+"""Maximum size of a file of boxes [byte]: that of 22 people in an hour has 200 MB."""
+BOX_COLUMNS: Final = range(6, 11)
+"""Numbers in a line of boxes: those of a result are 10, of MOTChallenge's truth 9."""
+PEDESTRIAN: Final = 1
+"""Class of people in MOTChallenge's truth."""
 _NUMBER: Final = re.compile(r"(\d+)(?:_keypoints)?\.json")
 
 
@@ -172,3 +181,122 @@ def _read_person(where: str, person: Any) -> NDArray[np.float64]:  # noqa: ANN40
             todo="Estimate the poses of this frame again.",
         )
     return values
+
+
+class GivenBoxes(NamedTuple):
+    """Boxes of people in one video, as a tracker gave them, sorted by frame."""
+
+    frame: NDArray[np.int64]
+    """(boxes,) frame of the video, from 0."""
+    person: NDArray[np.int64]
+    """(boxes,) the tracker's id; -1 without one."""
+    box: NDArray[np.float64]
+    """(boxes, 4) x0, y0, x1, y1 [px]; (0, 0) is the centre of the top-left pixel."""
+    score: NDArray[np.float64]
+    """(boxes,) in (0, 1]."""
+
+
+def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
+    """Return the boxes of a MOTChallenge text.
+
+    A line is frame, id, left, top, width, height, and up to four more numbers: confidence (-1 is
+    taken as 1, and a box of confidence 0 is not counted, as in MOTChallenge's truth) and, in truth
+    of nine numbers, the class, of which 1 is a person. Frames begin at 1, and (1, 1) is the upper
+    left corner of the image.
+
+    Args:
+        file: the text.
+        size: width and height of the video [px].
+        frames: number of frames of the video.
+
+    Raises:
+        InputError: the file is unreadable or empty, a line has no such numbers, a frame that the
+            video lacks, an id twice in a frame, an empty box, a box outside of the image, or an
+            impossible confidence; the error names the line.
+    """
+    lines, rows = _read_rows(file)
+    frame, person, box = rows[:, 0], rows[:, 1], rows[:, 2:6]
+    corner = box[:, :2] - 1.5
+    boxes = np.concatenate([corner, corner + box[:, 2:]], axis=1)
+    score = rows[:, 6] if rows.shape[1] > 6 else np.full(len(rows), -1.0)
+    kept = score != 0.0
+    if rows.shape[1] == 9:
+        kept &= rows[:, 7] == PEDESTRIAN
+    pairs = np.stack([frame, person], axis=1)
+    order = np.lexsort((np.arange(len(rows)), person, frame))
+    again = np.zeros(len(rows), np.bool_)
+    again[order[1:]] = (pairs[order[1:]] == pairs[order[:-1]]).all(axis=1)
+    far = np.array(size) - 0.5
+    most = f"a frame from 1 to {frames}, as many as the video has"
+    for wrong, key, expected in (
+        (~np.isfinite(rows).all(axis=1), "", "finite numbers"),
+        ((frame != np.round(frame)) | (frame < 1), "frame", most + "; add 1 if they begin at 0"),
+        (frame > frames, "frame", most),
+        ((person != np.round(person)) | (np.abs(person) > FRAME_LIMIT), "id", "a whole number"),
+        (again & kept & (person >= 0), "id", "each id once in a frame"),
+        ((box[:, 2:] <= 0.0).any(axis=1), "width, height", "more than 0 px"),
+        (
+            kept & ((boxes[:, :2] >= far) | (boxes[:, 2:] <= -0.5)).any(axis=1),
+            "left, top, width, height",
+            f"a box in the image of {size[0]} x {size[1]} px",
+        ),
+        (
+            (score > 1.0) | ((score < 0.0) & (score != -1.0)),
+            "confidence",
+            "0 to 1, or -1",
+        ),
+    ):
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            number, text = lines[row]
+            raise InputError(
+                f"{file}: line {number}{': ' if key else ''}{key}",
+                expected=expected,
+                found=f"{text!r:.80}",
+                todo="Correct the file, or write it again.",
+            )
+    chosen = order[kept[order]]
+    return GivenBoxes(
+        frame[chosen].astype(np.int64) - 1,
+        np.maximum(person[chosen].astype(np.int64), -1),
+        boxes[chosen],
+        np.where(score[chosen] == -1.0, 1.0, score[chosen]),
+    )
+
+
+def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
+    """Return the number and text of each line that is not empty, and its numbers."""
+    size = require_file(file)
+
+    def wrong(where: str, expected: str, found: str) -> InputError:
+        return InputError(
+            where,
+            expected=expected,
+            found=found,
+            todo="Write lines of MOTChallenge: frame,id,left,top,width,height,confidence.",
+        )
+
+    if size > BOX_BYTES:
+        raise wrong(str(file), f"at most {BOX_BYTES} bytes", f"{size}")
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise wrong(str(file), "text", str(error)) from error
+    lines = [(n, each) for n, each in enumerate(text.splitlines(), 1) if each.strip()]
+    if not lines:
+        raise wrong(str(file), "boxes", "an empty file")
+    count = lines[0][1].count(",") + 1
+    for number, each in lines:
+        if each.count(",") + 1 != count or count not in BOX_COLUMNS:
+            raise wrong(
+                f"{file}: line {number}",
+                f"{count if count in BOX_COLUMNS else '6 to 10'} numbers, separated by commas",
+                f"{each!r:.80}",
+            )
+    try:
+        rows = np.loadtxt([each for _, each in lines], delimiter=",", ndmin=2, comments=None)
+    except ValueError as error:
+        row = re.search(r"at row (\d+)", str(error))
+        number, each = lines[int(row[1])] if row else lines[0]
+        raise wrong(f"{file}: line {number}", "numbers", f"{each!r:.80}") from error
+    return lines, rows

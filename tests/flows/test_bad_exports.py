@@ -1,0 +1,235 @@
+"""An export that fails is one error and leaves nothing behind; strange results are written."""
+
+import errno
+import json
+import os
+import re
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import TINY, worldpose
+from test_release_formats import bodies, match_folder, origin, tracked
+
+from flows.results import export as export_module
+from flows.results.export import EXPORTS, export
+from worldpose.errors import InputError, UsageError, WorldposeError
+
+__all__ = ["match_folder"]  # a fixture
+
+NEEDS_PACKAGE = {"usd": "usd-core", "rerun": "rerun-sdk"}
+
+
+def whole():
+    """Return the results of a run: one static camera, the broadcast camera, two people."""
+    results = tracked()
+    inliers = np.ones((4, 2, 1, 17), np.bool_)
+    results["triangulation__A_1"]["inliers"] = (("frame", "person", "camera", "joint"), inliers)
+    results["triangulation__A_1"] = results["triangulation__A_1"].assign_coords(camera=["north"])
+    results["broadcast_calibration__A_1"].attrs["pitch"] = None
+    return results
+
+
+def few(people=slice(None), frames=slice(None)):
+    """Return the results of a run with a part of the people and frames."""
+    results = {}
+    for name, data in whole().items():
+        if "person" in data.sizes:
+            data = data.isel(person=people)
+        if "frame" in data.sizes and not name.startswith("broadcast"):
+            data = data.isel(frame=frames)
+        if name.startswith("tracking"):
+            kept = data["person"].values.tolist()
+            data.attrs["tracks"] = [t for t in data.attrs["tracks"] if t["person"] in kept]
+        results[name] = data
+    return results
+
+
+def without_joints():
+    """Return results in which no joint of anybody is known."""
+    results = whole()
+    for name in ("triangulation__A_1", "body_fitting__A_1"):
+        data = results[name].copy(deep=True)
+        data["joints"][:] = np.nan
+        if "transl" in data:
+            data["transl"][:] = np.nan
+        results[name] = data
+    return results
+
+
+CASES = {
+    "gaps": whole,
+    "nobody": lambda: few(people=[]),
+    "one person": lambda: few(people=[1]),
+    "one frame": lambda: few(frames=[0]),
+    "no joint": without_joints,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("form", EXPORTS)
+def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, case):
+    out = tmp_path / "out"
+    try:
+        written = export(origin(match_folder, **CASES[case]()), [form], out)
+    except WorldposeError as error:
+        assert "expected" in str(error)
+        assert not out.exists(), "an error leaves nothing"
+    else:
+        assert all(path.is_file() for path in written)
+        # MOTChallenge's file of nobody is empty.
+        assert form == "tracks" or all(path.stat().st_size for path in written)
+        assert len(set(written)) == len(written)
+        assert all(path.is_relative_to(out) for path in written)
+        there = [path for path in out.rglob("*") if path.is_file()]
+        assert set(there) == set(written), "no draft is left"
+
+
+@pytest.mark.parametrize("form", EXPORTS)
+def test_a_run_without_results_is_refused(match_folder, tmp_path, form):
+    with pytest.raises(WorldposeError, match="expected"):
+        export(origin(match_folder), [form], tmp_path / "new" / "out")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_later_format_that_fails_leaves_the_earlier_ones_out(match_folder, tmp_path):
+    results = {name: data for name, data in tracked().items() if "broadcast" not in name}
+    run = origin(match_folder, **results)
+    with pytest.raises(WorldposeError, match="broadcast_calibration/A_1"):
+        export(run, ["joints", "csv", "challenge"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    export(run, ["csv"], tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    with pytest.raises(WorldposeError, match="broadcast_calibration/A_1"):
+        export(run, ["joints", "csv", "challenge"], tmp_path / "out")
+    after = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert after == before
+
+
+def test_an_export_is_repeated_into_its_folder_and_joined_by_others(match_folder, tmp_path):
+    run = origin(match_folder, **tracked())
+    first = export(run, ["joints"], tmp_path / "out")
+    (tmp_path / "out" / "mine.txt").write_text("kept")
+    (tmp_path / "out" / "frame_rates.json").write_text('{"other": 25.0}')
+    assert export(run, ["joints", "csv"], tmp_path / "out")[:1] == first[:1]
+    assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
+    rates = json.loads((tmp_path / "out" / "frame_rates.json").read_text())
+    assert rates == {"other": 25.0, "A_1": 50.0}
+    mode = stat.S_IMODE((tmp_path / "out" / "joints.npz").stat().st_mode)
+    (tmp_path / "usual").write_text("")
+    assert mode == stat.S_IMODE((tmp_path / "usual").stat().st_mode)
+    (tmp_path / "folder").mkdir()
+    assert stat.S_IMODE((tmp_path / "out" / "tables").stat().st_mode) == stat.S_IMODE(
+        (tmp_path / "folder").stat().st_mode
+    )
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_disk_that_refuses_is_named_and_nothing_is_left(
+    match_folder, tmp_path, monkeypatch, code
+):
+    run = origin(match_folder, **tracked())
+
+    def fail(origin, out):
+        (out / "half.txt").write_text("half")
+        raise OSError(code, os.strerror(code), str(out / "half.txt"))
+
+    monkeypatch.setitem(export_module.EXPORTS, "csv", fail)
+    with pytest.raises(InputError, match=f"found {os.strerror(code)}.*nothing was written") as told:
+        export(run, ["joints", "csv"], tmp_path / "new" / "out")
+    assert str(tmp_path / "new" / "out") in told.value.where
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_fault_elsewhere_is_not_blamed_on_the_folder(match_folder, tmp_path, monkeypatch):
+    def fail(origin, out):
+        raise FileNotFoundError(errno.ENOENT, "gone", "/somewhere/else")
+
+    monkeypatch.setitem(export_module.EXPORTS, "csv", fail)
+    with pytest.raises(FileNotFoundError, match="gone"):
+        export(origin(match_folder, **tracked()), ["csv"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_target_of_another_kind_is_refused(match_folder, tmp_path):
+    run = origin(match_folder, **tracked())
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "page.html").mkdir()
+    (tmp_path / "out" / "joints.npz").mkdir(parents=True)
+    for out, form, found in (
+        (tmp_path / "file", "joints", "found a file"),
+        (tmp_path / "file" / "below", "joints", "found "),
+        (tmp_path / "page.html", "viewer", "found a folder"),
+        (tmp_path / "out", "joints", "joints.npz: .* found a folder"),
+        (Path("/proc/nothing/out"), "joints", "found "),
+    ):
+        with pytest.raises(InputError, match=found) as refused:
+            export(run, [form], out)
+        assert "--out" in refused.value.where and "nothing was written" in refused.value.todo
+    assert (tmp_path / "file").read_text() == "mine"
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["joints.npz"]
+
+
+@pytest.mark.parametrize("form", NEEDS_PACKAGE)
+def test_a_missing_package_is_named(match_folder, tmp_path, monkeypatch, form):
+    for name in ("pxr", "rerun"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UsageError, match=NEEDS_PACKAGE[form]):
+        export(origin(match_folder, **whole()), [form], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_broken_body_of_one_person_does_not_spoil_the_other(match_folder, tmp_path):
+    results = tracked()
+    fits = bodies()
+    fits["transl"][:, 0] = np.nan
+    for name in ("joints", "covariance"):
+        fits[name] = results["body_fitting__A_1"][name]
+    results["body_fitting__A_1"] = fits
+    for form in ("gltf", "bvh", "mot", "worldpose"):
+        assert export(origin(match_folder, **results), [form], tmp_path / form)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("nobody", "--format", "joints"), 1, "match nobody: expected a match folder or one of"),
+        (("MATCH", "--format", "excel"), 2, "--format excel: expected one of joints"),
+        (("MATCH", "--format", "joints", "--run", "0009"), 1, "run 0009 .*found no such run"),
+        (("MATCH", "--format", "joints", "--stage", "sleep"), 2, "--stage sleep: expected a resu"),
+        (("MATCH", "--format", "challenge", "--format", "worldpose"), 2, "different file names"),
+        (("MATCH", "--format", "joints", "--video"), 2, "expected --format viewer"),
+        (("MATCH", "--format", "gltf", "--licence", "absent.txt"), 1, "--licence absent.txt: exp"),
+        (("MATCH", "--format", "gltf", "--licence", "BINARY"), 1, "--licence .*: expected the te"),
+        (("MATCH", "--format", "gltf", "--licence", "EMPTY"), 1, "--licence .*found nothing"),
+        (("MATCH", "--format", "joints", "--release", "one"), 2, "expected --licence FILE"),
+        (("MATCH", "--format", "joints", "--out", "EMPTY"), 1, "--out .*found a file"),
+        (("MATCH", "--format", "joints", "--out", "page.html"), 2, "expected a folder; a file onl"),
+    ],
+)
+def test_the_command_says_one_thing_and_writes_nothing(
+    tiny_run, tmp_path, monkeypatch, arguments, code, message
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "empty.txt").write_bytes(b"")
+    words = {"MATCH": TINY, "BINARY": "binary.txt", "EMPTY": "empty.txt"}
+    asked = [words.get(each, each) for each in arguments]
+    asked += [] if "--out" in asked else ["--out", "out"]
+    answer = worldpose("export", *asked, "--project", tiny_run)
+    assert answer.code == code, answer.err
+    assert re.search(message, answer.err)
+    assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
+    assert {path.name for path in tmp_path.iterdir()} == {"binary.txt", "empty.txt"}
+
+
+@pytest.mark.parametrize("form", ["joints", "gltf", "viewer", "csv"])
+def test_a_run_that_did_not_finish_is_refused(ingested, tmp_path, form):
+    answer = worldpose(
+        *("export", TINY, "--format", form, "--out", tmp_path / "out", "--project", ingested)
+    )
+    assert answer.code in (1, 2), answer.err
+    assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
+    assert not (tmp_path / "out").exists()

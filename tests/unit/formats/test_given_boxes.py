@@ -1,0 +1,91 @@
+"""Boxes of people in MOTChallenge's text."""
+
+import numpy as np
+import pytest
+
+from worldpose.errors import InputError
+from worldpose.formats.baselines.result import write_tracks
+from worldpose.formats.detection_files import read_boxes
+
+SIZE = (640, 480)
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read_text(text, size=SIZE, frames=100):
+        file = tmp_path / "left.txt"
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_boxes(file, size, frames)
+
+    return read_text
+
+
+def test_lines_become_boxes_sorted_by_frame(read):
+    found = read("2,7,11.5,21.5,10,20,0.9,-1,-1,-1\n\n1,3,1.5,1.5,4,8,-1,-1,-1,-1\r\n")
+    assert found.frame.tolist() == [0, 1]
+    assert found.person.tolist() == [3, 7]
+    # (1, 1) there is the corner of the first pixel, (0, 0) here its centre.
+    np.testing.assert_allclose(found.box, [[0.0, 0.0, 4.0, 8.0], [10.0, 20.0, 20.0, 40.0]])
+    np.testing.assert_allclose(found.score, [1.0, 0.9])
+
+
+def test_our_own_tracks_are_read_back(tmp_path):
+    rng = np.random.default_rng(3)
+    corner = rng.uniform(0, 300, (5, 3, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(5, 100, (5, 3, 2))], axis=-1)
+    boxes[2, 1] = np.nan
+    write_tracks(tmp_path / "t.txt", boxes, np.array([0, 4, 9]))
+    found = read_boxes(tmp_path / "t.txt", SIZE, 5)
+    np.testing.assert_allclose(found.box, boxes[np.isfinite(boxes).all(-1)], atol=0.0101)
+    assert found.person.tolist() == [1, 5, 10] * 2 + [1, 10] + [1, 5, 10] * 2
+
+
+@pytest.mark.parametrize("end", ["", ",0.5", ",0.5,-1", ",0.5,-1,-1,-1"])
+def test_six_to_ten_numbers_are_read(read, end):
+    assert read(f"1,1,10,10,5,5{end}\n").score.tolist() == [0.5 if end else 1.0]
+
+
+def test_truth_has_a_class_and_boxes_that_do_not_count(read):
+    text = "1,1,10,10,5,5,1,1,0.8\n1,2,10,10,5,5,1,7,0.8\n1,3,10,10,5,5,0,1,0.8\n"
+    assert read(text).person.tolist() == [1]
+
+
+def test_detections_without_ids_may_share_a_frame(read):
+    assert read("1,-1,10,10,5,5,0.4\n1,-1,30,10,5,5,0.5\n").person.tolist() == [-1, -1]
+
+
+def test_a_box_may_reach_over_the_border(read):
+    assert read("1,1,-5,-5,10,10,1\n1,2,635,470,50,50,1\n").box.shape == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected boxes, found an empty file"),
+        ("\n \n", "expected boxes, found an empty file"),
+        (b"\x80\xff\x00" * 20, "expected text"),
+        ("a,b,c,d,e,f\n", "line 1: expected numbers, found 'a,b,c,d,e,f'"),
+        ("1,1,10,10,5,5,1\n\n1,1,x,10,5,5,1\n", "line 3: expected numbers"),
+        ("1 1 10 10 5 5\n", "line 1: expected 6 to 10 numbers, separated by commas"),
+        ("1,1,10,10,5,5,1\n2,1,10,10,5\n", "line 2: expected 7 numbers"),
+        ("1,1,10,10,5,5,1,2,3,4,5\n", "line 1: expected 6 to 10 numbers"),
+        ("1,1,10,10,5,nan,1\n", "line 1: expected finite numbers"),
+        ("1,1,10,10,5,inf,1\n", "line 1: expected finite numbers"),
+        ("0,1,10,10,5,5,1\n", "line 1: frame: expected a frame from 1 to 100.*begin at 0"),
+        ("1.5,1,10,10,5,5,1\n", "line 1: frame: expected"),
+        ("1,1,10,10,5,5,1\n101,1,10,10,5,5,1\n", "line 2: frame: expected a frame from 1 to 100"),
+        ("1e300,1,10,10,5,5,1\n", "line 1: frame: expected a frame from 1 to 100"),
+        ("1,1.5,10,10,5,5,1\n", "line 1: id: expected a whole number"),
+        ("1,4,10,10,5,5,1\n1,4,50,10,5,5,1\n", "line 2: id: expected each id once in a frame"),
+        ("1,1,10,10,0,5,1\n", "line 1: width, height: expected more than 0 px"),
+        ("1,1,10,10,5,-5,1\n", "line 1: width, height: expected more than 0 px"),
+        ("1,1,700,10,5,5,1\n", "line 1: left, .*: expected a box in the image of 640 x 480 px"),
+        ("1,1,10,-50,5,5,1\n", "line 1: left, .*: expected a box in the image"),
+        ("1,1,10,10,5,5,87\n", "line 1: confidence: expected 0 to 1"),
+        ("1,1,10,10,5,5,-0.5\n", "line 1: confidence: expected 0 to 1"),
+    ],
+)
+def test_a_bad_line_is_refused_with_its_number(read, text, message):
+    with pytest.raises(InputError, match=message) as refused:
+        read(text)
+    assert "left.txt" in str(refused.value)

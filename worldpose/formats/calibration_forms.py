@@ -1,0 +1,400 @@
+"""Calibrations of all forms: which form a file or folder has, and those of one file per camera.
+
+`FORMS` lists the forms. OpenCap and bioCV have a file per camera, EasyMocap has one file of lenses
+and one of poses; a folder then stands for all of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import (
+    MILLIMETRE,
+    Keys,
+    calibration_error,
+    index_by_name,
+    read_calibration_toml,
+    read_camera_table,
+)
+from worldpose.formats.calibration_systems import read_calibration_xml
+from worldpose.formats.files import SETTINGS_BYTES, require_file
+from worldpose.formats.lens_files import read_file_storage
+
+if TYPE_CHECKING:
+    from worldpose.geometry import Camera
+
+OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
+"""Stem of OpenCap's files; the folder of each is called as the camera."""
+
+OPENCAP_KEYS: Final = Keys("imageSize", "intrinsicMat", "distortion", "rotation", "translation")
+
+UPRIGHT: Final = 0.75
+"""Minimum mean cosine between the cameras' downward axes and the vertical [1]: phones that are
+tilted by 40 degrees."""
+
+STANDING: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+"""(3, 3) from a board whose y points down to a world with z up."""
+
+ON_ITS_HEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""(3, 3) from a board whose y points up."""
+
+LYING: Final = np.diag([1.0, -1.0, -1.0])
+"""(3, 3) from a board on the ground, whose z points into it."""
+
+VIDEOS: Final = (".mp4", ".avi", ".mov", ".mkv")
+"""Ends of a video's name, which bioCV puts before its own."""
+
+
+class Form(NamedTuple):
+    """A form of calibrations."""
+
+    name: str
+    """Programs that write it."""
+    endings: tuple[str, ...]
+    """How the names of its files end; the first one tells the form without doubt."""
+    unit: str
+    """Unit of positions, and the axis that points up."""
+    read: Callable[[tuple[Path, ...]], dict[str, CameraCalibration]]
+    """Reads its files."""
+
+
+def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """Return the cameras of a calibration by name, in file order.
+
+    Args:
+        path: file or folder as in `read_calibration`.
+
+    Raises:
+        InputError: an unknown form, or an invalid entry, with file and key.
+    """
+    from worldpose.geometry import Camera  # late: most commands only check calibrations
+
+    given = read_calibration(Path(path))
+    return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}
+
+
+def read_calibration(path: Path) -> dict[str, CameraCalibration]:
+    """Return the cameras of a calibration by name, in file order.
+
+    Args:
+        path: a file of one of `FORMS`, or a folder that has one calibration.
+
+    Raises:
+        InputError: an unknown form, a folder with no calibration or several, or an invalid entry,
+            with file and key.
+    """
+    form, files = find_calibration(path) if path.is_dir() else _form_of(path)
+    return form.read(files)
+
+
+def find_calibration(folder: Path) -> tuple[Form, tuple[Path, ...]]:
+    """Return the form and the files of the one calibration in a folder.
+
+    Raises:
+        InputError: there is none, or more than one; the error lists them.
+    """
+    found = calibrations_in(folder)
+    if len(found) == 1:
+        return found[0]
+    listed = "; ".join(
+        f"{files[0].name}{f' and {len(files) - 1} more' if len(files) > 1 else ''} ({form.name})"
+        for form, files in found
+    )
+    raise InputError(
+        str(folder),
+        expected="one calibration: " + _list_forms(),
+        found=listed or "none",
+        todo="Give the file that is meant, or move the others elsewhere."
+        if found
+        else "Export the calibration in one of these forms.",
+    )
+
+
+def calibrations_in(folder: Path) -> list[tuple[Form, tuple[Path, ...]]]:
+    """Return the form and the files of every calibration in a folder, TOML files first.
+
+    OpenCap's files may be in folders named after the cameras, as in its sessions.
+    """
+    files = [
+        file
+        for file in sorted(folder.iterdir())
+        if file.is_file() and not file.name.startswith(".") and file.name != "Config.toml"
+    ]
+    nested = sorted(folder.glob(f"*/{OPENCAP_NAME}.pickle"))
+    sets: dict[str, tuple[Path, ...]] = {
+        OPENCAP.name: tuple(f for f in files if f.suffix.lower() in OPENCAP.endings)
+        or tuple(nested),
+        EASYMOCAP.name: tuple(f for f in files if _is_easymocap(f)),
+        BIOCV.name: tuple(f for f in files if f.suffix.lower() in BIOCV.endings),
+    }
+    found: list[tuple[Form, tuple[Path, ...]]] = [
+        (form, (file,))
+        for form in (TOML, QUALISYS, VICON, OPTITRACK)
+        for file in files
+        if file.name.lower().endswith(form.endings[0])
+    ]
+    return found + [(form, sets[form.name]) for form in FORMS if sets.get(form.name)]
+
+
+def _list_forms() -> str:
+    return ", ".join(f"{' and '.join(form.endings[:2])} ({form.name})" for form in FORMS).replace(
+        ".qca.txt and .txt", ".qca.txt"
+    )
+
+
+def _is_easymocap(file: Path) -> bool:
+    return file.suffix.lower() in (".yml", ".yaml") and file.stem.lower().startswith(
+        ("intri", "extri")
+    )
+
+
+def _form_of(path: Path) -> tuple[Form, tuple[Path, ...]]:
+    """Return the form and the files of a calibration, from the name of one of its files."""
+    require_file(path)
+    suffix = path.suffix.lower()
+    if _is_easymocap(path):
+        return EASYMOCAP, tuple(f for f in sorted(path.parent.iterdir()) if _is_easymocap(f))
+    for form in FORMS:
+        if suffix in form.endings:
+            return form, (path,)
+    todo = "Export the calibration in one of these forms."
+    if suffix == ".cal":
+        todo = "Open it in Motive 3.2 or later, and export it as .mcal."
+    raise InputError(
+        str(path),
+        expected="a calibration: " + _list_forms(),
+        found=f"a file that ends in {path.suffix!r}",
+        todo=todo,
+    )
+
+
+def _read_opencap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
+    """Return the cameras of OpenCap's pickles, of which nothing is run.
+
+    Each has `intrinsicMat` (3, 3), `distortion` (k1 k2 p1 p2 k3), `imageSize` (height, width),
+    `rotation` and `translation` [mm] of x_cam = R x_board + t. The board stands, on its head or
+    not, or lies on the ground: the camera images are upright, so that the board's axis along which
+    they point down tells which. The world is the board's, turned so that z is up; of a standing
+    board as in Pose2Sim's conversion: x' = -x, y' = -z, z' = -y.
+    """
+    tables = {file: _read_pickle(file) for file in files}
+    down = np.mean([_downward(file, table) for file, table in tables.items()], axis=0)
+    cosine, axes = max(
+        ((down[1], STANDING), (-down[1], ON_ITS_HEAD), (down[2], LYING)),
+        key=lambda place: float(place[0]),
+    )
+    if not cosine >= UPRIGHT:
+        raise InputError(
+            f"{files[0]}: rotation",
+            expected="cameras that are level within 40 degrees, and a board that stands or lies",
+            found=f"a mean downward axis of {np.round(down, 2).tolist()} in the board's axes",
+            todo="Give the files of one session, all of them, as OpenCap wrote them.",
+        )
+    return index_by_name(
+        files[0].parent,
+        [
+            (
+                str(file),
+                read_camera_table(
+                    str(file),
+                    file.parent.name if file.stem == OPENCAP_NAME else file.stem,
+                    table,
+                    keys=OPENCAP_KEYS,
+                    unit_m=MILLIMETRE,
+                    axes=axes,
+                ),
+            )
+            for file, table in tables.items()
+        ],
+        MILLIMETRE,
+    )
+
+
+def _read_pickle(file: Path) -> dict[str, Any]:
+    """Return the entries of an OpenCap pickle as numbers and lists, width before height."""
+    from worldpose.pickles import plain, read_notes  # late: it imports scipy
+
+    size = require_file(file)
+    if size > SETTINGS_BYTES:
+        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{size} bytes")
+    try:
+        content = plain(read_notes(file))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            str(file),
+            expected="OpenCap's pickle of one camera: arrays alone",
+            found=f"{error}",
+            todo="Give cameraIntrinsicsExtrinsics.pickle, as OpenCap wrote it. Nothing in this "
+            "file was run.",
+        ) from error
+    if not isinstance(content, dict):
+        raise calibration_error(str(file), "a dictionary", type(content).__name__)
+    if "intrinsicMat" in content and "rotation" not in content:
+        raise InputError(
+            f"{file}: rotation",
+            expected="the pose of the camera",
+            found="a lens alone",
+            todo="Give cameraIntrinsicsExtrinsics.pickle, not cameraIntrinsics.pickle.",
+        )
+    table = {
+        key: np.squeeze(value).tolist() if isinstance(value, np.ndarray) else value
+        for key, value in content.items()
+        if isinstance(key, str)
+    }
+    image, matrix = table.get("imageSize"), table.get("intrinsicMat")
+    if isinstance(image, list) and len(image) == 2:
+        table["imageSize"] = image[::-1]
+        _require_order(file, image[::-1], matrix)
+    return table
+
+
+def _require_order(file: Path, size: list[Any], matrix: object) -> None:
+    """Raise InputError if the principal point shows that a file has the width before the height."""
+    try:
+        middle = np.array([matrix[0][2], matrix[1][2]], np.float64)  # type: ignore[index]
+        away = [
+            float(np.abs(middle / np.array(order, np.float64) - 0.5).max())
+            for order in (size, size[::-1])
+        ]
+    except (TypeError, ValueError, IndexError):
+        return  # `read_camera_table` names what is wrong
+    if away[0] > 0.2 and away[1] < 0.1:
+        raise InputError(
+            f"{file}: imageSize",
+            expected="height, then width, with the principal point near the middle",
+            found=f"{size[::-1]}, and the principal point {middle.tolist()}",
+            todo="Exchange them.",
+        )
+
+
+def _downward(file: Path, table: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Return the axis (3,) of the board along which a camera's images point down."""
+    try:
+        rotation = np.array(table.get("rotation"), np.float64)
+    except (TypeError, ValueError):
+        rotation = np.zeros(0)
+    if rotation.shape != (3, 3):
+        raise calibration_error(f"{file}.rotation", "numbers of shape (3, 3)", "something else")
+    return np.asarray(rotation[1], np.float64)
+
+
+def _read_easymocap(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
+    """Return the cameras of EasyMocap's intri.yml and extri.yml, files of OpenCV's FileStorage.
+
+    For each of `names`: K, dist (k1 k2 p1 p2 k3), H and W [px] in intri.yml, and R (Rodrigues
+    vector) or Rot (3, 3) and T [m] of x_cam = R x_world + t in extri.yml.
+    """
+    by_kind = {
+        kind: [file for file in files if file.stem.lower().startswith(kind)]
+        for kind in ("intri", "extri")
+    }
+    if any(len(some) != 1 for some in by_kind.values()):
+        raise InputError(
+            str(files[0].parent),
+            expected="one intri.yml of lenses and one extri.yml of poses",
+            found=", ".join(file.name for file in files),
+            todo="Put both into one folder, without others.",
+        )
+    ((lens_file,), (pose_file,)) = by_kind["intri"], by_kind["extri"]
+    lenses, poses = read_file_storage(lens_file), read_file_storage(pose_file)
+    names = lenses.get("names")
+    if not isinstance(names, list) or not names:
+        raise calibration_error(f"{lens_file}: names", "a list of cameras", "none")
+    cameras = []
+    for name in names:
+        where = f"{lens_file}: {name}"
+        if f"W_{name}" not in lenses or f"H_{name}" not in lenses:
+            raise InputError(
+                f"{lens_file}: W_{name}",
+                expected=f"the image size of camera {name}",
+                found="none",
+                todo=f"Add its width and height in pixels: a line W_{name}: 1920 and a line "
+                f"H_{name}: 1080.",
+            )
+        entries = {
+            "W, H": [lenses[f"W_{name}"], lenses[f"H_{name}"]],
+            f"K_{name}": lenses.get(f"K_{name}"),
+            f"dist_{name}": lenses.get(f"dist_{name}", lenses.get(f"D_{name}")),
+            f"R_{name}": poses.get(f"R_{name}", poses.get(f"Rot_{name}")),
+            f"T_{name}": poses.get(f"T_{name}"),
+        }
+        for key, value in entries.items():
+            if value is None:
+                file = lens_file if key[0] in "Kd" else pose_file
+                raise calibration_error(f"{file}: {key}", "a matrix", "nothing")
+        table = {
+            key: value.tolist() if isinstance(value, np.ndarray) else value
+            for key, value in entries.items()
+        }
+        keys = Keys("W, H", f"K_{name}", f"dist_{name}", f"R_{name}", f"T_{name}")
+        camera = read_camera_table(where, name, table, keys=keys, where_pose=f"{pose_file}: {name}")
+        cameras.append((where, camera))
+    return index_by_name(lens_file, cameras)
+
+
+def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
+    """Return the cameras of bioCV's text files, each of 32 numbers.
+
+    Width, height [px], K (3, 3), L (4, 4) of x_cam = L x_world [mm], and k1 k2 p1 p2 k3. The name
+    of `01.mp4.calib` is 01. Format: class Calibration of camera-mc-dev/mc_core.
+    """
+    cameras = []
+    for file in files:
+        where = str(file)
+        size = require_file(file)
+        if size > SETTINGS_BYTES:
+            raise calibration_error(where, f"at most {SETTINGS_BYTES} bytes", f"{size} bytes")
+        try:
+            numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
+        except (OSError, ValueError) as error:
+            raise calibration_error(where, "32 numbers", f"{error}"[:80]) from error
+        if len(numbers) != 32:
+            raise calibration_error(
+                where, "32 numbers: width, height, K, L and five of the lens", str(len(numbers))
+            )
+        pose = np.array(numbers[11:27]).reshape(4, 4)
+        if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+            raise calibration_error(f"{where}: L", "a last row 0 0 0 1", str(pose[3].tolist()))
+        table = {
+            "size": numbers[:2],
+            "K": np.array(numbers[2:11]).reshape(3, 3).tolist(),
+            "distortion": numbers[27:],
+            "rotation of L": pose[:3, :3].tolist(),
+            "translation of L": pose[:3, 3].tolist(),
+        }
+        keys = Keys("size", "K", "distortion", "rotation of L", "translation of L")
+        name = Path(file.stem).stem if Path(file.stem).suffix in VIDEOS else file.stem
+        camera = read_camera_table(where, name, table, keys=keys, unit_m=MILLIMETRE)
+        cameras.append((where, camera))
+    return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras, MILLIMETRE)
+
+
+TOML: Final = Form(
+    "Anipose, Pose2Sim, caliscope, FreeMoCap",
+    (".toml",),
+    "m (FreeMoCap: mm), z up",
+    lambda files: read_calibration_toml(files[0]),
+)
+QUALISYS: Final = Form(
+    "Qualisys",
+    (".qca.txt", ".txt", ".xml"),
+    "mm, z up",
+    lambda files: read_calibration_xml(files[0]),
+)
+VICON: Final = Form("Vicon", (".xcp",), "mm, z up", lambda files: read_calibration_xml(files[0]))
+OPTITRACK: Final = Form(
+    "OptiTrack", (".mcal",), "m, y up", lambda files: read_calibration_xml(files[0])
+)
+OPENCAP: Final = Form("OpenCap", (".pickle",), "mm, those of the board", _read_opencap)
+EASYMOCAP: Final = Form("EasyMocap", ("intri.yml", "extri.yml"), "m, z up", _read_easymocap)
+BIOCV: Final = Form("bioCV", (".calib",), "mm, z up", _read_biocv)
+FORMS: Final = (TOML, QUALISYS, VICON, OPTITRACK, OPENCAP, EASYMOCAP, BIOCV)
+"""All forms; docs/reference/formats.md describes them."""

@@ -1,0 +1,354 @@
+"""Readers of the calibrations of motion capture systems: Qualisys, Vicon and OptiTrack (XML)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.cameras import CameraCalibration
+from worldpose.errors import InputError
+from worldpose.formats.calibration_files import (
+    MILLIMETRE,
+    NUMBER_LIMIT,
+    build_camera,
+    calibration_error,
+    index_by_name,
+)
+from worldpose.formats.files import SETTINGS_BYTES, require_file
+
+LENS_ERROR_PX: Final = 0.1
+"""Maximum error of OpenCV's coefficients fitted to Vicon's lens, within the image [px]: a tenth of
+the error with which a detector finds a joint."""
+
+Y_UP: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""(3, 3) from a world with y up to one with z up: x stays, y becomes minus z."""
+
+BACKWARD: Final = np.diag([1.0, -1.0, -1.0])
+"""(3, 3) from camera axes x right, y up, z backward to OpenCV's."""
+
+
+def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
+    """Return the cameras of a calibration of Qualisys, Vicon or OptiTrack, in file order.
+
+    The root element tells the system: `calibration`, `Cameras` or `calibrationProfile`.
+
+    Raises:
+        InputError: the file is unreadable, of another program, or has a missing attribute, no
+            finite number, no rotation, a lens that OpenCV's model does not describe, no camera, or
+            two cameras of one name; the error names file, camera and attribute.
+    """
+    size = require_file(path)
+    if size > 16 * SETTINGS_BYTES:
+        raise calibration_error(str(path), f"at most {16 * SETTINGS_BYTES} bytes", f"{size} bytes")
+    try:
+        root = ET.fromstring(path.read_bytes(), ET.XMLParser(target=_PlainTree()))
+    except (ET.ParseError, ValueError, LookupError, OSError) as error:
+        raise calibration_error(
+            str(path), "XML of Qualisys, Vicon or OptiTrack", str(error)
+        ) from error
+    readers = {
+        "calibration": _read_qualisys,
+        "Cameras": _read_vicon,
+        "calibrationProfile": _read_optitrack,
+    }
+    if root.tag not in readers:
+        raise InputError(
+            f"{path}: <{root.tag:.40}>",
+            expected="<calibration> of Qualisys, <Cameras> of Vicon, or <calibrationProfile> of "
+            "OptiTrack",
+            found=f"<{root.tag:.40}>",
+            todo="Export the calibration of the system again.",
+        )
+    return readers[root.tag](path, root)
+
+
+class _PlainTree(ET.TreeBuilder):
+    """A tree builder that rejects entities, which could expand a small file without limit."""
+
+    def doctype(self, name: str, pubid: str, system: str) -> None:
+        raise ValueError(f"a DOCTYPE ({name}), which no calibration has")
+
+
+def _child(where: str, element: ET.Element, tag: str) -> ET.Element:
+    part = element.find(tag)
+    if part is None:
+        raise calibration_error(where, f"<{tag}>", "nothing")
+    return part
+
+
+def _numbers(where: str, element: ET.Element, keys: Sequence[str]) -> NDArray[np.float64]:
+    """Return attributes of one number each."""
+    values = [element.get(key) for key in keys]
+    return np.concatenate(
+        [_parse(f"{where}.{key}", text, 1) for key, text in zip(keys, values, strict=True)]
+    )
+
+
+def _parse(where: str, text: str | None, count: int) -> NDArray[np.float64]:
+    """Return the numbers of an attribute, separated by spaces."""
+    if text is None:
+        raise calibration_error(where, "a number" if count == 1 else f"{count} numbers", "nothing")
+    try:
+        values = np.array([float(each) for each in text.split()])
+    except ValueError as error:
+        raise calibration_error(where, "numbers", f"{text!r:.60}") from error
+    if len(values) != count:
+        raise calibration_error(where, f"{count} numbers", f"{text!r:.60}")
+    if not np.all(np.abs(values) <= NUMBER_LIMIT):  # also NaN
+        raise calibration_error(where, f"finite numbers up to {NUMBER_LIMIT:g}", f"{text!r:.60}")
+    return values
+
+
+def _read_qualisys(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
+    """Return the active cameras by serial."""
+    cameras = []
+    for index, element in enumerate(root.iterfind("cameras/camera")):
+        where = f"{path}: camera[{index}]"
+        if element.get("active", "1") != "0":
+            cameras.append((where, _read_qualisys_camera(where, element)))
+    return index_by_name(path, cameras, MILLIMETRE)
+
+
+def _read_qualisys_camera(where: str, element: ET.Element) -> CameraCalibration:
+    """Return one `<camera>` of a Qualisys calibration, with its `serial` as name.
+
+    `<transform>`: x y z is the camera centre C [mm]; r11..r33 is A, row by row, whose rows are the
+    camera's axes in the world: x right, y up, z backward. So R = diag(1, -1, -1) A, t = -R C.
+
+    `<intrinsic>`: focal length and centre point are in 1/64 px of the sensor; `<fov_video>` (px,
+    both ends included) is the part of the sensor in the video. The radial and tangential (in the
+    file: tangental) coefficients act on the normalised image plane and have no unit, so that they
+    need no conversion: only lengths on the sensor are in 1/64 px. (Pose2Sim's reader divides them
+    by 64 as well, which nearly removes the distortion.) `viewrotation` rotates only the view in
+    QTM; the function ignores it.
+    """
+    parts = {tag: _child(where, element, tag) for tag in ("transform", "intrinsic", "fov_video")}
+
+    def read(tag: str, keys: Sequence[str]) -> NDArray[np.float64]:
+        return _numbers(f"{where}.{tag}", parts[tag], keys)
+
+    left, top, right, bottom = read("fov_video", ("left", "top", "right", "bottom"))
+    skew = parts["intrinsic"].get("skew", "0")
+    if skew.strip("0.+-") != "":
+        raise calibration_error(f"{where}.intrinsic.skew", "0", repr(skew))
+    axes = read("transform", [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]).reshape(3, 3)
+    center = MILLIMETRE * read("transform", "xyz")
+    rotation = BACKWARD @ axes
+    k1, k2, k3 = read("intrinsic", [f"radialDistortion{i}" for i in (1, 2, 3)])
+    p1, p2 = read("intrinsic", ("tangentalDistortion1", "tangentalDistortion2"))
+    return build_camera(
+        where,
+        element.get("serial", ""),
+        size=np.array([right - left + 1, bottom - top + 1]),
+        focal=read("intrinsic", ("focalLengthU", "focalLengthV")) / 64.0,
+        principal_point=read("intrinsic", ("centerPointU", "centerPointV")) / 64.0 - [left, top],
+        distortion=np.array([k1, k2, p1, p2, k3]),
+        rotation=rotation,
+        translation=-rotation @ center,
+    )
+
+
+def _read_vicon(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
+    """Return the video cameras of an XCP file by device id; those for markers make no video."""
+    cameras, others = [], set()
+    for index, element in enumerate(root.iterfind("Camera")):
+        where = f"{path}: Camera[{index}]"
+        kind = f"{element.get('DISPLAY_TYPE', '')} {element.get('TYPE', '')}".lower()
+        is_digital = element.get("SYSTEM") == "DV" or element.get("ISDV", "0") not in ("", "0")
+        if is_digital or "video" in kind or "vue" in kind:
+            cameras.append((where, _read_vicon_camera(where, element)))
+        else:
+            others.add(element.get("DISPLAY_TYPE", "?"))
+    if others and not cameras:
+        raise InputError(
+            str(path),
+            expected="a video camera (SYSTEM DV, ISDV, VideoInputDevice or Vue)",
+            found=f"cameras for markers alone: {', '.join(sorted(others)):.80}",
+            todo="Calibrate the video cameras with the others, and export again.",
+        )
+    return index_by_name(path, cameras, MILLIMETRE)
+
+
+def _read_vicon_camera(where: str, element: ET.Element) -> CameraCalibration:
+    """Return one `<Camera>` of an XCP file, in pixels of its sensor.
+
+    The one `<KeyFrame>` of a static camera has the centre C (POSITION [mm]) and a quaternion
+    (ORIENTATION, x y z w) of the rotation from the world to OpenCV's camera axes; z is up. The
+    lens: see `_vicon_lens`. Format: Vicon's "About calibration data (XCP) files".
+    """
+    name = element.get("DEVICEID", "")
+    frames = element.findall("KeyFrames/KeyFrame")
+    where = f"{where} {name}".rstrip()
+    if len(frames) != 1:
+        raise InputError(
+            f"{where}.KeyFrames",
+            expected="one KeyFrame, of a camera that does not move",
+            found=str(len(frames)) if frames else "none: the camera is not calibrated",
+            todo="Calibrate the camera, or take it out of the file.",
+        )
+    (frame,) = frames
+    for holder, key, only in (
+        (element, "PIXEL_ASPECT_RATIO", 1.0),
+        (frame, "PIXEL_ASPECT_RATIO_CORRECTION", 1.0),
+        (element, "SKEW", 0.0),
+    ):
+        given = holder.get(key)
+        if given is not None and float(_parse(f"{where}.{key}", given, 1)[0]) != only:
+            raise calibration_error(f"{where}.{key}", f"{only:g}: square pixels", repr(given))
+    size = _parse(f"{where}.SENSOR_SIZE", element.get("SENSOR_SIZE"), 2)
+    (focal,) = _parse(f"{where}.FOCAL_LENGTH", frame.get("FOCAL_LENGTH"), 1)
+    middle = _parse(f"{where}.PRINCIPAL_POINT", frame.get("PRINCIPAL_POINT"), 2)
+    turn = _parse(f"{where}.ORIENTATION", frame.get("ORIENTATION"), 4)
+    center = MILLIMETRE * _parse(f"{where}.POSITION", frame.get("POSITION"), 3)
+    norm = float(np.linalg.norm(turn))
+    if abs(norm - 1.0) > 1e-3:
+        raise calibration_error(f"{where}.ORIENTATION", "a quaternion of length 1", f"{norm:g}")
+    from scipy.spatial.transform import Rotation  # late: it takes 0.1 s, and few files need it
+
+    rotation = Rotation.from_quat(turn).as_matrix()
+    return build_camera(
+        where,
+        name,
+        size=size,
+        focal=np.array([focal, focal]),
+        principal_point=middle,
+        distortion=_vicon_lens(where, frame, size, focal, middle),
+        rotation=rotation,
+        translation=-rotation @ center,
+    )
+
+
+def _vicon_lens(
+    where: str,
+    frame: ET.Element,
+    size: NDArray[np.float64],
+    focal: float,
+    middle: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return k1, k2, p1, p2, k3 (5,) of OpenCV's model, fitted to Vicon's.
+
+    Vicon's model goes from the pixel in the image to that without distortion: the offset d from the
+    center of distortion is scaled by 1 + w1 d^2 + w2 d^4 + w3 d^6 [px]. `VICON_RADIAL2` is
+    "Vicon3Parameter" with that center and w1, w2, w3; `VICON_RADIAL` is w1, w2, about the principal
+    point. OpenCV's model goes the other way, on the plane at distance 1. (Pose2Sim's reader takes
+    w1 and w2 as k1 and k2, which removes the distortion.)
+
+    Raises:
+        InputError: another model, one that folds the image, or one that OpenCV's coefficients do
+            not follow within `LENS_ERROR_PX`.
+    """
+    text = frame.get("VICON_RADIAL2")
+    if text is not None:
+        model, _, rest = text.strip().partition(" ")
+        if model != "Vicon3Parameter":
+            raise InputError(
+                f"{where}.VICON_RADIAL2",
+                expected="Vicon3Parameter, the center, and three coefficients",
+                found=f"{text!r:.60}",
+                todo="Calibrate with the three-parameter lens model.",
+            )
+        numbers = _parse(f"{where}.VICON_RADIAL2", rest, 5)
+        about, terms = numbers[:2], numbers[2:]
+    else:
+        about = middle
+        terms = np.append(_parse(f"{where}.VICON_RADIAL", frame.get("VICON_RADIAL"), 2), 0.0)
+    if not np.any(terms) or not np.all(size >= 1) or focal <= 0.0:
+        return np.zeros(5)  # `build_camera` refuses an impossible size and focal length
+    across = np.stack(
+        np.meshgrid(*(np.linspace(-0.5, length - 0.5, 41) for length in size)), axis=-1
+    ).reshape(-1, 2)
+    offset = across - about
+    square = np.sum(offset**2, axis=-1, keepdims=True)
+    powers = np.concatenate([np.ones_like(square), square, square**2, square**3], axis=-1)
+    ideal = about + offset * (powers @ np.append(1.0, terms))[:, None]
+    slope = powers @ (np.append(1.0, terms) * [1.0, 3.0, 5.0, 7.0])
+    x, y = ((ideal - middle) / focal).T
+    r2 = x**2 + y**2
+    none = np.concatenate([x, y])
+    effects = np.stack(
+        [
+            none * np.tile(r2, 2),
+            none * np.tile(r2**2, 2),
+            np.concatenate([2.0 * x * y, r2 + 2.0 * y**2]),
+            np.concatenate([r2 + 2.0 * x**2, 2.0 * x * y]),
+            none * np.tile(r2**3, 2),
+        ],
+        axis=-1,
+    )
+    seen = np.concatenate(list(((across - middle) / focal).T))
+    lens = np.linalg.lstsq(effects, seen - none, rcond=None)[0]
+    error = focal * float(np.abs(effects @ lens - (seen - none)).max())
+    if slope.min() <= 0.0 or error > LENS_ERROR_PX:
+        raise InputError(
+            f"{where}.VICON_RADIAL2" if text is not None else f"{where}.VICON_RADIAL",
+            expected=f"a lens that k1, k2, p1, p2, k3 follow within {LENS_ERROR_PX:g} px",
+            found="one that folds the image" if slope.min() <= 0.0 else f"{error:.2g} px",
+            todo="Correct the videos for distortion in Vicon's program, and set the coefficients "
+            "to 0.",
+        )
+    return np.asarray(lens)
+
+
+def _read_optitrack(path: Path, root: ET.Element) -> dict[str, CameraCalibration]:
+    """Return the cameras of a Motive calibration that film, by serial; all if none does.
+
+    Colour cameras (serial C...) and those in grayscale or MJPEG mode film (VideoType 1 or 6); the
+    others record markers.
+    """
+    filming, every = [], []
+    for index, element in enumerate(root.iterfind("Calibration/Cameras/Camera")):
+        properties = element.find("Properties")
+        mode = {} if properties is None else properties.attrib
+        if mode.get("Enabled", "1") == "0":
+            continue
+        every.append((f"{path}: Camera[{index}]", element))
+        if element.get("Serial", "").startswith("C") or mode.get("VideoType") in ("1", "6"):
+            filming.append(every[-1])
+    chosen = filming or every
+    return index_by_name(
+        path, [(where, _read_optitrack_camera(where, element)) for where, element in chosen]
+    )
+
+
+def _read_optitrack_camera(where: str, element: ET.Element) -> CameraCalibration:
+    """Return one `<Camera>` of a Motive calibration (.mcal of Motive 3.2 or later).
+
+    `<Extrinsic>`: X Y Z is the centre C [m]; OrientMatrix0..8 is A, row by row, from the camera's
+    axes (x right, y up, z backward) to the world, whose y is up. `<IntrinsicStandardCameraModel>`
+    has OpenCV's coefficients in pixels; Motive's own `<Intrinsic>` has another model. The world is
+    turned to z up: x stays, y is minus the file's z.
+    """
+    name = element.get("Serial", "")
+    where = f"{where} {name}".rstrip()
+    image = _child(where, element, "Attributes")
+    lens = element.find("IntrinsicStandardCameraModel")
+    if lens is None:
+        raise InputError(
+            f"{where}.IntrinsicStandardCameraModel",
+            expected="the lens in OpenCV's model",
+            found="Motive's own model alone"
+            if element.find("Intrinsic") is not None
+            else "no lens",
+            todo="Export the calibration (.mcal) from Motive 3.2 or later.",
+        )
+    place = _child(where, element, "Extrinsic")
+    optics, pose = f"{where}.IntrinsicStandardCameraModel", f"{where}.Extrinsic"
+    k1, k2, k3 = _numbers(optics, lens, ("k1", "k2", "k3"))
+    p1, p2 = _numbers(optics, lens, ("TangentialX", "TangentialY"))
+    axes = _numbers(pose, place, [f"OrientMatrix{index}" for index in range(9)]).reshape(3, 3)
+    rotation = BACKWARD @ axes.T @ Y_UP.T
+    return build_camera(
+        where,
+        name,
+        size=_numbers(f"{where}.Attributes", image, ("ImagerPixelWidth", "ImagerPixelHeight")),
+        focal=_numbers(optics, lens, ("HorizontalFocalLength", "VerticalFocalLength")),
+        principal_point=_numbers(optics, lens, ("LensCenterX", "LensCenterY")),
+        distortion=np.array([k1, k2, p1, p2, k3]),
+        rotation=rotation,
+        translation=-rotation @ (Y_UP @ _numbers(pose, place, "XYZ")),
+    )
