@@ -2,7 +2,7 @@
 
 SQLite has one writer. A transaction that reads and then writes fails at once if another one wrote
 in between, and Prefect then answers 503. Prefect's clients ask again; its dashboard only says that
-something went wrong, and a run that a person submitted does not exist.
+something went wrong, and the run or schedule that a person submitted does not exist.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from starlette.datastructures import Headers
+
+from flows.web.host_guard import SAFE_METHODS
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -23,7 +25,7 @@ PAUSE_SECONDS: Final = 0.5
 
 
 class RepeatBusy:
-    """ASGI middleware that repeats refused POST requests of browsers.
+    """ASGI middleware that repeats refused changes of browsers.
 
     Args:
         app: Prefect's server, which has undone all that a refused request had written.
@@ -35,8 +37,8 @@ class RepeatBusy:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request; only browsers send `Sec-Fetch-Mode`."""
-        is_form = scope["type"] == "http" and scope["method"] == "POST"
-        if not is_form or "sec-fetch-mode" not in Headers(scope=scope):
+        is_change = scope["type"] == "http" and scope["method"] not in SAFE_METHODS
+        if not is_change or "sec-fetch-mode" not in Headers(scope=scope):
             await self.app(scope, receive, send)
             return
         body: list[Message] = []
