@@ -235,7 +235,9 @@ PEOPLE = Gate(
     _of_people,
 )
 CONSISTENCY = Gate(
-    "camera_consistency", "Are these cameras wrong, for this reason?", ConsistencyLimits()
+    "camera_consistency",
+    "Are these cameras wrong, for this reason? If you approve, the run leaves them out.",
+    ConsistencyLimits(),
 )
 IDENTITIES = Gate(
     "tracking",

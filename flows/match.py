@@ -128,7 +128,10 @@ def run_stages(log: RunLog, time_limits: TimeLimits) -> RunRecord:
             reporter().say(f"{stage.name}: no units, as the match has no static cameras")
             return
         missing = [unit for unit in units if not unit.published]
-        reporter().stage_started(stage.name, stage.about, units=len(units), missing=len(missing))
+        if units:  # a stage without units in this match, or held by a question, is no news
+            reporter().stage_started(
+                stage.name, stage.about, units=len(units), missing=len(missing)
+            )
         seconds = seconds_of(stage.name, time_limits)
         work = [unit.work(log.store.url, log.match, log.run_id, seconds) for unit in missing]
         yield from compute(stage, missing, work)

@@ -341,6 +341,8 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
         f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
         f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"
     )
+    is_calibrated = (out / "calibration.toml").exists()
+    line(f"next: worldpose {'run' if is_calibrated else 'ingest'} {out}")
 
 
 def _boxes_alone() -> UsageError:
@@ -489,8 +491,9 @@ def _tell_unclicked(match: Match) -> None:
     missing = [*match.folder.to_click, *unclicked_clips(match.folder)]
     if missing and match.folder.pitch is None:
         line(
-            f"no calibration of {', '.join(missing)}: add them to calibration.toml (a match "
-            "without a pitch cannot be clicked)"
+            f"no calibration of {', '.join(missing)}: on a pitch, delete the line `pitch: none` of "
+            "match.yaml, repeat this command, and click the markings on the pages; elsewhere, see "
+            "worldpose locate-cameras, or add the cameras to calibration.toml"
         )
     elif missing:
         line(f"to be clicked first: {', '.join(missing)}; worldpose review serve shows the pages")

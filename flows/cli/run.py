@@ -187,7 +187,8 @@ def _print_settings(as_json: bool) -> None:
 
 
 def _print(record: RunRecord, project: str, seconds: float) -> None:
-    blocked = f" and {len(record.blocked)} blocked by that" if record.blocked else ""
+    by = " until the review" if record.waiting and not record.failed else " by that"
+    blocked = f" and {len(record.blocked)} blocked{by}" if record.blocked else ""
     line(
         f"run {record.run_id} of {record.match_id} is {record.state}: "
         f"{len(record.executed)} computed, {len(record.reused)} reused, "

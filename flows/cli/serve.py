@@ -91,7 +91,10 @@ def serve(
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
-    """Serve a project until interrupted: dashboard, inbox, runs, pages, metrics, alerts.
+    """Serve a project until interrupted: pages, runs, inbox, dashboard, metrics, alerts.
+
+    Open the printed address in a browser: its pages create, calibrate, run, review and show
+    matches.
 
     Alerts go to the webhook and the mail addresses in PROJECT/operations/secrets/alerts.toml, or as
     WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL say.
@@ -114,7 +117,7 @@ def serve(
         return
     from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.senders import senders_of
-    from flows.service.service_secrets import METRICS_TOKEN, secrets_of
+    from flows.service.service_secrets import METRICS_TOKEN, PAGES_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
@@ -171,17 +174,18 @@ def serve(
 
     def ready() -> None:
         line(f"serving {plan.project}")
+        # A token chosen by the operator is not printed: the output can go to a log.
+        login = "/login" if token or users else f"/login#token={access.token}"
+        whose = "the file --users" if users else PAGES_TOKEN if token else "this address"
+        line(f"pages          {plan.pages}{login}  open it in a browser; the token is in {whose}")
+        line(f"status page    {plan.pages}/status")
         line(f"inbox          {plan.inbox}")
         # Print the path of a secret, not its value: the output can go to a log.
         if secrets.prefect is None:
-            line(f"dashboard      {plan.dashboard}  which asks for no login: others may use it")
+            line(f"Prefect        {plan.dashboard}  which asks for no login: others may use it")
         else:
-            line(f"dashboard      {plan.dashboard}  log in with: {login_at}")
-        # A token chosen by the operator is not printed: the output can go to a log.
-        login = "/login" if token or users else f"/login#token={access.token}"
-        line(f"review pages   {plan.pages}{login}")
-        line(f"status page    {plan.pages}/status")
-        line(f"metrics        http://{host}:{metrics_port}/metrics  bearer token: {token_at}")
+            line(f"Prefect        {plan.dashboard}  its login is in {login_at}")
+        line(f"metrics        http://{host}:{metrics_port}/metrics  its token is in {token_at}")
         line("Ctrl-C ends it; the next start resumes")
 
     serve_all(plan, secrets, ready, lambda text: line(text, to=errors))

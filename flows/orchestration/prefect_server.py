@@ -20,6 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from flows.orchestration.busy_database import RepeatBusy
 from flows.orchestration.prefect_environment import SERVER_LOGIN
 from flows.web.host_guard import HostGuard
 from flows.web.http_server import serve_http
@@ -59,7 +60,7 @@ def guarded_app(names: Iterable[str], *, is_embedded: bool = False) -> ASGIApp:
     app = create_app(ephemeral=is_embedded, final=True)
     gc.freeze()
     gc.enable()
-    return HostGuard(app, names)
+    return HostGuard(RepeatBusy(app), names)
 
 
 def _let_dashboard_be_written() -> None:

@@ -78,9 +78,9 @@ def adjustment_tables(run: Run) -> list[Table]:
             ">after px",
             ">people before px",
             ">after px",
-            ">judging keypoints",
-            "changed?",
-            "known least",
+            ">held-out keypoints",
+            "change",
+            "least certain direction",
         ),
         tuple(rows),
     )

@@ -20,6 +20,8 @@ UNITS: Final[Mapping[str, str]] = {
     "hz": "Hz",
 }
 """Last part of a metric's name to its unit."""
+_WORDS: Final[Mapping[str, str]] = {"clicks_wrong": "outlier clicks"}
+"""Metrics whose names alone mislead."""
 _BEYOND: Final = re.compile(
     r"(?P<name>\w+) is (?P<value>\S+?)(?P<parts> \(.*\))?, at most (?P<limit>\S+) passes"
 )
@@ -28,6 +30,8 @@ _UNKNOWN: Final = re.compile(r"(?P<name>\w+) could not be computed")
 
 def metric_words(name: str) -> tuple[str, str]:
     """Return a metric's name in words, and its unit; `offset_rms_m` is `offset rms` in `m`."""
+    if name in _WORDS:
+        return _WORDS[name], ""
     rest, _, last = name.rpartition("_")
     unit = UNITS.get(last, "") if rest else ""
     return (rest if unit else name).replace("_", " "), unit

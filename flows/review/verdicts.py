@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -95,9 +96,16 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
     if latest is None or not latest.waiting:
         return frozenset()
     results = latest.results
-    match = match.without(left_out_cameras(store, match, METHOD, results))
+    held = {unit.unit for unit in latest.waiting}
+    usable = {name: key for name, key in results.items() if name not in held}
     stages = {stage.name: stage for stage in METHOD}
     is_changed: dict[str, bool] = {}
+
+    @functools.cache
+    def planned_match(stage: str) -> Match:
+        """Return the match as the stage's units were planned: only earlier stages leave out."""
+        earlier = METHOD[: METHOD.index(stages[stage])]
+        return match.without(left_out_cameras(store, match, earlier, usable))
 
     def check(name: str, key: str) -> bool:
         if name not in is_changed:
@@ -107,8 +115,8 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
             except StoreError:  # withdrawn or damaged: the next run reports it
                 return is_changed.setdefault(name, False)
             recipe = manifest.recipe
-            is_unknown = stage not in stages or unit not in stages[stage].units(match)
-            sources = {} if is_unknown else stages[stage].sources(match, unit)
+            is_known = stage in stages and unit in stages[stage].units(planned_match(stage))
+            sources = stages[stage].sources(planned_match(stage), unit) if is_known else {}
             now = recipe.model_copy(update={"sources": recipe.sources | sources})
             is_changed[name] = recipe_key(now) != recipe_key(recipe) or any(
                 check(used, used_key) for used, used_key in recipe.inputs.items()

@@ -257,7 +257,7 @@ def status_html(
         f'</head><body data-refresh="{refresh}">'
         '<header><nav aria-label="Where you are"><a href="/">worldpose review</a>'
         '<span>&rsaquo;</span><span aria-current="page">Status</span></nav>'
-        f'<div class="right"><a href="/">Pending review</a>{link}'
+        f'<div class="right"><a href="/">Matches and reviews</a>{link}'
         '<button id="ask" title="Keys and states of this page">Help <kbd>?</kbd></button>'
         '<span id="who" title="Your name, and what you may do here"></span>'
         f'<button id="leave" hidden>Log out</button></div></header>{HELP}'
@@ -351,9 +351,10 @@ def _describe_unit(unit: UnitSummary) -> str:
 def _inbox(arrivals: Iterable[Arrival], begun: Collection[str]) -> str:
     """Render the arrivals; what a match needed before its first run is history once it has one."""
     rows = "".join(
-        f"<tr><td>{escape(each.name)}</td><td>{each.state}</td><td>{each.priority}</td>"
-        f"<td>{_date(each.changed_at)}</td>"
-        f"<td>{escape(each.match_id or '')}</td>"
+        f'<tr><td data-of="arrival">{escape(each.name)}</td><td data-of="state">{each.state}</td>'
+        f'<td data-of="priority">{each.priority}</td>'
+        f'<td data-of="since">{_date(each.changed_at)}</td>'
+        f'<td data-of="match">{escape(each.match_id or "")}</td>'
         f"<td><small>{'' if each.match_id in begun else escape(in_browser(each.reason))}</small>"
         "</td></tr>"
         for each in sorted(arrivals, key=lambda each: each.changed_at, reverse=True)

@@ -35,6 +35,9 @@ from worldpose.store import Run, Store, open_run
 KEPT: Final = 16
 """Review requests whose images are kept in memory; drawing takes one or two seconds each."""
 
+MOST_CAMERAS: Final = 4
+"""Images of cameras that contradict the others; more than four are rarely wrong at once."""
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -46,6 +49,8 @@ class Evidence:
     first_frame: int = 0
     video: str | None = None
     """Camera or clip whose video shows it; None if there is none."""
+    clicked: tuple[str, ...] = ()
+    """Static cameras whose clicks may be wrong."""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -81,6 +86,7 @@ def routes(context: PageContext) -> APIRouter:
             ],
             "first_frame": found.first_frame,
             "video": found.video,
+            "clicked": found.clicked,
         }
 
     @router.get("/pictures/{number}")
@@ -133,6 +139,45 @@ def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
         "error on the ground."
     )
     return Evidence((CaptionedImage(caption, png),))
+
+
+def _consistency(store: Store, run: Run, match: Match, clip: str) -> Evidence:
+    """Draw the cameras that contradict the others; list their faults and what any two share."""
+    result = run[f"camera_consistency/{clip}"]
+    faults = result.attrs["faults"]
+    named = list(dict.fromkeys(fault["camera"] for fault in faults))
+    pictures = [
+        replace(picture, caption=f"Camera {camera}. {picture.caption}")
+        for camera in named[:MOST_CAMERAS]
+        for picture in _camera(store, run, match, camera).pictures
+    ]
+    rows = tuple(
+        (
+            fault["camera"],
+            fault["reason"],
+            f"{fault['share_now']:.0%}",
+            "" if fault["share_corrected"] is None else f"{fault['share_corrected']:.0%}",
+        )
+        for fault in faults
+    )
+    columns = ("camera", "fault", ">detections that agree", ">if corrected")
+    cameras = [str(name) for name in result["camera"].values]
+    agreement = tuple(
+        (camera, *("" if k == c else f"{value:.1f}" for k, value in enumerate(row)))
+        for c, (camera, row) in enumerate(
+            zip(cameras, result["agreement"].values.tolist(), strict=True)
+        )
+    )
+    tables = (
+        Table("Cameras that contradict the others", columns, rows),
+        Table(
+            "People in a frame that two cameras agree on, above chance",
+            ("camera", *(f">{camera}" for camera in cameras)),
+            agreement,
+        ),
+    )
+    clicked = tuple(camera for camera in named if camera in match.folder.clicked)
+    return Evidence(tuple(pictures), tables, clicked=clicked)
 
 
 def _identities(store: Store, run: Run, match: Match, clip: str) -> Evidence:
@@ -198,6 +243,7 @@ def _no_evidence(store: Store, run: Run, match: Match, unit: str) -> Evidence:
 
 _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "static_calibration": _camera,
+    "camera_consistency": _consistency,
     "tracking": _identities,
     "triangulation": _clip,
     "bundle_adjustment": _adjustment,

@@ -14,7 +14,7 @@ const places = {
   calibration: [`/#/picture/${match}/cam00`, "[data-figure]"],
   people: [`/#/detections/${match}/cam00`, "[data-keypoint]"],
   identities: [`/#/identities/${match}/clip`, "[data-person]"],
-  status: ["/status", "table"], // the last one, because it loads itself again
+  status: ["/status", "main table"], // the last one, because it loads itself again
 };
 for (const [name, [path, selector]] of Object.entries(places)) {
   await page.goto("about:blank");

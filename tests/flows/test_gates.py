@@ -305,7 +305,7 @@ def test_people_are_asked_and_answer_on_the_command_line(tiny, project_copy, tmp
     status = json.loads(say("status", "--json").stdout)["matches"][0]
     assert (status["state"], len(status["waiting"])) == ("waiting", 6)
     wrong = next(each["id"] for each in reviews if WRONG in each["keys"])
-    assert "clicks wrong: 1, limit 0" in say("review", "show", TINY, wrong).stdout
+    assert "outlier clicks: 1, limit 0" in say("review", "show", TINY, wrong).stdout
     assert say("review", "approve", TINY).exit_code == 2  # who
     edits = tmp_path / "edits.json"
     edits.write_text('[{"kind": "moved_point", "camera": "cam03", "marking": "corner", "xy": []}]')

@@ -101,8 +101,9 @@ def test_a_match_that_cannot_be_read_hides_no_other_review(store, tmp_path):
         (None, "to be clicked first: cam1; worldpose review serve shows the pages"),
         (
             "none",
-            "no calibration of cam1: add them to calibration.toml (a match without a pitch "
-            "cannot be clicked)",
+            "no calibration of cam1: on a pitch, delete the line `pitch: none` of match.yaml, "
+            "repeat this command, and click the markings on the pages; elsewhere, see worldpose "
+            "locate-cameras, or add the cameras to calibration.toml",
         ),
     ],
 )

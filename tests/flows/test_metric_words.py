@@ -15,7 +15,7 @@ PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js
     ("reason", "words"),
     [
         ("offset_rms_m is 0.05, at most 0.03 passes", "offset rms: 0.05 m, limit 0.03 m"),
-        ("clicks_wrong is 1, at most 0 passes", "clicks wrong: 1, limit 0"),
+        ("clicks_wrong is 1, at most 0 passes", "outlier clicks: 1, limit 0"),
         (
             "held_out_certain_excess_m is 0.03 (knee, ankle), at most 0.01 passes",
             "held out certain excess: 0.03 m (knee, ankle), limit 0.01 m",

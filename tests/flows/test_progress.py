@@ -130,7 +130,7 @@ def test_a_unit_is_one_line_of_80_columns_with_metrics_only_if_asked_for(verbose
     assert all(len(each) <= 80 for each in lines), lines
     row = r"broadcast_ca…y_characters 5432\.1 s +1 % 16 d +0 % 772 d$"
     assert re.search(row, lines[2]), lines
-    assert ("clicks wrong 1" in lines[-1]) == verbose
+    assert ("outlier clicks 1" in lines[-1]) == verbose
 
 
 def test_expected_work_comes_from_the_latest_run(project_copy):

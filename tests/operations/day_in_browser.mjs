@@ -217,7 +217,10 @@ async function schedule() {
   await prefect.getByText("Cron", { exact: true }).click();
   await prefect.locator('xpath=//label[normalize-space()="Value"]/following::input[1]').fill("0 3 * * *");
   await shoot(prefect, "schedule");
+  const answering = prefect.waitForResponse((each) => each.request().method() === "POST" && /\/schedules$/.test(each.url()));
   await prefect.getByRole("button", { name: "Save", exact: true }).click();
+  const answer = await answering;
+  if (!answer.ok()) throw new Error(`Prefect keeps no schedule: ${answer.status()} ${await answer.text()}`);
   await prefect.waitForSelector("text=/At 03:00/");
   await shoot(prefect, "scheduled");
 }

@@ -39,3 +39,4 @@ def test_a_match_goes_from_the_inbox_to_its_release_in_a_browser(served, tmp_pat
     assert json.loads((released / "v1" / "manifest.json").read_text())["release"] == "v1"
     with capsys.disabled():
         print(f"\nseconds since the match arrived in the inbox: {seen['seconds']}")
+        print(f"runs that Prefect refused to create at first: {seen.get('refused', [])}")

@@ -89,7 +89,11 @@ class Store:
                 f"no worldpose project at {blobs.url}",
                 expected=PROJECT,
                 found="no such file",
-                todo=f"Run: worldpose init {os.fspath(url)}",
+                todo=(
+                    "Register a match, which also creates the project: worldpose ingest "
+                    f"MATCH_FOLDER --project {os.fspath(url)}. An empty project: worldpose init "
+                    f"{os.fspath(url)}"
+                ),
             )
         where = f"{blobs.url}/{PROJECT}"
         project = unseal(Project, data, where)

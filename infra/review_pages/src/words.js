@@ -10,11 +10,14 @@ export function shown(value) {
 
 const UNITS = { m: "m", mm: "mm", px: "px", rad: "rad", deg: "°", s: "s", frames: "frames", hz: "Hz" };
 
+// Metrics whose names alone mislead.
+const WORDS = { clicks_wrong: "outlier clicks" };
+
 const unitOf = (name) => UNITS[/_([a-z]+)$/.exec(name)?.[1]];
-const withoutUnit = (name) => spoken(unitOf(name) ? name.replace(/_[a-z]+$/, "") : name);
+const withoutUnit = (name) => WORDS[name] ?? spoken(unitOf(name) ? name.replace(/_[a-z]+$/, "") : name);
 
 // The name of a metric, `offset_rms_m`, as a title: `offset rms [m]`.
-export const metric = (name) => (unitOf(name) ? `${withoutUnit(name)} [${unitOf(name)}]` : spoken(name));
+export const metric = (name) => (unitOf(name) ? `${withoutUnit(name)} [${unitOf(name)}]` : withoutUnit(name));
 
 // Why a gate holds a result, `offset_rms_m is 0.05, at most 0.03 passes`, as a person reads it: `offset rms: 0.05 m, limit 0.03 m`.
 export const reason = (text) =>
