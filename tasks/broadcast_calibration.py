@@ -57,22 +57,9 @@ def broadcast_calibration(work: Work) -> str:
         for frame, markings in clicked.items()
         if start <= int(frame) < start + count
     ]
-    if "side" in sources:
-        numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
-
-        def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
-            with open_video(path) as video:
-                for number in np.unique(numbers).tolist():
-                    yield from video.frames(number, number + 1)
-
-        known = None
-        if people is not None and seen is not None:
-            feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
-            known = KnownPeople(seen, feet, float(sources["fps"]), start)
-        key_frames = propose_key_frames(
-            spread_out(), pitch, side=sources["side"], where=str(path), people=known
-        )
     with store.publish(work) as result:
+        if "side" in sources:
+            key_frames = _propose(work, pitch, people, seen)
         calibration = calibrate_broadcast(
             pitch,
             BroadcastClip(
@@ -96,6 +83,29 @@ def broadcast_calibration(work: Work) -> str:
         )
         result.figures.update(_figures(calibration.report))
     return work.key
+
+
+def _propose(
+    work: Work, pitch: PitchTemplate, people: People | None, seen: KeypointDetections | None
+) -> list[KeyFrame]:
+    """Return key frames that are proposed from images spread over the clip."""
+    sources: dict[str, Any] = work.recipe.sources
+    path, count = Path(work.folder) / sources["video"], sources["frame_count"]
+    start = sources["first_frame"] + sources["offset_frames"]
+    numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
+
+    def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        with open_video(path) as video:
+            for number in np.unique(numbers).tolist():
+                yield from video.frames(number, number + 1)
+
+    known = None
+    if people is not None and seen is not None:
+        feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
+        known = KnownPeople(seen, feet, float(sources["fps"]), start)
+    return propose_key_frames(
+        spread_out(), pitch, side=sources["side"], where=str(path), people=known
+    )
 
 
 def _open_pitch(store: Store, work: Work) -> PitchTemplate:

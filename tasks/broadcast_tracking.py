@@ -35,16 +35,16 @@ def broadcast_tracking(work: Work) -> str:
     filmed = open_broadcast(store, work)
     detections, pitch = filmed.detections, filmed.pitch
     path = Path(work.folder) / sources["video"]
-    with open_video(path) as video:
-        start = first + sources["offset_frames"]
-        images = (image for _, image in video.frames(start, start + count))
-        positions = _locate_people(detections, filmed.camera, pitch, images)
-    require_registered(path, sources["video_sha256"])
-    size = (pitch.length, pitch.width)
-    tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
-    index = tracks.detection_index[:, 0]
-    found = int(np.isfinite(positions.xy[..., 0]).sum())
     with store.publish(work) as result:
+        with open_video(path) as video:
+            start = first + sources["offset_frames"]
+            images = (image for _, image in video.frames(start, start + count))
+            positions = _locate_people(detections, filmed.camera, pitch, images)
+        require_registered(path, sources["video_sha256"])
+        size = (pitch.length, pitch.width)
+        tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
+        index = tracks.detection_index[:, 0]
+        found = int(np.isfinite(positions.xy[..., 0]).sum())
         result.write(
             BROADCAST_TRACKING,
             arrays={
