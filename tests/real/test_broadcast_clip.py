@@ -48,9 +48,11 @@ def test_lines_drawn_by_hand_in_further_frames_are_met_within_a_pixel(bench, fou
     off = np.array([row[2] for row in bench.distances(found, bench.estimated_pitch(found), drawn)])
     assert len(off) > 150
     assert np.mean(np.abs(off)) < 0.4  # seen: 0.20 of 512 columns
-    # The markings of the Laws, on the surface that the clip shows.
+    nominal = bench.distances(found, bench.PitchTemplate.standard(), drawn)
+    assert np.mean([abs(row[2]) for row in nominal]) < 1.0  # seen: 0.87
+    # The markings of the Laws on the surface that the clip shows.
     nominal = bench.distances(found, bench.estimated_surface(found), drawn)
-    assert np.mean([abs(row[2]) for row in nominal]) < 1.0  # seen: 0.66
+    assert np.mean([abs(row[2]) for row in nominal]) < 1.0  # seen: 0.64
 
 
 @needs_clip

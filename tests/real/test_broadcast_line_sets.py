@@ -29,5 +29,5 @@ def test_one_drawn_frame_gives_a_main_camera_in_a_main_stand():
     assert ((centers[:, 2] > 8.0) & (centers[:, 2] < 40.0)).all()
     scorer = load_scorer(DATA)
     hits = [jaccards(scorer, lines[name], camera, SIZE) for name, camera in found.items()]
-    # Seen: 96.3, 98.3, 98.3; one marking of the 30 line sets' is 0.5.
+    # Seen: 97.2, 98.3, 98.3; one marking of the 30 line sets' is 0.5.
     assert (100.0 * np.mean(hits, axis=0) >= (95.8, 97.8, 97.8)).all()

@@ -66,9 +66,10 @@ class BroadcastCalibrationSettings(Record):
     crown_std_m: float = Field(default=0.1, ge=0, le=1)
     """Standard deviation of an unmeasured crown from the standard 0.2 m [m]: prior. The pitches of
     two real cameras have about 0.1 m; 0 = as given."""
-    end_fall_std_m: float = Field(default=0.25, ge=0, le=1)
+    end_fall_std_m: float = Field(default=0.1, ge=0, le=1)
     """Standard deviation of an unmeasured fall from the halfway line to the goal lines from 0 [m]:
-    prior, as for static cameras; 0 = as given."""
+    prior; 0 = as given. A clip of one half hardly tells it, unlike static cameras on both sides,
+    and its camera then serves on level pitches, too."""
     pitch_size_std_m: float = Field(default=0.1, ge=0, le=10)
     """Standard deviation of an unmeasured length or width from 105 and 68 m [m]: prior. Top
     competitions prescribe this size; 0 = as given. A pitch of another size needs pitch.json."""

@@ -24,10 +24,10 @@ def pitch(**known):
 
 def test_only_what_nobody_measured_has_an_error():
     usual = PitchErrors.of(pitch(), SETTINGS)
-    np.testing.assert_allclose(usual.size_m, [0.1, 0.1, 0.1, 0.25])
+    np.testing.assert_allclose(usual.size_m, [0.1, 0.1, 0.1, 0.1])
     assert (usual.point_m == 0.03).all()
     given = PitchErrors.of(pitch(length=104.0, crown=0.12), SETTINGS)
-    np.testing.assert_allclose(given.size_m, [0.0, 0.1, 0.0, 0.25])
+    np.testing.assert_allclose(given.size_m, [0.0, 0.1, 0.0, 0.1])
     corner = {"corner_left_near": (-52.51, -34.02, -0.19)}
     surveyed = PitchErrors.of(pitch(points=corner), SETTINGS)
     assert not surveyed.size_m.any()
@@ -41,7 +41,7 @@ def test_a_larger_pitch_moves_corners_and_a_fall_lowers_touch_lines_and_ends():
     ends = np.array([[names.index(name), -1] for name in ("corner_right_near", "center_mark")])
     world = pitch().positions(["corner_right_near", "center_mark"])
     moved = errors.displacement_by_size(ends, np.ones(ends.shape), world)
-    np.testing.assert_allclose(moved[0], [[0.05, -0.05, -0.1], [0.0, 0.0, -0.25]], atol=1e-12)
+    np.testing.assert_allclose(moved[0], [[0.05, -0.05, -0.1], [0.0, 0.0, -0.1]], atol=1e-12)
     np.testing.assert_allclose(moved[1], 0.0, atol=1e-12)
 
 
