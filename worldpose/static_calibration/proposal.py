@@ -57,6 +57,8 @@ MIN_FOUND: Final = 0.6
 MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
+_WELL: Final = (0.75, 0.6)
+"""Both shares; a clear camera that reaches neither of these does not end the search [1]."""
 _AGREES: Final = 0.01
 """Maximum median displacement of markings by the calibration, in image widths [1]."""
 _TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
@@ -267,15 +269,13 @@ def propose_from_paint(
     samples, best = sample_markings(pitch, _FINE[0]), _stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)
     markings, drawn = _support(paint, samples, seen)
-    lengths = seen.lengths[0]
-    on_paint = (lengths * (seen.distances[0] < _ON_PAINT)).sum() / max(lengths.sum(), 1e-9)
     return Proposal(
         _to_camera(best, paint),
         drawn,
         markings,
         float(scores[0]),
         float(scores[0]) - _second(scores),
-        float(on_paint),
+        _on_paint(seen),
         explained_share(paint, seen, 3.0 * _ON_PAINT),
     )
 
@@ -418,6 +418,12 @@ def _rank_under_lenses(
     return best
 
 
+def _on_paint(seen: SeenMarkings) -> float:
+    """Return the share of the first camera's markings that lies on paint [1]."""
+    lengths, near = seen.lengths[0], seen.distances[0] < _ON_PAINT
+    return float((lengths * near).sum() / max(lengths.sum(), 1e-9))
+
+
 def _second(scores: Floats) -> float:
     """Return the score of the best other camera, or that of none [1]."""
     return max(0.0, float(scores[1])) if len(scores) > 1 else 0.0
@@ -435,15 +441,14 @@ def rank_cameras(
         focals: focal lengths to try, in image widths [1]; a single one is kept.
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
+    samples = sample_markings(pitch, _FINE[0])
     if len(scores) and scores[0] - _second(scores) >= MIN_MARGIN:
-        return best, scores
+        seen = project_markings(paint, samples, best[:1])
+        shares = _on_paint(seen), explained_share(paint, seen, 3.0 * _ON_PAINT)
+        if np.greater_equal(shares, _WELL).any():
+            return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
-    return _order(
-        paint,
-        sample_markings(pitch, _FINE[0]),
-        join_candidates(best, rolled),
-        np.append(scores, others),
-    )
+    return _order(paint, samples, join_candidates(best, rolled), np.append(scores, others))
 
 
 def _rank_rolled(
