@@ -55,7 +55,6 @@ from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from data_contracts.pitch import PitchSpec
-from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.errors import InputError
 from worldpose.formats import read_camera
 from worldpose.geometry import Camera
@@ -77,7 +76,6 @@ from worldpose.static_calibration.parameters import by_step
 from worldpose.static_calibration.proposal import propose_from_paint
 from worldpose.static_calibration.sides import turn_camera
 from worldpose.tracking import locate_feet
-from worldpose.video import median_picture, open_video
 
 SIZE = (1280, 720)
 """Width, height of the images of drawn lines [px]."""
@@ -355,22 +353,12 @@ def compare_pair(data: Path) -> None:
         rows = np.concatenate(steps, axis=-1)
         return seen.points_image, rows @ known.covariance @ np.swapaxes(rows, 1, 2)
 
-    for side, offset in static_pair.SIDES.items():
-        with open_video(folder / f"{side}_camera.mp4") as video:
-            numbers = (offset + np.linspace(8, 47, 25)).astype(int).tolist()
-            shown = (image for n in numbers for _, image in video.frames(n, n + 1))
-            still = median_picture(shown, len(numbers))
-        world, pixels = static_pair.read_clicks(folder, side)
-        points = {name: tuple(place) for name, place in world.items()}
-        named = PitchTemplate.from_spec(PitchSpec(crown=CROWN, points=points))
-        clicks = tuple(ClickedPoint(name=name, xy=pixel) for name, pixel in pixels.items())
+    for side in static_pair.SIDES:
+        still = static_pair.median_still(folder, side)
+        named, clicks = static_pair.clicked_pitch(folder, side)
         (first, one), (second, two) = (
             see(calibrate_without_clicks(level, still, side="near")),
-            see(
-                calibrate_camera(
-                    named, ClickedMarkings(points=clicks), static_pair.SIZE, picture=still
-                )
-            ),
+            see(calibrate_camera(named, clicks, static_pair.SIZE, picture=still)),
         )
         inside = np.asarray(((first > 0.0) & (first < static_pair.SIZE)).all(axis=1))
         away = (second - first)[inside]

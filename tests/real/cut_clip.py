@@ -12,12 +12,10 @@ import cv2
 import numpy as np
 import static_pair
 
-from data_contracts.pitch import PitchSpec
-from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.geometry import Camera, Rigid
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate_camera
-from worldpose.video import median_picture, open_video, write_video
+from worldpose.video import open_video, write_video
 
 SIZE = (1280, 720)
 FRAMES, FPS = 150, 25.0
@@ -47,19 +45,11 @@ class CutClip:
 
 
 def calibrate_static(data, side):
-    """Return a static camera and the pitch with its surface, from clicks and painted lines."""
-    offset = static_pair.SIDES[side]
-    with open_video(data / f"{side}_camera.mp4") as video:
-        numbers = (offset + np.linspace(8, 47, 25)).astype(int).tolist()
-        shown = (image for number in numbers for _, image in video.frames(number, number + 1))
-        still = median_picture(shown, len(numbers))
-    places, pixels = static_pair.read_clicks(data, side)
-    points = {name: tuple(place) for name, place in places.items()}
-    named = PitchTemplate.from_spec(PitchSpec(crown=static_pair.CROWN, points=points))
-    clicks = tuple(ClickedPoint(name=name, xy=pixel) for name, pixel in pixels.items())
-    found = calibrate_camera(
-        named, ClickedMarkings(points=clicks), static_pair.SIZE, picture=still
-    ).report.lines.estimate
+    """Return a static camera and the pitch with its surface, from clicks and lines; the clicks."""
+    named, clicks = static_pair.clicked_pitch(data, side)
+    still = static_pair.median_still(data, side)
+    found = calibrate_camera(named, clicks, static_pair.SIZE, picture=still).report.lines.estimate
+    pixels = {point.name: point.xy for point in clicks.points}
     return found.camera, PitchTemplate.standard().with_surface(found.surface), pixels
 
 

@@ -11,7 +11,11 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
+from data_contracts.pitch import PitchSpec
+from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
+from worldpose.pitch import PitchTemplate
 from worldpose.pitch.template import law_points
+from worldpose.video import median_picture, open_video
 
 CROWN = 0.1
 """Height of the long axis above the touch lines [m]; it fits both cameras better than 0.2."""
@@ -54,6 +58,23 @@ def read_clicks(data, side, *, correct_labels=True):
 
 SIDES = {"left": 4, "right": 0}
 """Offset of each camera's frames; the left video is four frames late."""
+
+
+def median_still(data, side):
+    """Return the median of frames 8 to 47 (height, width, 3) RGB of one camera."""
+    with open_video(data / f"{side}_camera.mp4") as video:
+        numbers = (SIDES[side] + np.linspace(8, 47, 25)).astype(int).tolist()
+        shown = (image for number in numbers for _, image in video.frames(number, number + 1))
+        return median_picture(shown, len(numbers))
+
+
+def clicked_pitch(data, side):
+    """Return the pitch with the clicked places as points, and the clicks of one camera."""
+    places, pixels = read_clicks(data, side)
+    points = {name: tuple(place) for name, place in places.items()}
+    clicks = tuple(ClickedPoint(name=name, xy=pixel) for name, pixel in pixels.items())
+    pitch = PitchTemplate.from_spec(PitchSpec(crown=CROWN, points=points))
+    return pitch, ClickedMarkings(points=clicks)
 
 
 def write_static_pair(
