@@ -308,7 +308,8 @@ class Views:
         """Return all cameras, added to a pair one by one, the one with the most joints first.
 
         Raises:
-            InputError: a camera shares no person with the others.
+            InputError: a camera shares no person with the others, or no keypoint agrees with the
+                cameras.
         """
         a, b = pair.cameras
         poses = {a: Rigid(np.eye(3), np.zeros(3)), b: pair.pose}
@@ -332,7 +333,14 @@ class Views:
             poses = self._refine(poses, shown)
         order = list(range(len(self.names)))
         cameras = self._place(order, poses)
-        return Start(cameras, self._observe(order, cameras, shown, poses))
+        observed = self._observe(order, cameras, shown, poses)
+        if not len(observed.image):
+            raise refusal(
+                self.names,
+                "people whose joints lie where two cameras show them",
+                "none: the cameras' lenses are other ones, or these are different people",
+            )
+        return Start(cameras, observed)
 
     def _place(self, order: list[int], poses: dict[int, Rigid]) -> Camera:
         """Return the batch of some cameras with their poses."""

@@ -187,3 +187,10 @@ def test_a_camera_that_shows_another_person_is_named(walkers, cameras):
     keypoints[:, 1] = keypoints[::-1, 1] * [-1.0, 1.0] + [1280.0, 0.0]
     with pytest.raises(InputError, match="east: expected a person for 20 frames that"):
         locate_cameras(lenses(cameras), replace(given, keypoints=keypoints), FPS, KnownLength(1.8))
+
+
+def test_cameras_that_no_keypoint_agrees_with_are_refused(walkers, cameras, monkeypatch):
+    # Every keypoint counts as a gross error.
+    monkeypatch.setattr("worldpose.bundle_adjustment.people_views.GROSS", 0.0)
+    with pytest.raises(InputError, match="joints lie where two cameras show them, found none"):
+        locate_cameras(lenses(cameras), seen(cameras, walkers[:, :1]), FPS, KnownLength(1.8))
