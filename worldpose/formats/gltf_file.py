@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.body import SKELETONS, BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
@@ -23,7 +23,6 @@ from worldpose.geometry import Camera
 _KINDS: Final = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _TYPES: Final = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-_LINE_STRIP: Final = 3
 _SHORT: Final = 32767
 INFLUENCES: Final = 8
 """Joints of a vertex in two sets of four; viewers must read one set, and most read both."""
@@ -31,6 +30,8 @@ NEAR_M: Final = 0.1
 """Near plane of cameras [m]."""
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation from glTF's camera axes (y up, looking along -z) to OpenCV's."""
+MARKING_WIDTH_M: Final = 0.12
+"""Width of painted lines, at most, by the Laws [m]: programs do not render lines without width."""
 LAWN_MARGIN_M: Final = 4.0
 """Width of the lawn around the markings [m]."""
 LAWN_DEPTH_M: Final = 0.02
@@ -349,16 +350,20 @@ class _Writer:
         return index
 
     def add_pitch(self, markings: Sequence[Floats]) -> int:
-        """Add the markings as lines, above a lawn; return the node."""
-        paint = {"pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0]}}
-        grass = {
-            "pbrMetallicRoughness": {
-                "baseColorFactor": [0.12, 0.35, 0.14, 1.0],
-                "metallicFactor": 0.0,
-                "roughnessFactor": 1.0,
-            }
-        }
-        lawn, white = self.file.add("materials", grass), self.file.add("materials", paint)
+        """Add the markings as flat strips, above a lawn; return the node."""
+        lawn, white = (
+            self.file.add(
+                "materials",
+                {
+                    "pbrMetallicRoughness": {
+                        "baseColorFactor": [*color, 1.0],
+                        "metallicFactor": 0.0,
+                        "roughnessFactor": 1.0,
+                    }
+                },
+            )
+            for color in ((0.12, 0.35, 0.14), (1.0, 1.0, 1.0))
+        )
         points = np.concatenate(list(markings))
         low, high = points.min(axis=0), points.max(axis=0)
         (x0, y0), (x1, y1) = low[:2] - LAWN_MARGIN_M, high[:2] + LAWN_MARGIN_M
@@ -377,12 +382,40 @@ class _Writer:
                 "material": lawn,
             }
         ]
-        for line in markings:
-            place = self.file.accessor(line.astype(np.float32), _VERTICES, bounds=True)
-            strip = {"attributes": {"POSITION": place}, "mode": _LINE_STRIP, "material": white}
-            shapes.append(strip)
+        vertices, triangles = paint_strips(markings)
+        painted = {
+            "POSITION": self.file.accessor(vertices.astype(np.float32), _VERTICES, bounds=True),
+            "NORMAL": self.file.accessor(
+                np.broadcast_to(up[:1], vertices.shape).astype(np.float32), _VERTICES
+            ),
+        }
+        wide = np.uint16 if len(vertices) < 65535 else np.uint32
+        faces = self.file.accessor(triangles.ravel().astype(wide), _INDICES)
+        shapes.append({"attributes": painted, "indices": faces, "material": white})
         mesh = self.file.add("meshes", {"name": "pitch", "primitives": shapes})
         return self.file.add("nodes", {"name": "pitch", "mesh": mesh})
+
+
+def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
+    """Return flat strips along lines: vertices (n, 3) [m] and triangles (m, 3), which face up.
+
+    Args:
+        markings: lines on the pitch (points, 3) [m], world, of two points or more.
+    """
+    vertices, triangles, first = [], [], 0
+    for line in markings:
+        way = np.gradient(line[:, :2], axis=0)
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        aside = 0.5 * MARKING_WIDTH_M * np.column_stack([-way[:, 1], way[:, 0], 0.0 * way[:, 0]])
+        vertices += [line + aside, line - aside]
+        left = first + np.arange(len(line))
+        right = left + len(line)
+        triangles += [
+            np.column_stack([left[:-1], right[:-1], right[1:]]),
+            np.column_stack([left[:-1], right[1:], left[1:]]),
+        ]
+        first += 2 * len(line)
+    return np.concatenate(vertices), np.concatenate(triangles)
 
 
 def body_frames(poses: BodyParameters) -> Flags:

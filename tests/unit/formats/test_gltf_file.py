@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from worldpose.body import SKELETONS, BodyParameters, load_open_body
 from worldpose.errors import InputError
-from worldpose.formats.gltf_file import AnimatedBody, write_gltf
+from worldpose.formats.gltf_file import AnimatedBody, paint_strips, write_gltf
 from worldpose.geometry import Camera
 
 FPS, FRAMES = 50.0, 60
@@ -168,6 +168,18 @@ def test_thirty_seconds_of_22_people_take_at_most_10_mb(model, tmp_path):
         nodes = [found["frames"][0]["nodes"][f"{body.name}_{j}"] for j in SKELETONS["smpl24"]]
         places = np.array([node["place"] for node in nodes])
         assert np.abs(places - model.joints(body.poses[700])).max() < 1e-4
+
+
+def test_markings_are_strips_of_their_painted_width_that_face_up():
+    straight = np.array([[-2.0, 1.0, 0.0], [0.0, 1.0, 0.1], [2.0, 1.0, 0.0]])
+    vertices, triangles = paint_strips([straight, straight[:2, [1, 0, 2]]])
+    np.testing.assert_allclose(np.unique(vertices[:6, 1]), [0.94, 1.06])
+    np.testing.assert_allclose(np.unique(vertices[6:, 0]), [0.94, 1.06])
+    np.testing.assert_allclose(vertices[:3, [0, 2]], straight[:, [0, 2]])
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    areas = np.cross(b - a, c - a)[:, 2] / 2.0
+    assert areas.min() > 0.0
+    assert areas.sum() == pytest.approx(0.12 * 6.0)
 
 
 def test_without_a_surface_the_file_has_joints_alone(model, tmp_path):
