@@ -386,7 +386,8 @@ def _trace_thin_markings(
 ) -> tuple[DrawnMarking, ...]:
     """Return pixels on the markings whose paint is too thin for the search of painted lines.
 
-    Without them nothing holds the camera beyond the last line that was found.
+    Without them nothing holds the camera beyond the last line that was found: on two real cameras
+    the far touch line was 3.6 px off, 1.1 m on the ground.
     """
     lines = calibration.report.lines
     if lines is None or not lines.refined:
@@ -398,8 +399,7 @@ def _trace_thin_markings(
         pixels = camera.project(there.marking_points(name, settings.sample_spacing_m))
         traced = trace_marking(picture, pixels)
         if len(traced):
-            few = traced[:: -(-len(traced) // _DRAWN)].tolist()  # neighbours share their errors
-            found.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in few)))
+            found.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in traced.tolist())))
     return tuple(found)
 
 
