@@ -251,13 +251,13 @@ def _row(
     def mean(figure: str, digits: int) -> str:
         return f"{np.mean(values(figure)):.{digits}f}" if scores else "-"
 
-    def format_figure(figure: str, digits: int) -> str:
-        return f"{mean(figure, digits)} ± {np.std(values(figure)):.{digits}f}" if scores else "-"
+    def mean_and_deviation(metric: str) -> str:
+        return f"{mean(metric, 1)} ± {np.std(values(metric)):.1f}" if scores else "-"
 
     return (
         name,
-        format_figure("g_mpjpe_mm", 1),
-        format_figure("pa_mpjpe_mm", 1),
+        mean_and_deviation("g_mpjpe_mm"),
+        mean_and_deviation("pa_mpjpe_mm"),
         mean("ground_error_m", 3),
         mean("marking_error_px", 2),
         "-" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}",

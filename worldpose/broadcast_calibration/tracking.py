@@ -157,7 +157,7 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
         focal=np.repeat(camera.focal, 2),
         distortion=np.repeat(camera.distortion, 2, axis=0),
     )
-    return _fit_turn(both, followed, 4)
+    return _fit_turn(both, followed)
 
 
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
@@ -191,34 +191,32 @@ def modified_z_scores(residual: Floats) -> Floats:
     return np.asarray((0.6745 * off / spread).max(axis=-1))
 
 
-def _fit_turn(both: MovingCamera, followed: Followed, count: int) -> Turned:
-    """Return the second of two frames with fitted rotation and, if `count` is 4, zoom."""
+def _fit_turn(both: MovingCamera, followed: Followed) -> Turned:
+    """Return the second of two frames with fitted rotation and zoom."""
     if len(followed.start) < _FEW:
         return Turned(both, np.full((len(followed.start), 2), np.nan), False)
     bounds = np.array([0, len(followed.start), len(followed.start)])
     ones = np.ones(len(followed.start))
     # The median motion is a robust start.
     x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
-    both = _move_second(both, np.array([-y, x, 0.0, 0.0])[:count])
+    both = _move_second(both, np.array([-y, x, 0.0, 0.0]))
     for scale in _SCALES:
         equations = empty_equations(2, 5)
         flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
         add_flow(both.arrays, bounds, flow, equations)
-        normal = equations.blocks[0, 1, :count, :count]
+        normal = equations.blocks[0, 1, :4, :4]
         normal = normal + 1e-9 * np.diag(np.diag(normal))
         if not np.linalg.cond(normal) < 1e12:
             return Turned(both, flow_residuals(both, followed), False)
-        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :count])))
+        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :4])))
     return Turned(both, flow_residuals(both, followed), True)
 
 
 def _move_second(both: MovingCamera, step: Floats) -> MovingCamera:
-    """Return both frames after a step of the second: rotation (3,), or with log focal (4,)."""
+    """Return both frames after a step (4,) of the second: rotation, log focal length."""
     whole = np.zeros((2, 7))
-    whole[1, : len(step)] = step
+    whole[1, :4] = step
     moved = both.take_step(whole, np.zeros(5))
-    if len(step) == 3:
-        return moved
     growth = (moved.focal[1] / moved.focal[0]) ** _LENS
     lens = np.stack([both.distortion[0], both.distortion[0] * growth])
     return replace(moved, distortion=lens)

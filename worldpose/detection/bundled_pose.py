@@ -145,7 +145,7 @@ class BundledPoseEstimator:
             boxes=np.full((len(boxes), 4), np.nan),
             fit=np.full(len(boxes), np.nan),
         )
-        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes, CROP)]
+        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
         for start in range(0, len(maps), BATCH):
             part = maps[start : start + BATCH]
             end = start + len(part)
@@ -306,16 +306,14 @@ def _show_others(seen: CropEstimates, known: Floats, least: float) -> Flags:
     return np.asarray(real & apart & (seen.score >= least))
 
 
-def crops_around(boxes: Floats, size: tuple[int, int], margin: float = MARGIN) -> Floats:
+def crops_around(boxes: Floats) -> Floats:
     """Return the crops (people, 3) that show boxes whole: centre x, y [px], frame px per crop px.
 
     Args:
         boxes: (people, 4) x0, y0, x1, y1 [px].
-        size: width, height of a crop [px].
-        margin: size of the crop over that of the box.
     """
     sides = boxes[:, 2:] - boxes[:, :2]
-    scale = margin * np.max(sides / np.array(size), axis=1)
+    scale = MARGIN * np.max(sides / np.array(CROP), axis=1)
     middle = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     return np.column_stack([middle, np.maximum(scale, 1e-3)])
 

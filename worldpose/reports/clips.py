@@ -161,11 +161,10 @@ def plot_stadium(
     cameras: Mapping[str, Camera],
     title: str,
     tracks: JointTracks,
-    frame: int,
     *,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of the stadium from above in one frame: cameras, fields of view, people.
+    """Return a PNG of the stadium from above in the first frame: cameras, fields of view, people.
 
     Shading shows the ground in each camera's field of view, on and near the pitch if there is one:
     the more cameras see a place, the darker it is.
@@ -174,10 +173,9 @@ def plot_stadium(
         cameras: single cameras by id.
         title: names the frame.
         tracks: people, one colour each, with their ids.
-        frame: index in `tracks` of the frame to draw.
         pitch: draw its markings; None without a pitch.
     """
-    hips = tracks.joints[frame][:, HIPS, :2].mean(axis=1)
+    hips = tracks.joints[0][:, HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))

@@ -118,7 +118,6 @@ def build_problem(
     evidence: Evidence,
     image_size: tuple[int, int],
     settings: StaticCalibrationSettings,
-    distortion: str | None = None,
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
 ) -> Problem:
@@ -128,13 +127,12 @@ def build_problem(
         evidence: clicks and drawn markings.
         image_size: width, height [px].
         settings: noise, prior, free coefficients.
-        distortion: radial coefficients to solve for, if not those of the settings.
         where: file or camera, for messages.
         lens: replaces the prior of focal length, principal point and distortion.
     """
     width, height = image_size
     known = settings.prior
-    radial = {"none": 0, "k1": 1, "k1_k2": 2, "k1_k2_k3": 3}[distortion or settings.distortion]
+    radial = {"none": 0, "k1": 1, "k1_k2": 2, "k1_k2_k3": 3}[settings.distortion]
     free = np.ones(len(PARAMETERS), dtype=np.bool_)
     free[9 + radial :] = False
     middle = (0.5 * (width - 1), 0.5 * (height - 1))

@@ -14,6 +14,8 @@ from worldpose.errors import InputError
 
 MIN_VIEWS: Final = 4
 """Least images with a board [1]: leaving out one must leave three, which determine a lens."""
+MAX_VIEWS: Final = 40
+"""Maximum views of a video [1]."""
 MIN_CORNERS: Final = 8
 """Least corners of a board in an image [1]."""
 MAX_BEND: Final = 0.25
@@ -284,14 +286,13 @@ def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
 
 
 def choose_views(
-    frames: Iterable[Image], board: Board, most: int = 40
+    frames: Iterable[Image], board: Board
 ) -> tuple[list[BoardView | None], tuple[int, int]]:
     """Return different views of a board in the frames of a video, and the frames' size.
 
     Args:
         frames: (height, width, 3) each.
         board: the board.
-        most: most views.
     """
     views: list[BoardView | None] = []
     size = (0, 0)
@@ -301,7 +302,7 @@ def choose_views(
         if view is None or any(_is_same(view, other, size[0]) for other in views if other):
             continue
         views.append(view)
-        if len(views) == most:
+        if len(views) == MAX_VIEWS:
             break
     return views, size
 

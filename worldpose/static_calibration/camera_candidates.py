@@ -46,6 +46,9 @@ _BY_CHANCE: Final = 0.05
 INDEPENDENT: Final = 1.0 / 32.0
 """Length of a marking that counts as one observation, in image widths [1]: what hides paint has
 this size."""
+_NEAR_SAMPLE: Final = 12.0
+"""Maximum distance of explained paint from a sample of a marking [px]; samples are up to tens of
+pixels apart."""
 _ITERATIONS: Final = 4
 """Steps of each stage [1]."""
 _ROLL_STD: Final = 0.015
@@ -489,14 +492,12 @@ def _move(candidates: Candidates, step: Floats) -> Candidates:
     )
 
 
-def explained_share(paint: PaintMap, seen: SeenMarkings, reach: float) -> float:
+def explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
     """Return the share of the segments' length that lies on a projected marking [1].
 
     Args:
         paint: paint of the image.
         seen: the markings in view of one candidate.
-        reach: largest distance from a sample of a marking [px]; samples are up to tens of pixels
-            apart.
     """
     width, height = paint.size
     canvas = np.ones((height, width), np.uint8)
@@ -509,6 +510,6 @@ def explained_share(paint: PaintMap, seen: SeenMarkings, reach: float) -> float:
         count = max(2, int(np.linalg.norm(end - start)))
         x, y = np.linspace(start, end, count).T
         row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-        on += float((away[row.astype(int), column.astype(int)] < reach).sum())
+        on += float((away[row.astype(int), column.astype(int)] < _NEAR_SAMPLE).sum())
         total += count
     return on / max(total, 1.0)

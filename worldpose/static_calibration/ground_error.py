@@ -130,6 +130,10 @@ _PLACES = 5.0
 """Grid spacing of the summed gain over the pitch [m]."""
 _DRAWN = 5
 """Assumed number of drawn pixels per marking [1]."""
+_PROPOSED = 3
+"""Names to propose after a calibration [1]."""
+_NAMED = 4
+"""Points to name in a message [1]: as many as a camera needs."""
 
 
 def propose_clicks(
@@ -137,7 +141,6 @@ def propose_clicks(
     pitch: PitchTemplate,
     clicked: tuple[str, ...],
     noise: float,
-    count: int = 3,
 ) -> tuple[str, ...]:
     """Return the points and markings whose clicks would lower the expected ground error most.
 
@@ -148,7 +151,6 @@ def propose_clicks(
         pitch: the template.
         clicked: names that already have clicks.
         noise: noise of a click [px].
-        count: maximum number of names.
     """
     motion = _visible_motion(estimate, pitch)
     if not len(motion):
@@ -161,7 +163,7 @@ def propose_clicks(
     }
     covariance = estimate.covariance
     chosen: list[str] = []
-    while candidates and len(chosen) < count:
+    while candidates and len(chosen) < _PROPOSED:
         best, gain, best_update = "", 0.0, np.zeros_like(covariance)
         for name, rows in candidates.items():
             through = covariance @ rows.T
@@ -179,10 +181,8 @@ def propose_clicks(
     return tuple(chosen)
 
 
-def points_off_line(
-    pitch: PitchTemplate, points_world: NDArray[np.float64], count: int = 4
-) -> tuple[str, ...]:
-    """Return points of the pitch near the given ones and farthest off the line through them."""
+def points_off_line(pitch: PitchTemplate, points_world: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return four points of the pitch near given ones and farthest off the line through them."""
     middle = points_world.mean(axis=0)
     _, _, axes = np.linalg.svd(points_world[:, :2] - middle[:2])
     offsets = {
@@ -190,7 +190,7 @@ def points_off_line(
     }
     near = {name: off for name, off in offsets.items() if np.linalg.norm(off) < _NEARBY}
     ranked = sorted(near, key=lambda name: -abs(float(near[name] @ axes[1])))
-    return tuple(ranked[:count])
+    return tuple(ranked[:_NAMED])
 
 
 def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[np.float64]:
@@ -233,16 +233,13 @@ def _inside(estimate: CameraEstimate, pixels: NDArray[np.float64]) -> NDArray[np
     return np.asarray(within.all(axis=1))
 
 
-def points_in_view(
-    camera: Camera, pitch: PitchTemplate, lines: Collection[str], count: int = 4
-) -> tuple[str, ...]:
-    """Return named points on the ground that a camera sees, ends of some lines first, far apart.
+def points_in_view(camera: Camera, pitch: PitchTemplate, lines: Collection[str]) -> tuple[str, ...]:
+    """Return four points on the ground that a camera sees, ends of some lines first, far apart.
 
     Args:
         camera: a single camera.
         pitch: the template.
         lines: lines that the image shows.
-        count: maximum number of points.
     """
     names = [name for name, place in pitch.points.items() if place[2] < _GROUND]
     pixels = camera.project(pitch.positions(names))
@@ -252,7 +249,7 @@ def points_in_view(
     ends = {end for line in shown for end in (line.start, line.end)}
     away = dict.fromkeys(left, np.inf)
     chosen: list[str] = []
-    while left and len(chosen) < count:
+    while left and len(chosen) < _NAMED:
         best = max(left, key=lambda name: (name in ends, away[name]))
         here = left.pop(best)
         chosen.append(best)

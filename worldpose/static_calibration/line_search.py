@@ -389,7 +389,7 @@ class LineSearch:
             known = np.isfinite(adjusted.residuals)
             scaled = (adjusted.residuals / np.sqrt(variances))[known]
             self.noise = before.update(self.least, adjusted.paint, scaled)
-            if not self.noise.differs_from(before, _LEARNED):
+            if self.noise.relative_difference(before) < _LEARNED:
                 break
         measured = replace(found.measured, variances=own * self.noise.reading**2)
         seen = self.look(found.camera, found.samples)

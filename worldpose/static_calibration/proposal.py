@@ -276,7 +276,7 @@ def propose_from_paint(
         float(scores[0]),
         float(scores[0]) - _second(scores),
         _on_paint(seen),
-        explained_share(paint, seen, 3.0 * _ON_PAINT),
+        explained_share(paint, seen),
     )
 
 
@@ -444,7 +444,7 @@ def rank_cameras(
     samples = sample_markings(pitch, _FINE[0])
     if len(scores) and scores[0] - _second(scores) >= MIN_MARGIN:
         seen = project_markings(paint, samples, best[:1])
-        shares = _on_paint(seen), explained_share(paint, seen, 3.0 * _ON_PAINT)
+        shares = _on_paint(seen), explained_share(paint, seen)
         if np.greater_equal(shares, _WELL).any():
             return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])

@@ -161,7 +161,7 @@ def keypoint_batch(
         middle = 0.5 * (box[:2] + box[2:]) + off
         half = 0.5 * sides * np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
         given = np.concatenate([middle - half, middle + half])
-        crop = crops_around(given[None], CROP)[0]
+        crop = crops_around(given[None])[0]
         mirrored = bool(rng.random() < 0.5)
         turned = bool(rng.random() < settings.turned)
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0

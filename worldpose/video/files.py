@@ -344,7 +344,7 @@ def _stored_pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDA
     return np.ascontiguousarray(rows[:, : picture.width])
 
 
-def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | None = None) -> int:
+def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
     """Write a range of frames of a video without re-encoding.
 
     Decoding begins at key frames: the file also holds some frames before the first one wanted, and
@@ -355,7 +355,6 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
         start: number of the first frame.
         stop: one past the last.
         out: the file to write, of the same kind.
-        index: index of the video; if None, it is computed.
 
     Returns:
         The number of frame `start` in the new file.
@@ -363,7 +362,7 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
     Raises:
         InputError: no video, or it has no such frames.
     """
-    index = index_frames(path) if index is None else index
+    index = index_frames(path)
     if not 0 <= start < stop <= len(index):
         raise InputError(
             str(path),
