@@ -1,6 +1,6 @@
 """Candidate cameras from a segment of paint and the circle around it (C2).
 
-Where the centre circle, or the arc of a penalty area, is in view, one straight marking beside it
+Where the centre circle, or the arc of a penalty area, is in view, one straight marking next to it
 determines a camera without roll: midfield shows no three straight markings. On the ground the
 normal of a circle passes through its centre, so that every pixel of paint votes for one circle.
 """
@@ -40,7 +40,7 @@ _ARC_POINTS: Final = 1200
 """Pixels of paint that vote for circles, at least [1]."""
 _ARC_REACH: Final = 14.0
 """Reach of the neighbors that give the direction of a pixel's paint [px]."""
-_ARCS: Final = 400
+_MAX_CANDIDATES: Final = 400
 """Maximum candidates from circles, those with the most paint [1]."""
 
 
@@ -101,7 +101,7 @@ def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
     segment and its normal give radius and centre of the one circle for which it votes.
     """
     rows, counts = [np.empty((0, 9))], [np.zeros(0)]
-    for seen in _beside_segments(paint, focals, roll):
+    for seen in _ground_paint(paint, focals, roll):
         across = np.stack([seen.along[:, 1], -seen.along[:, 0]], axis=-1)
         for arc in _painted_arcs(pitch):
             for sign in (1.0, -1.0) if arc.side else (0.0,):
@@ -118,13 +118,13 @@ def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                 fits = (count >= _MIN_ARC) & are_plausible(pitch, up, x, y)
                 rows.append(np.column_stack([seen.focals, seen.tilts, up, *axes, x, y])[fits])
                 counts.append(count[fits])
-    best = np.argsort(-np.concatenate(counts), kind="stable")[:_ARCS]
+    best = np.argsort(-np.concatenate(counts), kind="stable")[:_MAX_CANDIDATES]
     level = level_cameras(np.concatenate(rows)[best])
     return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
 
-class _Beside(NamedTuple):
-    """Pixels of paint beside a segment, in the ground frame of level cameras.
+class _Paint(NamedTuple):
+    """Pixels of paint around a segment, in the ground frame of level cameras.
 
     Attributes:
         focals: (g,) [px].
@@ -132,7 +132,7 @@ class _Beside(NamedTuple):
         along: (g, 2) unit vector of the segment.
         offset: (g,) of the segment across it, to its right [1].
         places: (g, m, 2) of the pixels to the right of the segment and along it [1].
-        normals: (g, m, 2) unit normals of the paint, likewise.
+        normals: (g, m, 2) unit normals of the paint, in the same axes.
     """
 
     focals: Floats
@@ -143,8 +143,8 @@ class _Beside(NamedTuple):
     normals: Floats
 
 
-def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Beside]:
-    """Yield the paint beside each segment at all focal lengths and tilts."""
+def _ground_paint(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Paint]:
+    """Yield the paint around each segment at all focal lengths and tilts."""
     middle = 0.5 * np.array([paint.size[0] - 1, paint.size[1] - 1])
     points, ways = _paint_directions(paint.points)
     if not len(points):
@@ -169,7 +169,7 @@ def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_
         axes = np.stack([along[:, ::-1] * [1.0, -1.0], along], axis=-1)[kept]
         offset = (lines[kept, index].mean(axis=1) * axes[..., 0]).sum(axis=-1)
         beside = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
-        yield _Beside(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
+        yield _Paint(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
 
 
 def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
@@ -196,8 +196,8 @@ def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
     return mean[clear], axes[clear][:, :, 1]
 
 
-def _vote_circle(seen: _Beside, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
-    """Return radius, centre along the segment and share of pixels (g,) of the circle most vote for.
+def _vote_circle(seen: _Paint, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
+    """Return radius, centre along the segment and share of votes (g,) of the best circle.
 
     Args:
         seen: paint.
