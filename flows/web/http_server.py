@@ -208,6 +208,7 @@ def serve_http(
     *,
     host: str,
     port: int,
+    max_connections: int = MAX_CONNECTIONS,
     announce: Callable[[], None] = lambda: None,
     **options: Any,  # noqa: ANN401
 ) -> None:
@@ -217,13 +218,15 @@ def serve_http(
         app: the application.
         host: name or address to listen at.
         port: port; 0 = any free one.
+        max_connections: open connections, limited to a quarter of the files that this process can
+            open.
         announce: called when the port is ours, and before it is served.
         options: further options of `uvicorn.Config`.
 
     Raises:
         InputError: the port is taken, or the host is not an address of this machine.
     """
-    connections = Connections(MAX_CONNECTIONS)
+    connections = Connections(max_connections)
     protocol = type("Protocol", (_Protocol,), {"connections_open": connections})
     config = uvicorn.Config(
         app,
