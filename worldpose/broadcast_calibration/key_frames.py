@@ -18,7 +18,7 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
@@ -40,9 +40,9 @@ from worldpose.static_calibration.parameters import nearest_on_markings
 from worldpose.static_calibration.sides import INDEPENDENT_S, MIN_EVIDENCE, compare_sides
 from worldpose.tracking import locate_feet
 
-_ROUNDS = 3
+_ITERATIONS = 3
 """Iterations that match drawn markings and painted lines again [1]."""
-_SAME_CENTER = 0.1
+_CENTER_TOLERANCE = 0.1
 """Largest distance of a proposal's center from the median one, of its distance to the centre spot
 [1]: from one frame alone the distance trades with the focal length."""
 _MIN_PROPOSALS = 2
@@ -90,7 +90,7 @@ def propose_key_frames(
 
     Raises:
         InputError: fewer than two frames have a clear proposal with one center; the people do not
-            tell the side, or contradict the stated one.
+            decide the side, or contradict the stated one.
     """
     clear, seen = [], 0
     for number, picture in pictures:
@@ -102,7 +102,7 @@ def propose_key_frames(
                 clear.append((number, proposal))
     centers = np.array([each.camera.center for _, each in clear]).reshape(-1, 3)
     middle = np.median(centers, axis=0) if len(clear) else np.zeros(3)
-    reach = _SAME_CENTER * float(np.linalg.norm(middle))
+    reach = _CENTER_TOLERANCE * float(np.linalg.norm(middle))
     agreed = np.linalg.norm(centers - middle, axis=1) <= reach
     if np.count_nonzero(agreed) < max(_MIN_PROPOSALS, len(clear) // 2 + 1):
         raise InputError(
@@ -131,13 +131,13 @@ def _must_turn(
     """Return whether the people stand where they are only after half a turn of the cameras.
 
     Raises:
-        InputError: they do not tell, or they contradict the stated side.
+        InputError: they do not decide, or they contradict the stated side.
     """
-    same, turned = (0.0, 0.0) if people is None else _agreement(cameras, pitch, people)
+    same, turned = (0.0, 0.0) if people is None else _compare_people(cameras, pitch, people)
     if side is None and abs(same - turned) < MIN_EVIDENCE:
         raise InputError(
             where,
-            expected="people of the static cameras in the clip, who tell the camera's side",
+            expected="people of the static cameras in the clip, who decide the camera's side",
             found=f"no agreement that decides between two sides (evidence "
             f"{abs(same - turned):.0f}, {MIN_EVIDENCE:g} needed)",
             todo="State the broadcast camera's side (near, far, left, right) in match.yaml.",
@@ -153,7 +153,7 @@ def _must_turn(
     return side is None and turned > same
 
 
-def _agreement(
+def _compare_people(
     cameras: Mapping[int, Camera], pitch: PitchTemplate, people: KnownPeople
 ) -> tuple[float, float]:
     """Return how well people agree if the cameras stand as assumed, and after half a turn.
@@ -248,17 +248,17 @@ def calibrate_keys(
     clicked = {key.frame - first: key for key in key_frames}
     wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
     estimates = [each.estimate for each in found.values()]
-    camera = _of_one_place(estimates)
+    camera = _share_center(estimates)
     errors = PitchErrors.of(pitch, settings)
     surface = pitch.surface
     clicks = PointEvidence.none()
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         samples = FieldSamples.of(pitch, errors, surface)
         parts, lines = [], []
         for index, frame in enumerate(found):
             single = camera.frames(slice(index, index + 1))
             parts.append(
-                _clicks(
+                _click_evidence(
                     pitch,
                     clicked[frame],
                     index,
@@ -271,9 +271,9 @@ def calibrate_keys(
             if frame in pictures:
                 seen, _ = find_lines(single, samples, pictures[frame], None, settings)
                 lines.append(seen.in_frame(index))
-        clicks = together(parts)
+        clicks = join_evidence(parts)
         problem = Problem(
-            points=together([clicks, *lines]),
+            points=join_evidence([clicks, *lines]),
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
@@ -284,7 +284,7 @@ def calibrate_keys(
     return Keys(np.array(list(found)), camera, surface, clicks, refused, wrong)
 
 
-def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
+def _share_center(estimates: Sequence[CameraEstimate]) -> MovingCamera:
     """Return cameras with the covariance-weighted mean of centers and principal points."""
     information, right = np.zeros((5, 5)), np.zeros(5)
     for estimate in estimates:
@@ -303,11 +303,11 @@ def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
         camera = estimate.camera
         batch = type(camera).stack([camera])
         single = MovingCamera.of(batch, shared[:3], shared[3:])
-        parts.append(_kept_aim(single, camera.center, camera.principal_point))
+        parts.append(_keep_aim(single, camera.center, camera.principal_point))
     return join_cameras(parts)
 
 
-def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
+def _keep_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
     """Return a single frame with rotation and focal length changed to show the same ground.
 
     Args:
@@ -326,7 +326,7 @@ def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> 
     off = np.append(
         (camera.image_size - 1.0 - 2.0 * camera.principal_point) / 2.0 / camera.focal[0], 1.0
     )
-    turned = _between(before.T @ off, new)
+    turned = _rotation_between(before.T @ off, new)
     zoom = np.linalg.norm(new) / np.linalg.norm(old)
     return MovingCamera(
         camera.center,
@@ -338,7 +338,7 @@ def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> 
     )
 
 
-def _between(one: Floats, other: Floats) -> Floats:
+def _rotation_between(one: Floats, other: Floats) -> Floats:
     """Return the shortest rotation (3, 3) from one direction to another."""
     a, b = one / np.linalg.norm(one), other / np.linalg.norm(other)
     axis, cos = np.cross(a, b), float(a @ b)
@@ -346,7 +346,7 @@ def _between(one: Floats, other: Floats) -> Floats:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cos))
 
 
-def _clicks(
+def _click_evidence(
     pitch: PitchTemplate,
     key: KeyFrame,
     index: int,
@@ -413,7 +413,7 @@ def _clicks(
                 settings.loss_scale,
             )
         )
-    return together(parts)
+    return join_evidence(parts)
 
 
 def _locate_on_marking(

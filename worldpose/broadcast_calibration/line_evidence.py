@@ -15,7 +15,7 @@ from worldpose.broadcast_calibration.evidence import (
     ObservedPoints,
     PointEvidence,
     bounds,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
@@ -41,13 +41,13 @@ _LINE_WIDTH: Final = 0.12
 """Width of the paint [m]: the maximum of Law 1, which most pitches have."""
 _CONTRAST: Final = 6.0
 """Minimum brightness of paint above the grass on either side [levels of 255]."""
-_FEW: Final = 15
+_MIN_SAMPLES: Final = 15
 """Minimum line samples for a correction of the camera [1]."""
-_FINE: Final = 3.0
+_FINE_REACH: Final = 3.0
 """Half width of the second search, after the first has corrected the camera [px]."""
 _SCALES: Final = (12.0, 6.0, 3.0, 1.5, 1.0)
 """Decreasing scales of the loss of the correction [px]."""
-_HOLD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
+_STEP_STD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
 """Prior of a frame's correction of rotation [rad] and log focal, standard deviations."""
 
 
@@ -106,14 +106,16 @@ def find_lines(
         people: boxes (detections, 4) [px] that occlude lines; None = no people.
         settings: search width, noise, number of samples.
     """
-    first = _look(camera, samples, picture, people, settings, settings.line_search_px)
-    if len(first) < _FEW:
+    first = _measure_lines(camera, samples, picture, people, settings, settings.line_search_px)
+    if len(first) < _MIN_SAMPLES:
         return PointEvidence.none(), camera
     corrected = _correct_camera(camera, first)
-    return samples.lower(_look(corrected, samples, picture, people, settings, _FINE)), corrected
+    return samples.lower(
+        _measure_lines(corrected, samples, picture, people, settings, _FINE_REACH)
+    ), corrected
 
 
-def _look(
+def _measure_lines(
     camera: MovingCamera,
     samples: FieldSamples,
     picture: Image,
@@ -122,7 +124,7 @@ def _look(
     reach: float,
 ) -> PointEvidence:
     """Return bars of paint within reach of one frame's projected lines."""
-    lines = _near(camera, samples.lines)
+    lines = _select_near(camera, samples.lines)
     seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, EXACT_PAINT)
     index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
@@ -184,14 +186,14 @@ def _look(
     )
 
 
-def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
+def _select_near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
     """Return the samples in or near the image of a pinhole camera without distortion."""
-    gone = (lines.points_world - camera.center) @ camera.rotation[0].T
-    ahead = gone[:, 2] > 1.0
-    place = gone[:, :2] / np.where(ahead, gone[:, 2], 1.0)[:, None]
+    local = (lines.points_world - camera.center) @ camera.rotation[0].T
+    ahead = local[:, 2] > 1.0
+    place = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
     half = 0.6 * camera.image_size / camera.focal[0]
-    off = (camera.principal_point - 0.5 * camera.image_size) / camera.focal[0]
-    return lines[ahead & (np.abs(place + off) < half).all(axis=-1)]
+    shift = (camera.principal_point - 0.5 * camera.image_size) / camera.focal[0]
+    return lines[ahead & (np.abs(place + shift) < half).all(axis=-1)]
 
 
 def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
@@ -206,16 +208,16 @@ def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.boo
 def _correct_camera(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
     """Return a single frame with rotation and focal length fitted to its lines."""
     begin, edges = camera, bounds(lines.frame, 1)
-    gone = np.zeros(4)
+    step = np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
     for scale in _SCALES:
         equations = empty_equations(1, 5)
         scaled = replace(lines, whitening=across / scale, loss=np.ones(len(lines)))
         points = scaled.arrays(np.full_like(lines.ends, -1))
         add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
-        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
-        gone = gone - np.linalg.solve(normal, equations.right[0, :4] + gone / _HOLD**2)
-        camera = begin.take_step(np.append(gone, np.zeros(3))[None], np.zeros(5))
+        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _STEP_STD**2)
+        step = step - np.linalg.solve(normal, equations.right[0, :4] + step / _STEP_STD**2)
+        camera = begin.take_step(np.append(step, np.zeros(3))[None], np.zeros(5))
     return camera
 
 
@@ -276,4 +278,4 @@ def follow_lines(
         parts.append(found.in_frame(frame))
         cameras.append(corrected)
         before, after = single, corrected
-    return FollowedLines(together(parts), join_cameras(cameras))
+    return FollowedLines(join_evidence(parts), join_cameras(cameras))
