@@ -14,7 +14,6 @@ from pydantic import JsonValue
 
 from data_contracts.records import field_docstrings
 from data_contracts.run import GatePolicy, RunRecord
-from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -27,6 +26,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import DaskOption, TimeLimitOption, WorkersOption
 from flows.iterate import Iteration, Iterations, iterate_match
 from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits

@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, errors, line, print_json
-from flows.cli.page_server import (
+from flows.cli.options import (
     PAGES_PORT,
     CertificateOption,
+    DaskOption,
     HostOption,
     KeyOption,
     NamesOption,
     PortOption,
+    TimeLimitOption,
     TokenOption,
     UsersOption,
+    WorkersOption,
     certificate_and_key,
 )
 from flows.orchestration.time_limits import parse_time_limits

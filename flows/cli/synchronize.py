@@ -11,7 +11,6 @@ import typer
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
-from flows.cli.computing import WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -22,6 +21,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.best_results import static_cameras
 from flows.run_record import latest_run, require_no_other_run

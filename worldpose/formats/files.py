@@ -35,12 +35,13 @@ def whole_file(path: Path) -> Iterator[Path]:
         # In a subfolder: a temporary folder is private, but the file gets the usual permissions.
         draft = Path(workshop) / path.name
         yield draft
-        _sync(draft)
+        sync_path(draft)
         draft.replace(path)
-    _sync(path.parent)
+    sync_path(path.parent)
 
 
-def _sync(path: Path) -> None:
+def sync_path(path: Path) -> None:
+    """Sync a file, or the entries of a folder, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
