@@ -144,9 +144,7 @@ def _pass(
 
 def _plan(store: Store, match: Match, request: RunRequest) -> RunPlan:
     latest = latest_run(store, match.match_id)
-    waits = latest is not None and latest.state == "waiting"
-    policy = request.gates or (latest.gates if latest is not None and waits else "never")
-    gatekeeper = Gatekeeper(store, match, policy)
+    gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
     return plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
 
 

@@ -112,7 +112,7 @@ class DetectionReport:
     is_given: bool = False
 
     def why_no_person(self) -> str | None:
-        """Return the likely reason why a clip of `SUSPICIOUS_FRAMES` frames or more shows no person.
+        """Return the likely reason why a clip of `SUSPICIOUS_FRAMES` or more shows no person.
 
         None: people were found, or the clip is shorter.
         """
