@@ -249,7 +249,7 @@ def _draw_steps(time: Floats, count: int, rng: np.random.Generator) -> Floats:
     steps = np.empty((len(time), count, 2))
     for person in range(count):
         intervals = int((time[-1] - time[0]) / FEINT_TIME[0]) + 2
-        ends = time[0] + np.cumsum(rng.uniform(*FEINT_TIME, intervals))
+        ends = time[0] + np.cumsum(rng.uniform(FEINT_TIME[0], FEINT_TIME[1], intervals))
         steps[:, person] = rng.standard_normal((len(ends) + 1, 2))[np.searchsorted(ends, time)]
     return steps
 

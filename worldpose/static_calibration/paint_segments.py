@@ -440,10 +440,8 @@ def _find_segments(ridges: Ridges, diagonal: float, most: int) -> list[tuple[int
         row, column = np.unravel_index(int(votes.argmax()), votes.shape)
         if votes[row, column] < _MIN_LENGTH * _MIN_FILL:
             break
-        voted, middle = (
-            np.array([np.cos(thetas[row]), np.sin(thetas[row])]),
-            2.0 * column - diagonal,
-        )
+        voted = np.array([np.cos(thetas[row]), np.sin(thetas[row])])
+        middle = 2.0 * column - diagonal
         near, across, offset = _fit_line(points, angles, voted, middle)
         segments += _split(points[near], across, offset)
         # The voters go too where they form no line; else they would win again.
@@ -567,8 +565,8 @@ def _find_section_ridges(picture: Image, at: Floats, normals: Floats) -> tuple[I
         _smooth_lightness(picture), pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR
     )
     side = round(2.0 / _TRACE_STEP)
-    middle = profiles[:, side:-side]
-    contrast = middle - np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
+    flanks = np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
+    contrast = profiles[:, side:-side] - flanks
     peak = contrast >= _TRACE_CONTRAST
     peak[:, 1:] &= contrast[:, 1:] >= contrast[:, :-1]
     peak[:, :-1] &= contrast[:, :-1] > contrast[:, 1:]
