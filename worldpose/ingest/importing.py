@@ -347,13 +347,12 @@ def import_pose2sim(
 
     The calibration is the one in `calibration/`, of the trial or of the folder above it, as in
     Pose2Sim's batches, in any form that `read_calibration` reads; without it each video is a
-    camera. 2D poses
-    are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each camera; without them
-    people are detected in the videos of `videos/`. Poses and videos belong to the cameras of their
-    names, or, as in Pose2Sim, in alphabetical order to the cameras in the calibration's order.
-    `frame_rate` and `frame_range` of Config.toml hold. Where a video is smaller or larger than the
-    calibrated images, with or without black bars, its camera is in the video's pixels, as the 2D
-    poses are.
+    camera. 2D poses are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each
+    camera; without them people are detected in the videos of `videos/`. Poses and videos belong to
+    the cameras of their names, or, as in Pose2Sim, in alphabetical order to the cameras in the
+    calibration's order. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
+    smaller or larger than the calibrated images, with or without black bars, its camera is in the
+    video's pixels, as the 2D poses are.
 
     Args:
         project: folder of a trial.
@@ -407,15 +406,7 @@ def import_pose2sim(
     sizes = {name: index.size for name, index in indices.items()}
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
-    if rate is None and not indices:
-        raise InputError(
-            f"{config}: project.frame_rate",
-            expected="frames per second, as there are no videos to take them from",
-            found="'auto'",
-            todo="Write for example frame_rate = 60, or give --fps.",
-        )
-    if rate is None:
-        rate = round(next(iter(indices.values())).fps, 3)
+    rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
     read = {name: read_openpose_folder(place) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
@@ -462,6 +453,18 @@ def import_pose2sim(
             "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
         )
     return spec, notes
+
+
+def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
+    """Return the frame rate of the first video [1/s]; raise InputError without videos."""
+    if not indices:
+        raise InputError(
+            f"{config}: project.frame_rate",
+            expected="frames per second, as there are no videos to take them from",
+            found="'auto'",
+            todo="Write for example frame_rate = 60, or give --fps.",
+        )
+    return round(indices[0].fps, 3)
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:
