@@ -34,7 +34,7 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run, Store
 
-FRACTION = 0.1
+MIN_OFFSET_FRAMES = 0.1
 """Remaining offset that is worth a correction [frame]."""
 
 
@@ -240,7 +240,7 @@ def _print(
     if any(
         row.found is not None
         and row.std is not None
-        and abs(row.found - row.proposed) > max(FRACTION, 3.0 * row.std)
+        and abs(row.found - row.proposed) > max(MIN_OFFSET_FRAMES, 3.0 * row.std)
         for row in rows
     ):
         line(

@@ -24,7 +24,7 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.body_fit import BodyFit, FittedArrays
-from worldpose.body_fitting.bones import DEFINITION, shorten_limbs
+from worldpose.body_fitting.bones import DEFINITION_STD_M, shorten_limbs
 from worldpose.body_fitting.monocular import (
     CORRELATION_S,
     PRIOR_SPREAD,
@@ -231,7 +231,7 @@ def fit_bodies_on_plane(
         track = clip.track(person, rows, evidence.fps, for_shape=False)
         pose, solved = solver.search(track, start, shapes.offsets)
         spread = pose_covariance(solved, pose, shapes.offsets)
-        bias = np.full(17, DEFINITION**2)[:, None, None] * np.eye(3)
+        bias = np.full(17, DEFINITION_STD_M**2)[:, None, None] * np.eye(3)
         result.put(solver, person, span, pose, spread + bias, shapes)
         result.covariance[span, person] += clip.depth_covariance(
             person, own, result.joints[span, person]

@@ -42,7 +42,7 @@ DISTORTION_NAMES: Final = (
 )
 ARRAY_BYTES: Final = 1 << 26
 """Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
-SQUARE: Final = 0.02
+MAX_ASPECT_ERROR: Final = 0.02
 """Largest difference of fx and fy of square pixels [1]; their mean is used."""
 
 
@@ -225,7 +225,7 @@ def _lens(
     optics = read_optics(where, table)
     require_optics(where, optics.size, optics.focal, optics.principal_point)
     fx, fy = optics.focal.tolist()
-    if abs(fx - fy) > SQUARE * fx:
+    if abs(fx - fy) > MAX_ASPECT_ERROR * fx:
         raise calibration_error(
             f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
         )

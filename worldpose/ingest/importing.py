@@ -32,7 +32,7 @@ from worldpose.video import FrameIndex, VideoReader, index_frames
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
-BLACK: Final = 16.0
+MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
@@ -336,8 +336,8 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
     lines = frame.mean(axis=(axis, 2)).astype(np.float64)
     black = np.concatenate([lines[:width], lines[len(lines) - width :]])
     # The line next to a bar with a fraction is a mixture.
-    beside = [lines[width + 2], lines[-width - 3]]
-    return width > 0 and bool(black.max() < BLACK and min(beside) > BLACK)
+    next_lines = [lines[width + 2], lines[-width - 3]]
+    return width > 0 and bool(black.max() < MAX_BLACK and min(next_lines) > MAX_BLACK)
 
 
 def import_pose2sim(

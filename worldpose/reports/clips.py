@@ -115,7 +115,7 @@ def _frame(
     return middle - half, middle + half
 
 
-REACH: Final = 130.0
+VIEW_LENGTH_M: Final = 130.0
 """Length of a drawn field of view [m]: a little more than a pitch's length."""
 
 
@@ -229,7 +229,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> NDArray[np.float64]:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, up to `REACH` away.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `VIEW_LENGTH_M`.
 
     The ground is the plane z = 0, world.
     """
@@ -244,7 +244,9 @@ def visible_ground(camera: Camera) -> NDArray[np.float64]:
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
         # Rays that go up never meet the ground: clip them to the drawn length.
-        distance = np.where((directions[:, 2] < 0.0) & (distance < REACH), distance, REACH)
+        distance = np.where(
+            (directions[:, 2] < 0.0) & (distance < VIEW_LENGTH_M), distance, VIEW_LENGTH_M
+        )
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])
 
 

@@ -106,17 +106,17 @@ def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
         for arc in _painted_arcs(pitch):
             for sign in (1.0, -1.0) if arc.side else (0.0,):
                 radius, center, count = _vote_circle(seen, arc, sign)
-                up = arc.radius / radius
+                height = arc.radius / radius
                 # Arcs lie on one side of their line: the frame may have to be turned.
                 turn = sign * arc.side if arc.side else 1.0
-                turn, way = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
-                beside = arc.line - way * turn * up * seen.offset
-                ahead = arc.center - turn * up * center
-                x, y = (beside, ahead) if arc.axis else (ahead, beside)
+                turn, normal_sign = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
+                across_place = arc.line - normal_sign * turn * height * seen.offset
+                along_place = arc.center - turn * height * center
+                x, y = (across_place, along_place) if arc.axis else (along_place, across_place)
                 axes = (turn * across, turn * seen.along)
                 axes = axes if arc.axis else (turn * seen.along, -turn * across)
-                fits = (count >= _MIN_ARC) & are_plausible(pitch, up, x, y)
-                rows.append(np.column_stack([seen.focals, seen.tilts, up, *axes, x, y])[fits])
+                fits = (count >= _MIN_ARC) & are_plausible(pitch, height, x, y)
+                rows.append(np.column_stack([seen.focals, seen.tilts, height, *axes, x, y])[fits])
                 counts.append(count[fits])
     best = np.argsort(-np.concatenate(counts), kind="stable")[:_MAX_CANDIDATES]
     level = level_cameras(np.concatenate(rows)[best])
@@ -168,8 +168,8 @@ def _ground_paint(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Pai
         kept = np.isfinite(along).all(axis=-1)
         axes = np.stack([along[:, ::-1] * [1.0, -1.0], along], axis=-1)[kept]
         offset = (lines[kept, index].mean(axis=1) * axes[..., 0]).sum(axis=-1)
-        beside = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
-        yield _Paint(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
+        relative = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
+        yield _Paint(focal[kept], tilt[kept], along[kept], offset, relative, normals[kept] @ axes)
 
 
 def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
@@ -204,23 +204,25 @@ def _vote_circle(seen: _Paint, arc: _PaintedArc, sign: float) -> tuple[Floats, F
         arc: the circle and its marking.
         sign: side of the paint, 0 = both.
     """
-    beside, ahead, turned, onward = np.moveaxis(
+    across, along, normal_across, normal_along = np.moveaxis(
         np.concatenate([seen.places, seen.normals], axis=-1), -1, 0
     )
     rows = int(np.log(_RADIUS_RANGE[1] / _RADIUS_RANGE[0]) / _ARC_BINS[0]) + 1
     cells = rows * _ARC_BINS[2]
-    counts = np.zeros(len(beside) * cells, np.int64)
+    counts = np.zeros(len(across) * cells, np.int64)
     for way in arc.ways:
-        steep = arc.depth + way * np.abs(turned)
+        steep = arc.depth + way * np.abs(normal_across)
         with np.errstate(divide="ignore", invalid="ignore"):
-            radius = np.abs(beside) / steep
+            radius = np.abs(across) / steep
             used = (steep > 0.2) & (radius > _RADIUS_RANGE[0]) & (radius < _RADIUS_RANGE[1])
             if sign:
-                used &= beside * sign > 0.0
+                used &= across * sign > 0.0
         g, m = np.nonzero(used)
         found = radius[g, m]
-        toward = way * np.sign(beside[g, m]) * np.sign(turned[g, m])
-        column = (ahead[g, m] / found - toward * onward[g, m]) / _ARC_BINS[1] + 0.5 * _ARC_BINS[2]
+        toward = way * np.sign(across[g, m]) * np.sign(normal_across[g, m])
+        column = (along[g, m] / found - toward * normal_along[g, m]) / _ARC_BINS[
+            1
+        ] + 0.5 * _ARC_BINS[2]
         row = np.log(found / _RADIUS_RANGE[0]) / _ARC_BINS[0]
         kept = (column >= 0.0) & (column < _ARC_BINS[2])
         cell = row[kept].astype(np.int64) * _ARC_BINS[2] + column[kept].astype(np.int64)
@@ -229,4 +231,4 @@ def _vote_circle(seen: _Paint, arc: _PaintedArc, sign: float) -> tuple[Floats, F
     best = votes.argmax(axis=1)
     size = _RADIUS_RANGE[0] * np.exp((best // _ARC_BINS[2] + 0.5) * _ARC_BINS[0])
     place = (best % _ARC_BINS[2] + 0.5 - 0.5 * _ARC_BINS[2]) * _ARC_BINS[1] * size
-    return size, place, votes.max(axis=1) / max(1, beside.shape[1])
+    return size, place, votes.max(axis=1) / max(1, across.shape[1])

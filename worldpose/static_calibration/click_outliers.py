@@ -320,8 +320,8 @@ def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray
         estimate: camera that is independent of these clicks.
     """
     rows = compute_residuals(problem, camera_row(estimate.camera))
-    nobody = np.zeros(len(rows.click), dtype=np.bool_)
-    return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, nobody)
+    no_inliers = np.zeros(len(rows.click), dtype=np.bool_)
+    return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, no_inliers)
 
 
 def held_out_error(problem: Problem, fit: InlierFit) -> float:

@@ -130,9 +130,9 @@ _CANNOT_IMAGE: Final = {
     RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
     RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
 }
-_SAME: Final = 0.01
+_MIN_SCALE_CHANGE: Final = 0.01
 """Difference from the stated noise too small to report [1]."""
-_TRUSTED: Final = 4.0
+_MAX_MISFIT: Final = 4.0
 """Maximum mean loss per observation [1] without a warning: twice the stated noise."""
 
 
@@ -170,7 +170,7 @@ def build_report(
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
     decisions = list(found.assumptions)
-    if abs(scale - 1.0) > _SAME:
+    if abs(scale - 1.0) > _MIN_SCALE_CHANGE:
         decisions.append(
             f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "
             "calibration uses this noise"
@@ -253,7 +253,7 @@ def _accuracy_reasons(
             f"expected ground error {ground_error.p95:.2f} m on the worst twentieth of the seen "
             f"pitch, over {settings.weak_p95_m:g} m"
         )
-    if fit.misfit > _TRUSTED * fit.noise_scale**2:
+    if fit.misfit > _MAX_MISFIT * fit.noise_scale**2:
         reasons.append(
             f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
         )

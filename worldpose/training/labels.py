@@ -21,7 +21,7 @@ from worldpose.detection import DetectionSettings, Detector, People, PoseEstimat
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError
 
-SEEN: Final = 0.5
+VISIBLE_CONFIDENCE: Final = 0.5
 """Keypoints from this confidence on are proposed as visible, others as occluded [1]."""
 
 
@@ -318,7 +318,7 @@ def _write(
         found = poses.confidence >= settings.min_keypoint_confidence
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])
-        visible = np.where(poses.confidence >= SEEN, 2, 1) * found
+        visible = np.where(poses.confidence >= VISIBLE_CONFIDENCE, 2, 1) * found
         proposed.append(
             LabelledPicture(
                 path=path,

@@ -227,7 +227,7 @@ def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)
 
 
-WORTH: Final = 8
+MIN_SKIPPED_FRAMES: Final = 8
 """Frames that a jump to a key frame must save: a restart costs about as many."""
 
 
@@ -257,7 +257,7 @@ def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[
     keys = np.flatnonzero(key)
     begin = keys[np.maximum(np.searchsorted(keys, numbers, side="right") - 1, 0)]
     saved = begin[1:] - numbers[:-1] - 1
-    return np.split(numbers, np.flatnonzero(saved >= WORTH) + 1)
+    return np.split(numbers, np.flatnonzero(saved >= MIN_SKIPPED_FRAMES) + 1)
 
 
 _BAND: Final = 64

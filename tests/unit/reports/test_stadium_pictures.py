@@ -5,7 +5,7 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.clips import REACH, plot_camera_view, plot_stadium, visible_ground
+from worldpose.reports.clips import VIEW_LENGTH_M, plot_camera_view, plot_stadium, visible_ground
 from worldpose.reports.drawing import PALETTE
 from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, plot_calibration
 
@@ -53,7 +53,7 @@ def test_over_the_horizon_the_ground_ends_at_the_reach():
     corners = visible_ground(looking(0.0))
     assert np.isfinite(corners).all()
     far = np.linalg.norm(corners - (0.0, -50.0), axis=-1)
-    assert far.max() == pytest.approx(REACH)
+    assert far.max() == pytest.approx(VIEW_LENGTH_M)
     # The lower edge looks down by atan(540 / 960): 20 m up that is 35.6 m away, straight ahead.
     assert far.min() == pytest.approx(20.0 * 960.0 / 540.0, rel=0.01)
 
