@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_contracts.arrays import Flags, Floats
+from data_contracts.arrays import Floats
 from worldpose.body import SKELETONS, BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
@@ -137,7 +137,7 @@ def write_gltf(
     Raises:
         InputError: no person has a body.
     """
-    present = [person for person in people if body_frames(person.poses).any()]
+    present = [person for person in people if person.poses.known.any()]
     if not present:
         raise InputError(
             str(path),
@@ -234,7 +234,7 @@ class _Writer:
 
     def add_person(self, person: AnimatedBody, number: int) -> int:
         """Add a person's joints, motion and surface; return the node."""
-        there = body_frames(person.poses)
+        there = person.poses.known
         rows = np.flatnonzero(there)
         poses = person.poses[rows]
         betas = poses.betas[0]
@@ -270,7 +270,7 @@ class _Writer:
 
     def _add_surface(self, person: AnimatedBody, number: int, rest: Floats, first: int) -> None:
         """Add a surface to the nodes without a parent: its joints alone place it."""
-        betas = person.poses.betas[np.flatnonzero(body_frames(person.poses))[0]]
+        betas = person.poses.betas[np.flatnonzero(person.poses.known)[0]]
         surface = (self.model.template + self.model.shape_directions @ betas).astype(np.float32)
         colour = colorsys.hsv_to_rgb(number * 0.618 % 1.0, 0.45, 0.85)
         material = {
@@ -383,13 +383,6 @@ class _Writer:
             shapes.append(strip)
         mesh = self.file.add("meshes", {"name": "pitch", "primitives": shapes})
         return self.file.add("nodes", {"name": "pitch", "mesh": mesh})
-
-
-def body_frames(poses: BodyParameters) -> Flags:
-    """Return the frames (frames,) that have a body."""
-    parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
-    there: Flags = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
-    return there
 
 
 def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArray[np.int16]:

@@ -9,8 +9,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from typing import Final, Self
 
 import av
 import numpy as np
@@ -185,15 +184,10 @@ class VideoReader:
         self._stream.thread_type = "AUTO"
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
 
-    def __enter__(self) -> VideoReader:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.close()
 
     def __len__(self) -> int:

@@ -10,8 +10,7 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,15 +88,10 @@ class ImageFolder:
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
 
-    def __enter__(self) -> ImageFolder:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.close()
 
     def __len__(self) -> int:
