@@ -159,34 +159,9 @@ def report_calibration(
         player_count = np.bincount(fit.matches.frame, minlength=frames)
     flow_count = np.bincount(tracked.flow.frame, minlength=frames)
     expected = expected_errors(camera, fit.uncertainty, pitch)
-    status = np.full(frames, FRAME_STATUS.index("bridged"), dtype=np.uint8)
-    linked = np.append(links.determined, False) | np.append(False, links.determined)
-    status[linked] = FRAME_STATUS.index("followed")
-    status[player_count >= _MIN_PLAYERS] = FRAME_STATUS.index("players")
-    status[line_count >= _MIN_LINES] = FRAME_STATUS.index("lines")
-    status[keys.frames] = FRAME_STATUS.index("key_frame")
+    status = _frame_status(tracked, line_count, player_count)
     earlier, later = median_residuals(fit.before, points), median_residuals(camera, points)
-    reasons = []
-    share = float(np.mean(expected > settings.weak_error_px))
-    if share > 0.05:
-        reasons.append(
-            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error_px:g} px"
-        )
-    bridged = int((status == FRAME_STATUS.index("bridged")).sum())
-    if bridged:
-        reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
-    if fit.pitch.paint_m > _MAX_PAINT_ERROR_M:
-        reasons.append(
-            f"markings differ from the Laws by {fit.pitch.paint_m:.2f} m per axis: the pitch has "
-            "another size, or clicks have wrong names"
-        )
-    reasons += [
-        f"key frame {first + frame} is not used: {why}" for frame, why in keys.refused.items()
-    ]
-    reasons += [
-        f"key frame {first + frame} does not rest on {', '.join(names)}"
-        for frame, names in keys.wrong.items()
-    ]
+    reasons = _review_reasons(expected, status, keys, fit.pitch, settings, first)
     decisions = [
         f"a followed point counts {fit.weights.flow_share:.2g} of its loss, as tracking drifts",
         f"errors of a person last {fit.weights.player_frames:.1f} frames",
@@ -217,6 +192,59 @@ def report_calibration(
         decisions=tuple(decisions),
         reasons=tuple(reasons),
     )
+
+
+def _frame_status(
+    tracked: TrackedClip, line_count: Integers, player_count: Integers
+) -> NDArray[np.uint8]:
+    """Return the main evidence of each frame (frames,), an index into `FRAME_STATUS`."""
+    status = np.full(len(line_count), FRAME_STATUS.index("bridged"), dtype=np.uint8)
+    determined = tracked.chain.determined
+    linked = np.append(determined, False) | np.append(False, determined)
+    status[linked] = FRAME_STATUS.index("followed")
+    status[player_count >= _MIN_PLAYERS] = FRAME_STATUS.index("players")
+    status[line_count >= _MIN_LINES] = FRAME_STATUS.index("lines")
+    status[tracked.keys.frames] = FRAME_STATUS.index("key_frame")
+    return status
+
+
+def _review_reasons(
+    expected: Floats,
+    status: NDArray[np.uint8],
+    keys: Keys,
+    pitch: PitchFit,
+    settings: BroadcastCalibrationSettings,
+    first: int,
+) -> list[str]:
+    """Return why a person must review the clip, apart from its clock.
+
+    Args:
+        expected: (frames,) expected image error [px].
+        status: (frames,) main evidence.
+        keys: key frames, used and refused.
+        pitch: the pitch that the fit shows.
+        settings: thresholds.
+        first: number of the clip's first frame in its video.
+    """
+    reasons = []
+    share = float(np.mean(expected > settings.weak_error_px))
+    if share > 0.05:
+        reasons.append(
+            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error_px:g} px"
+        )
+    bridged = int((status == FRAME_STATUS.index("bridged")).sum())
+    if bridged:
+        reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
+    if pitch.paint_m > _MAX_PAINT_ERROR_M:
+        reasons.append(
+            f"markings differ from the Laws by {pitch.paint_m:.2f} m per axis: the pitch has "
+            "another size, or clicks have wrong names"
+        )
+    for frame, why in keys.refused.items():
+        reasons.append(f"key frame {first + frame} is not used: {why}")
+    for frame, names in keys.wrong.items():
+        reasons.append(f"key frame {first + frame} does not rest on {', '.join(names)}")
+    return reasons
 
 
 def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: PitchTemplate) -> Floats:

@@ -74,10 +74,6 @@ class Problem:
             drawn_noise=self.drawn_noise[markings[self.evidence.drawn_marking]],
         )
 
-    def on_evidence(self, evidence: Evidence) -> Problem:
-        """Return the problem with the same clicks at other places of the world."""
-        return replace(self, evidence=evidence)
-
     def with_survey_error(
         self, row: NDArray[np.float64], settings: StaticCalibrationSettings
     ) -> Problem:

@@ -10,7 +10,7 @@ gives the pitch of the venue, and each camera on it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -76,7 +76,7 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
     """
     bars, free = evidence.bars, np.flatnonzero(evidence.problem.free)
     there = evidence.problem.evidence.on_surface(best.surface)
-    problem = evidence.problem.on_evidence(there)
+    problem = replace(evidence.problem, evidence=there)
     clicks, by_clicks = weight_residuals(
         problem, camera_row(best.camera), evidence.scale, evidence.surface
     )
