@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import (
@@ -21,7 +22,7 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import read_openpose_folder
+from worldpose.formats.detection_files import OpenPoseFolder, read_openpose_folder
 from worldpose.formats.files import read_toml, whole_file
 from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
@@ -67,12 +68,7 @@ def import_match(
     cameras = read_calibration(calibration)
     files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
     people = {name: read_observations(file) for name, file in files.items()}
-    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
-    if not seen:
-        raise InputError(
-            str(detections), expected="people", found="none in any file", todo="Check the detector."
-        )
-    first, last = min(frame for frame, _ in seen), max(frame for _, frame in seen)
+    first, stop = _find_people(detections, people)
     content = {
         "match_id": match_id if match_id is not None else name_of(out),
         "fps": fps,
@@ -80,12 +76,12 @@ def import_match(
             {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
             for name, camera in cameras.items()
         ],
-        "clips": [{"id": "clip", "first_frame": first, "frame_count": last - first + 1}],
+        "clips": [{"id": "clip", "first_frame": first, "frame_count": stop - first}],
         "pitch": pitch,
     }
     spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
     for name, file in files.items():
-        people[name] = on_frames(file, people[name], [(first, last - first + 1)])
+        people[name] = on_frames(file, people[name], [(first, stop - first)])
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec
 
@@ -410,13 +406,7 @@ def import_pose2sim(
     counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
     read = {name: read_openpose_folder(place) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
-    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
-    if people and not seen:
-        raise InputError(
-            str(folder), expected="people", found="none in any frame", todo="Check the estimator."
-        )
-    first = min((a for a, _ in seen), default=0)
-    stop = max((b + 1 for _, b in seen), default=min(counts, default=0))
+    first, stop = _find_people(folder, people) if people else (0, min(counts, default=0))
     first, stop = settings.get("frame_range", (first, stop))
     content = {
         "match_id": match_id if match_id is not None else name_of(out),
@@ -440,19 +430,33 @@ def import_pose2sim(
             shutil.copyfile(file, building / "videos" / file.name)
 
     write_match(out, spec, calibrations=cameras, observations=people, further=copy)
+    return spec, notes + _describe_poses(folder, read)
+
+
+def _find_people(folder: Path, people: Mapping[str, KeypointDetections]) -> tuple[int, int]:
+    """Return the first frame with a person in any camera, and the one after the last."""
+    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
+    if not seen:
+        raise InputError(
+            str(folder), expected="people", found="none in any frame", todo="Check the detector."
+        )
+    return min(first for first, _ in seen), max(last + 1 for _, last in seen)
+
+
+def _describe_poses(folder: Path, read: Mapping[str, OpenPoseFolder]) -> list[str]:
+    """Return sentences about the 2D poses of cameras and what of them is kept."""
+    if not read:
+        return [
+            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
+            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
+        ]
     kinds = {found.kind: found.people.points for found in read.values() if found.kind}
-    notes += [
+    return [
         f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
         + (" and heels and toes" if points else "")
         + ("" if kind == "COCO-17" else "; those of hands, face and trunk are left out")
         for kind, points in sorted(kinds.items())
     ]
-    if not poses:
-        notes.append(
-            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
-            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
-        )
-    return spec, notes
 
 
 def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
