@@ -65,7 +65,8 @@ class BodyParameters:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(...), bodies without a missing value."""
-        return np.all([np.isfinite(array).all(axis=-1) for array in self._arrays()], axis=0)
+        finite = [np.isfinite(array).all(axis=-1) for array in self._arrays()]
+        return np.asarray(np.all(finite, axis=0))
 
     def __getitem__(self, index: Index) -> BodyParameters:
         return BodyParameters(*(array[index_leading(index, 1)] for array in self._arrays()))

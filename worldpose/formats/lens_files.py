@@ -137,9 +137,7 @@ def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
 def _read_file(file: Path) -> dict[str, Any]:
     """Return the arrays and numbers of a file by name."""
     suffix = file.suffix.lower()
-    bytes_there = require_file(file)
-    if bytes_there > SETTINGS_BYTES:
-        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{bytes_there}")
+    require_file(file, SETTINGS_BYTES)
     try:
         if suffix == ".npy":
             array = np.load(file, allow_pickle=False)
@@ -164,9 +162,7 @@ def read_file_storage(file: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is too large, or not of that kind, or has none of these.
     """
-    size = require_file(file)
-    if size > SETTINGS_BYTES:
-        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{size}")
+    require_file(file, SETTINGS_BYTES)
     import cv2  # late: it takes 0.2 s, and few commands read such a file
 
     try:
