@@ -13,6 +13,7 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
+from data_contracts.static_calibration import DrawnMarking
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
@@ -227,25 +228,8 @@ def calibrate_keys(
     Raises:
         InputError: no key frame is usable; the message gives the reason for each.
     """
-    found: dict[int, StaticCalibration] = {}
-    refused: dict[int, str] = {}
-    for key in sorted(key_frames, key=lambda each: each.frame):
-        place = f"{where}: frame {key.frame}"
-        try:
-            # The joint fit of all key frames below adds painted lines.
-            found[key.frame - first] = calibrate_camera(
-                pitch, key.markings, image_size, settings=settings.key_frame, where=place
-            )
-        except (InputError, DegenerateError) as error:
-            refused[key.frame - first] = f"{error}"
-    if not found:
-        raise InputError(
-            where,
-            expected="a key frame that determines a camera",
-            found="; ".join(refused.values()) or "no key frame",
-            todo="Click points in frames that show an area's corners or the centre circle.",
-        )
-    clicked = {key.frame - first: key for key in key_frames}
+    clicked = {key.frame - first: key for key in sorted(key_frames, key=lambda each: each.frame)}
+    found, refused = _calibrate_each(pitch, clicked, image_size, settings, where)
     wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
     estimates = [each.estimate for each in found.values()]
     camera = _share_center(estimates)
@@ -282,6 +266,38 @@ def calibrate_keys(
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (errors.size_m * shown)[2:]
     return Keys(np.array(list(found)), camera, surface, clicks, refused, wrong)
+
+
+def _calibrate_each(
+    pitch: PitchTemplate,
+    clicked: Mapping[int, KeyFrame],
+    image_size: tuple[int, int],
+    settings: BroadcastCalibrationSettings,
+    where: str,
+) -> tuple[dict[int, StaticCalibration], dict[int, str]]:
+    """Return each key frame's camera from its clicks alone, and why others have none, by frame.
+
+    Raises:
+        InputError: no key frame is usable.
+    """
+    found: dict[int, StaticCalibration] = {}
+    refused: dict[int, str] = {}
+    for frame, key in clicked.items():
+        place = f"{where}: frame {key.frame}"
+        try:
+            found[frame] = calibrate_camera(
+                pitch, key.markings, image_size, settings=settings.key_frame, where=place
+            )
+        except (InputError, DegenerateError) as error:
+            refused[frame] = f"{error}"
+    if not found:
+        raise InputError(
+            where,
+            expected="a key frame that determines a camera",
+            found="; ".join(refused.values()) or "no key frame",
+            todo="Click points in frames that show an area's corners or the centre circle.",
+        )
+    return found, refused
 
 
 def _share_center(estimates: Sequence[CameraEstimate]) -> MovingCamera:
@@ -357,63 +373,74 @@ def _click_evidence(
 ) -> PointEvidence:
     """Return the evidence of one key frame's clicks without outliers."""
     points = [point for point in key.markings.points if point.name not in wrong]
-    drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
     template = {name: number for number, name in enumerate(pitch.points)}
     own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
     one, world = np.ones(own.shape), pitch.positions([point.name for point in points])
-    parts = [
-        PointEvidence.at_points(
-            ObservedPoints(
-                frame=np.full(len(points), index),
-                world=world,
-                image=np.array([point.xy for point in points]).reshape(-1, 2),
-                kind=CLICK,
-                source=np.full(len(points), -1),
-                ends=own,
-                shares=errors.shares(own, one),
-                by_size=errors.displacement_by_size(own, one, world),
-            ),
-            np.full(len(points), settings.click_noise_px),
-            settings.field_weight,
-            settings.loss_scale,
-        )
+    at_points = PointEvidence.at_points(
+        ObservedPoints(
+            frame=np.full(len(points), index),
+            world=world,
+            image=np.array([point.xy for point in points]).reshape(-1, 2),
+            kind=CLICK,
+            source=np.full(len(points), -1),
+            ends=own,
+            shares=errors.shares(own, one),
+            by_size=errors.displacement_by_size(own, one, world),
+        ),
+        np.full(len(points), settings.click_noise_px),
+        settings.field_weight,
+        settings.loss_scale,
+    )
+    drawn = [
+        _drawn_evidence(pitch, marking, index, camera, settings, errors)
+        for marking in key.markings.drawn
+        if marking.name not in wrong
     ]
-    numbers = camera.camera[0].numbers
-    for marking in drawn:
-        pixels = np.array(marking.xy).reshape(-1, 2)
-        samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
-        place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
-        nearest_on_markings(
-            numbers,
-            0.5 * float(np.hypot(*camera.image_size)),
-            samples,
-            np.array([0, len(samples)]),
-            pixels,
-            np.zeros(len(pixels), dtype=np.int64),
-            place,
-            normal,
-        )
-        known = np.isfinite(place).all(axis=-1)
-        names, shares = _locate_on_marking(pitch, marking.name, place[known])
-        ends = np.tile([template[name] for name in names], (int(known.sum()), 1))
-        parts.append(
-            PointEvidence.across_lines(
-                ObservedPoints(
-                    frame=np.full(int(known.sum()), index),
-                    world=place[known],
-                    image=pixels[known],
-                    kind=CLICK,
-                    source=np.full(int(known.sum()), -1),
-                    ends=ends,
-                    shares=errors.shares(ends, shares),
-                    by_size=errors.displacement_by_size(ends, shares, place[known]),
-                ),
-                normal[known],
-                np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
-                settings.loss_scale,
-            )
-        )
-    return join_evidence(parts)
+    return join_evidence([at_points, *drawn])
+
+
+def _drawn_evidence(
+    pitch: PitchTemplate,
+    marking: DrawnMarking,
+    index: int,
+    camera: MovingCamera,
+    settings: BroadcastCalibrationSettings,
+    errors: PitchErrors,
+) -> PointEvidence:
+    """Return the evidence of a drawn marking: its pixels, across the nearest place on it."""
+    pixels = np.array(marking.xy).reshape(-1, 2)
+    samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
+    place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
+    nearest_on_markings(
+        camera.camera[0].numbers,
+        0.5 * float(np.hypot(*camera.image_size)),
+        samples,
+        np.array([0, len(samples)]),
+        pixels,
+        np.zeros(len(pixels), dtype=np.int64),
+        place,
+        normal,
+    )
+    known = np.isfinite(place).all(axis=-1)
+    pixels, place, normal = pixels[known], place[known], normal[known]
+    names, shares = _locate_on_marking(pitch, marking.name, place)
+    points = list(pitch.points)
+    ends = np.tile([points.index(name) for name in names], (len(pixels), 1))
+    return PointEvidence.across_lines(
+        ObservedPoints(
+            frame=np.full(len(pixels), index),
+            world=place,
+            image=pixels,
+            kind=CLICK,
+            source=np.full(len(pixels), -1),
+            ends=ends,
+            shares=errors.shares(ends, shares),
+            by_size=errors.displacement_by_size(ends, shares, place),
+        ),
+        normal,
+        np.full(len(pixels), settings.key_frame.drawn_noise_px),
+        settings.loss_scale,
+    )
 
 
 def _locate_on_marking(

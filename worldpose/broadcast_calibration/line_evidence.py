@@ -23,7 +23,13 @@ from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
 from worldpose.pitch.template import surface_shape
-from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
+from worldpose.static_calibration.line_detection import (
+    CANDIDATES,
+    CLEARANCE,
+    CrossSections,
+    find_bars,
+    fit_bars,
+)
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     LineSamples,
@@ -142,30 +148,9 @@ def _measure_lines(
     ]
     if not len(index):
         return PointEvidence.none()
-    count, sections = len(index), seen[index].sections
-    places, normals = sections.places, sections.normals
-    offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
-    find_bars(
-        picture,
-        sections,
-        np.full(count, reach),
-        _CONTRAST,
-        offsets,
-        strengths,
-    )
-    with np.errstate(divide="ignore"):
-        merit = np.log(strengths) - 0.5 * (2.0 * offsets / reach) ** 2
-    best = np.where(np.isnan(offsets), -np.inf, merit).argmax(axis=1)
-    exact, variances = np.empty(count), np.empty(count)
-    fit_bars(
-        picture,
-        sections,
-        offsets[np.arange(count), best],
-        _CONTRAST,
-        exact,
-        variances,
-    )
-    found = np.isfinite(exact)
+    sections = seen[index].sections
+    offsets, variances = _locate_bars(picture, sections, reach)
+    found = np.isfinite(offsets)
     chosen = lines[index[found]]
     world, ends, shares = chosen.points_world, chosen.ends, chosen.shares
     deviation = np.sqrt(variances[found] + settings.line_noise_px**2)
@@ -173,17 +158,34 @@ def _measure_lines(
         ObservedPoints(
             frame=np.zeros(int(found.sum()), dtype=np.int64),
             world=world,
-            image=(places + exact[:, None] * normals)[found],
+            image=(sections.places + offsets[:, None] * sections.normals)[found],
             kind=MARKING,
             source=chosen.marking,
             ends=ends,
             shares=samples.errors.shares(ends, shares),
             by_size=samples.errors.displacement_by_size(ends, shares, world),
         ),
-        normals[found],
+        sections.normals[found],
         deviation,
         settings.loss_scale,
     )
+
+
+def _locate_bars(picture: Image, sections: CrossSections, reach: float) -> tuple[Floats, Floats]:
+    """Return offsets of bars along the sections [px], NaN without one, and their variances [px^2].
+
+    Of several bars in a section, the strong one near its middle counts.
+    """
+    count = len(sections.places)
+    candidates, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
+    find_bars(picture, sections, np.full(count, reach), _CONTRAST, candidates, strengths)
+    with np.errstate(divide="ignore"):
+        merit = np.log(strengths) - 0.5 * (2.0 * candidates / reach) ** 2
+    best = np.where(np.isnan(candidates), -np.inf, merit).argmax(axis=1)
+    offsets, variances = np.empty(count), np.empty(count)
+    chosen = candidates[np.arange(count), best]
+    fit_bars(picture, sections, chosen, _CONTRAST, offsets, variances)
+    return offsets, variances
 
 
 def _select_near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
