@@ -211,15 +211,11 @@ def fit_bodies(
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
         gone = _long_gaps(present[span, person], settings.max_filled_gap_s * fps)
-        result.drop(person, span, gone)
-        if extra is not None:
-            extra.drop(person, span, gone)
-    if evidence.shared_covariance is not None:
-        for person, span in spans.items():
-            shared = _nearest_known(evidence.shared_covariance[span, person])
-            result.covariance[span, person] += shared[:, None]
-            if extra is not None:
-                extra.covariance[span, person] += shared[:, None]
+        shared = evidence.shared_covariance
+        for arrays in (result,) if extra is None else (result, extra):
+            arrays.drop(person, span, gone)
+            if shared is not None:
+                arrays.covariance[span, person] += _nearest_known(shared[span, person])[:, None]
     fit = result.fit(shapes)
     return fit if extra is None else replace(fit, extra=extra.fit())
 
