@@ -96,11 +96,11 @@ def write_match(
                 read_keypoint_arrays(file)
             if pitch is not None:
                 _write_pitch(building, spec, pitch)
-            annotations: dict[str, ClickedMarkings | KeyFrames] = {
+            records: dict[str, ClickedMarkings | KeyFrames] = {
                 **{clicked_file(name): each for name, each in clicked.items()},
                 **{key_frames_file(name): each for name, each in key_frames.items()},
             }
-            for name, record in annotations.items():
+            for name, record in records.items():
                 (building / name).parent.mkdir(parents=True, exist_ok=True)
                 (building / name).write_text(record.model_dump_json(indent=2) + "\n", "utf-8")
             for camera_id, picture in stills.items():
