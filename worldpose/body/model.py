@@ -66,7 +66,7 @@ class BodyParameters:
     def known(self) -> NDArray[np.bool_]:
         """(...), bodies without a missing value."""
         finite = [np.isfinite(array).all(axis=-1) for array in self._arrays()]
-        return np.asarray(np.all(finite, axis=0))
+        return np.asarray(np.all(finite, axis=0), dtype=np.bool_)
 
     def __getitem__(self, index: Index) -> BodyParameters:
         return BodyParameters(*(array[index_leading(index, 1)] for array in self._arrays()))
