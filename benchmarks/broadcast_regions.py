@@ -22,7 +22,7 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.players import match, player_evidence
 from worldpose.broadcast_calibration.priors import (
@@ -81,7 +81,7 @@ def lines_of(
                 settings.loss_scale,
             )
         )
-    return together(parts)
+    return join_evidence(parts)
 
 
 def judge_clip(name: str, seed: int, seconds: float, fps: float) -> dict[str, Floats]:
@@ -103,7 +103,7 @@ def judge_clip(name: str, seed: int, seconds: float, fps: float) -> dict[str, Fl
     lines = lines_of(true, samples, settings, rng)
     players, _ = player_evidence(true, people, match(true, people), settings)
     problem = Problem(
-        points=together([lines, players]),
+        points=join_evidence([lines, players]),
         flow=FlowEvidence.none(),
         prior=build_prior(settings.prior, true.focal, true.image_size),
         smoothness=estimate_smoothness(true, fps),

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.calibration import BroadcastClip, refine, track
-from worldpose.broadcast_calibration.evidence import together
+from worldpose.broadcast_calibration.evidence import join_evidence
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.players import match as match_players
@@ -81,7 +81,7 @@ def rows_of(
     samples = FieldSamples.of(pitch, PitchErrors.of(pitch, whole), pitch.surface)
     lines = follow_lines(true, samples, pictures(), people.boxes, whole)
     players, _ = player_evidence(true, people, match_players(true, people), whole)
-    evidence = together([lines.evidence, players])
+    evidence = join_evidence([lines.evidence, players])
     feet, inside = feet_in_picture(true, joints)
     at = true.camera.project(feet)
     rows = {}

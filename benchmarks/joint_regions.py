@@ -8,8 +8,8 @@ from scipy.special import chdtri
 from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
+from worldpose.evaluation import EvaluationSettings
 from worldpose.evaluation.matching import joint_distances, match_people, select_frames, take_matched
-from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
 
 

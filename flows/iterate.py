@@ -27,7 +27,7 @@ from worldpose.store import Store
 GAIN: Final = 0.01
 """Minimum relative decrease of the held-out error for a better iteration: rejecting the tails of
 a detector's noise alone causes smaller decreases."""
-MOST: Final = 6
+MAX_ITERATIONS: Final = 6
 """Maximum number of iterations if the caller gives none."""
 
 
@@ -107,7 +107,7 @@ def _iterate(store: Store, match: Match, request: RunRequest, most: int | None) 
     passes: list[Iteration] = []
     ended = "that many were requested"
     with shared_machines(store, request) as machines_for:
-        for number in range(1, (most or MOST) + 1):
+        for number in range(1, (most or MAX_ITERATIONS) + 1):
             iteration = _pass(store, match, replace(request, iteration=number), machines_for)
             passes.append(iteration)
             if iteration.record.state != "complete":
@@ -144,9 +144,7 @@ def _pass(
 
 def _plan(store: Store, match: Match, request: RunRequest) -> RunPlan:
     latest = latest_run(store, match.match_id)
-    waits = latest is not None and latest.state == "waiting"
-    policy = request.gates or (latest.gates if latest is not None and waits else "never")
-    gatekeeper = Gatekeeper(store, match, policy)
+    gatekeeper = Gatekeeper(store, match, request.gate_policy(latest))
     return plan_ahead(gatekeeper, METHOD, request.settings, latest, request.iteration)
 
 

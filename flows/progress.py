@@ -46,10 +46,10 @@ class Progress:
         percent = f"{100.0 * self.share:.0f} %"
         if self.seconds_left is None or self.share >= 1.0:
             return percent
-        return f"{percent} {in_time(self.seconds_left)}"
+        return f"{percent} {format_duration(self.seconds_left)}"
 
 
-def in_time(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration in at most 7 characters."""
     if seconds < 99.5:
         return f"{seconds:.0f} s"

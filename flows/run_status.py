@@ -7,6 +7,7 @@ plan of now is compared with a match's latest run.
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -28,26 +29,9 @@ from worldpose.errors import InputError, StoreError
 from worldpose.store import RecipeDifference, Store, recipe_differences
 
 TEMPORARY_ERRORS: Final = frozenset(
-    error.__name__
-    for error in (
-        StoreError,
-        OSError,
-        BlockingIOError,
-        ChildProcessError,
-        ConnectionError,
-        BrokenPipeError,
-        ConnectionAbortedError,
-        ConnectionRefusedError,
-        ConnectionResetError,
-        FileExistsError,
-        FileNotFoundError,
-        InterruptedError,
-        IsADirectoryError,
-        NotADirectoryError,
-        PermissionError,
-        ProcessLookupError,
-        TimeoutError,
-    )
+    name
+    for name, error in {**vars(builtins), "StoreError": StoreError}.items()
+    if isinstance(error, type) and issubclass(error, StoreError | OSError)
 )
 """Errors of a disk or a network, as run records name them; the next attempt can succeed."""
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gates import Gatekeeper
 from flows.orchestration.cluster_errors import require_room, require_workers
-from flows.orchestration.local_cluster import kept_complete, starting_cluster, workers_for
+from flows.orchestration.local_cluster import keep_workers, start_cluster, workers_for
 from flows.orchestration.prefect_environment import START_SECONDS, has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
@@ -66,6 +66,11 @@ class RunRequest:
     time_limits: TimeLimits = field(default_factory=dict)
     security: Security | None = None
 
+    def gate_policy(self, latest: RunRecord | None) -> GatePolicy:
+        """Return when results need review, for a match with this latest run."""
+        waits = latest is not None and latest.state == "waiting"
+        return self.gates or (latest.gates if latest is not None and waits else "never")
+
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """Run a match until its results are current; return the run's record.
@@ -80,9 +85,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
-    policy: GatePolicy = request.gates or "never"
-    if request.gates is None and latest is not None and latest.state == "waiting":
-        policy = latest.gates
+    policy = request.gate_policy(latest)
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)
     reporter().run_planned(expected_work(store, match, plan.missing, latest))
@@ -176,12 +179,12 @@ def _machines(
     if request.dask is None or not is_watched:
         reporter().say("starting Prefect and Dask")
     server = prefect_server(store.url, is_local=request.dask is None)
-    with ending_at_once(), server as wait_until_ready, ExitStack() as stack:
+    with end_at_once(), server as wait_until_ready, ExitStack() as stack:
         cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more
         if request.dask is None:
-            cluster = stack.enter_context(starting_cluster(request.workers, missing))
-            ask_for = stack.enter_context(kept_complete(cluster))
+            cluster = stack.enter_context(start_cluster(request.workers, missing))
+            ask_for = stack.enter_context(keep_workers(cluster))
             request = replace(request, dask=cluster.scheduler_address, security=cluster.security)
         else:
             _require_scheduler(request.dask, request.security)
@@ -205,7 +208,7 @@ def _no_more(workers: int) -> None:
 
 
 @contextmanager
-def ending_at_once() -> Iterator[None]:
+def end_at_once() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the run at once.
 
     A killed run keeps its finished results, and its workers and server end with it. An orderly

@@ -33,10 +33,10 @@ from worldpose.filtering import (
 )
 from worldpose.geometry.boxes import box_areas, box_iou
 
-AROUND: Final = (0.12, 0.20, 0.12, 0.10)
+BOX_MARGINS: Final = (0.12, 0.20, 0.12, 0.10)
 """Margins of a person beyond the joints: left, up to the top of the head, right, and down to the
 soles [m]."""
-BEHIND: Final = 0.2
+OCCLUSION_M: Final = 0.2
 """A body occludes joints that are farther away than it by more than this [m]."""
 
 
@@ -90,7 +90,7 @@ class Expected:
     @property
     def boxes(self) -> Floats:
         """Return bodies' boxes (frames, persons, 4) [px]: x0, y0, x1, y1; NaN if incomplete."""
-        left, up, right, down = (side * self.scale for side in AROUND)
+        left, up, right, down = (side * self.scale for side in BOX_MARGINS)
         x, y = self.image[..., 0], self.image[..., 1]
         sides = [(x - left).min(-1), (y - up).min(-1), (x + right).max(-1), (y + down).max(-1)]
         return np.stack(sides, axis=-1)
@@ -113,7 +113,7 @@ class Expected:
             part = (off * along).sum(-1) / np.square(along).sum(-1)
             away = off - np.clip(np.nan_to_num(part), 0.0, 1.0)[..., None] * along
             covered = np.square(away).sum(-1) < radius**2
-            covered &= near + BEHIND < depth[:, :, None, None]
+            covered &= near + OCCLUSION_M < depth[:, :, None, None]
         persons = np.arange(len(image))
         covered[persons, :, persons] = False
         return np.asarray(covered.any(axis=(2, 3)))
@@ -199,9 +199,9 @@ def find_detected_people(
     return seen
 
 
-FEWEST: Final = 8
+MIN_KEYPOINTS: Final = 8
 """Least number of keypoints of a result [1]: half a body."""
-FARTHEST: Final = 0.3
+MAX_DISTANCE_M: Final = 0.3
 """Cap on the distance between a joint and a keypoint [m]."""
 
 
@@ -345,7 +345,7 @@ def _compare_with_bodies(
         max_deviation=settings.max_deviation,
         min_inlier_share=settings.min_inlier_share,
         min_similarity=settings.min_similarity,
-        min_keypoints=FEWEST,
+        min_keypoints=MIN_KEYPOINTS,
     )
     judged = judge_detections(BodyViews(image, variance, scale), suspects, spread, rules)
     return judged.fits[:, 0, 0] == 0, judged.rejected[:, 0, 0]
@@ -357,5 +357,5 @@ def _distances(results: KeypointDetections, sought: MissingPeople, expected: Exp
     with np.errstate(invalid="ignore"):
         away = np.linalg.norm(results.keypoints[:, None] - image, axis=-1) / scale
     there = np.asarray(np.isfinite(results.keypoints).all(axis=-1))
-    away = np.where(there[:, None], np.fmin(away, FARTHEST), 0.0)
+    away = np.where(there[:, None], np.fmin(away, MAX_DISTANCE_M), 0.0)
     return np.asarray(away.sum(axis=-1) / np.maximum(there.sum(axis=-1), 1)[:, None])

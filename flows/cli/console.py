@@ -131,7 +131,7 @@ class ConsoleReporter(Reporter):
     def tell_of(self, unit: str, seconds: float, figures: Mapping[str, float]) -> None:
         """Print the unit and its time, and how far its stage and the run are."""
         super().tell_of(unit, seconds, figures)
-        name = escape(f"{shorten_name(unit, UNIT_WIDTH):<{UNIT_WIDTH}}")
+        name = escape(f"{shorten_name(unit):<{UNIT_WIDTH}}")
         at = f"{self.stage_progress!s:>13}   {self.run_progress!s:>13}"
         self.say(f"  {name} {seconds:6.1f} s   {at}")
         if self.verbose and figures:
@@ -162,12 +162,12 @@ class ConsoleReporter(Reporter):
         os.write(terminal, f"{erase}{said}".encode())
 
 
-def shorten_name(name: str, width: int) -> str:
-    """Return a name without its middle if it is longer than `width` characters."""
-    if len(name) <= width:
+def shorten_name(name: str) -> str:
+    """Return a name without its middle if it is longer than `UNIT_WIDTH`."""
+    if len(name) <= UNIT_WIDTH:
         return name
-    end = (width - 1) // 2
-    return f"{name[: width - 1 - end]}…{name[-end:]}"
+    end = (UNIT_WIDTH - 1) // 2
+    return f"{name[: UNIT_WIDTH - 1 - end]}…{name[-end:]}"
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from flows.results.ablation import Score
+    from flows.results.evaluation import Scores
 
 
 def evaluate(
@@ -132,7 +133,6 @@ def evaluate(
             todo="Name prediction and ground truth, or use --ablation 10.",
         )
     from flows.results.evaluation import score
-    from worldpose.reports.run_report import score_rows
 
     scores = score(
         prediction,
@@ -144,17 +144,24 @@ def evaluate(
         match_in=match_in,
         marker_map=markers,
     )
-    laid = scores.laid
+    _print_scores(scores, as_json=as_json)
+
+
+def _print_scores(scores: Scores, *, as_json: bool) -> None:
+    from worldpose.reports.run_report import score_rows
+
+    alignment = scores.alignment
     if as_json:
-        figures = scores.evaluation.model_dump(exclude_none=True)
-        if laid is not None:
-            figures |= {"reference_offset_s": laid.offset, "reference_residual_m": laid.residual}
-        print_json(figures)
+        metrics = scores.evaluation.model_dump(exclude_none=True)
+        if alignment is not None:
+            metrics["reference_offset_s"] = alignment.offset
+            metrics["reference_residual_m"] = alignment.residual
+        print_json(metrics)
         return
-    if laid is not None:
+    if alignment is not None:
         line(
-            f"the reference's clock is {laid.offset:.4f} s at match frame 0; laid over rigidly, "
-            f"joints are {1000.0 * laid.residual:.1f} mm apart (root mean square)"
+            f"the reference's clock is {alignment.offset:.4f} s at match frame 0; after a rigid "
+            f"alignment, joints are {1000.0 * alignment.residual:.1f} mm apart (root mean square)"
         )
     rows = [
         (name, value, meaning)
@@ -251,13 +258,13 @@ def _row(
     def mean(figure: str, digits: int) -> str:
         return f"{np.mean(values(figure)):.{digits}f}" if scores else "-"
 
-    def format_figure(figure: str, digits: int) -> str:
-        return f"{mean(figure, digits)} ± {np.std(values(figure)):.{digits}f}" if scores else "-"
+    def mean_and_deviation(metric: str) -> str:
+        return f"{mean(metric, 1)} ± {np.std(values(metric)):.1f}" if scores else "-"
 
     return (
         name,
-        format_figure("g_mpjpe_mm", 1),
-        format_figure("pa_mpjpe_mm", 1),
+        mean_and_deviation("g_mpjpe_mm"),
+        mean_and_deviation("pa_mpjpe_mm"),
         mean("ground_error_m", 3),
         mean("marking_error_px", 2),
         "-" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}",

@@ -51,11 +51,11 @@ def label(
 
     Example: worldpose label cam00.mp4 cam01.mp4 --out labels
     """
-    from flows.review.labelling import propose
     from worldpose.detection import DetectionSettings
+    from worldpose.training.labels import propose_labels
 
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
-    frames = propose(videos, every, out, settings)
+    frames = propose_labels(videos, every, out, settings)
     if as_json:
         print_json({"frames": frames, "labels": str(out / "labels.json")})
     else:

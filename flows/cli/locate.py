@@ -10,7 +10,6 @@ import numpy as np
 import typer
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from flows.cli.computing import WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -21,6 +20,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import WorkersOption
 from flows.cli.synchronize import choose_clip, load_detections, until_detection
 from flows.registering import find_match
 from flows.run_record import latest_run, require_no_other_run

@@ -14,7 +14,7 @@ from rich.progress import Progress
 from flows.cli.console import JsonOption, errors, line, print_json, print_table
 from worldpose.errors import UsageError
 
-WIDTH = 320
+ANALYSED_WIDTH = 320
 """Width of the analysed images [px]."""
 
 
@@ -105,7 +105,7 @@ def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]
         Progress(console=errors, transient=True, disable=not errors.is_terminal) as bars,
     ):
         bar = bars.add_task(programme.name, total=len(video))
-        for number, picture in video.readable(width=WIDTH):
+        for number, picture in video.readable(width=ANALYSED_WIDTH):
             yield number, picture
             bars.update(bar, completed=number + 1)
 

@@ -8,7 +8,6 @@ from typing import Annotated, Final
 import typer
 from pydantic import JsonValue
 
-from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -20,6 +19,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import DaskOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
 from flows.reprocess import Reprocessed, reprocess_matches

@@ -20,7 +20,7 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
-from flows.cli.page_server import (
+from flows.cli.options import (
     PAGES_PORT,
     CertificateOption,
     HostOption,

@@ -14,7 +14,6 @@ from pydantic import JsonValue
 
 from data_contracts.records import field_docstrings
 from data_contracts.run import GatePolicy, RunRecord
-from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -27,6 +26,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import DaskOption, TimeLimitOption, WorkersOption
 from flows.iterate import Iteration, Iterations, iterate_match
 from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits
@@ -42,7 +42,7 @@ from worldpose.errors import UsageError
 from worldpose.store import Store
 
 EXIT_CODES = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
-SHOWN = 5
+MAX_LISTED = 5
 """Number of waiting units listed by name."""
 
 
@@ -220,10 +220,10 @@ def _print_waiting(record: RunRecord) -> None:
     rejected = len(record.waiting) - undecided
     also = f", {rejected} rejected and to be corrected" if rejected else ""
     line(f"{undecided} {'review' if undecided == 1 else 'reviews'} pending{also}:")
-    for unit in record.waiting[:SHOWN]:
+    for unit in record.waiting[:MAX_LISTED]:
         line(f"  {unit.request}: {all_reasons(unit.reasons)}")
-    if len(record.waiting) > SHOWN:
-        line(f"  and {len(record.waiting) - SHOWN} more")
+    if len(record.waiting) > MAX_LISTED:
+        line(f"  and {len(record.waiting) - MAX_LISTED} more")
 
 
 UNTIL_BEST = "auto"

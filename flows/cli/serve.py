@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.computing import DaskOption, TimeLimitOption, WorkersOption
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, errors, line, print_json
-from flows.cli.page_server import (
+from flows.cli.options import (
     PAGES_PORT,
     CertificateOption,
+    DaskOption,
     HostOption,
     KeyOption,
     NamesOption,
     PortOption,
+    TimeLimitOption,
     TokenOption,
     UsersOption,
+    WorkersOption,
     certificate_and_key,
 )
 from flows.orchestration.time_limits import parse_time_limits
@@ -26,6 +28,7 @@ from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from flows.service.layout import StateFolder
+    from flows.service.plan import ServePlan
 
 
 def serve(
@@ -115,9 +118,8 @@ def serve(
     if test_alerts:
         _test_alerts(folder, as_json=as_json)
         return
-    from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
     from flows.service.senders import senders_of
-    from flows.service.service_secrets import METRICS_TOKEN, PAGES_TOKEN, secrets_of
+    from flows.service.service_secrets import PAGES_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
@@ -166,29 +168,45 @@ def serve(
     )
     access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
     secrets = secrets_of(plan, access.token)
-    variable = CLIENT_LOGIN if given else SERVER_LOGIN
-    is_kept = not given and variable not in os.environ
+    # A token that the operator chose is not printed: the output can go to a log.
+    login = "/login" if token or users else f"/login#token={access.token}"
+    token_at = "the file --users" if users else PAGES_TOKEN if token else "this address"
+    pages = f"{plan.pages}{login}  open it in a browser; the token is in {token_at}"
+    serve_all(
+        plan,
+        secrets,
+        lambda: _print_addresses(plan, pages, asks_for_login=secrets.prefect is not None),
+        lambda text: line(text, to=errors),
+    )
+
+
+def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> None:
+    """Print the addresses, and where secrets are instead of the secrets.
+
+    Args:
+        plan: the served project.
+        pages: address of the pages, and where its token is.
+        asks_for_login: whether Prefect's dashboard asks for a login.
+    """
+    from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
+    from flows.service.service_secrets import METRICS_TOKEN
+
+    variable = SERVER_LOGIN if plan.owns_prefect else CLIENT_LOGIN
+    is_kept = plan.owns_prefect and variable not in os.environ
     login_at = plan.state_folder.prefect_login if is_kept else variable
     is_given = METRICS_TOKEN in os.environ
     token_at = METRICS_TOKEN if is_given else plan.state_folder.metrics_token
-
-    def ready() -> None:
-        line(f"serving {plan.project}")
-        # A token chosen by the operator is not printed: the output can go to a log.
-        login = "/login" if token or users else f"/login#token={access.token}"
-        whose = "the file --users" if users else PAGES_TOKEN if token else "this address"
-        line(f"pages          {plan.pages}{login}  open it in a browser; the token is in {whose}")
-        line(f"status page    {plan.pages}/status")
-        line(f"inbox          {plan.inbox}")
-        # Print the path of a secret, not its value: the output can go to a log.
-        if secrets.prefect is None:
-            line(f"Prefect        {plan.dashboard}  which asks for no login: others may use it")
-        else:
-            line(f"Prefect        {plan.dashboard}  its login is in {login_at}")
-        line(f"metrics        http://{host}:{metrics_port}/metrics  its token is in {token_at}")
-        line("Ctrl-C ends it; the next start resumes")
-
-    serve_all(plan, secrets, ready, lambda text: line(text, to=errors))
+    line(f"serving {plan.project}")
+    line(f"pages          {pages}")
+    line(f"status page    {plan.pages}/status")
+    line(f"inbox          {plan.inbox}")
+    if asks_for_login:
+        line(f"Prefect        {plan.dashboard}  its login is in {login_at}")
+    else:
+        line(f"Prefect        {plan.dashboard}  which asks for no login: others may use it")
+    metrics = f"http://{plan.host}:{plan.metrics_port}/metrics"
+    line(f"metrics        {metrics}  its token is in {token_at}")
+    line("Ctrl-C ends it; the next start resumes")
 
 
 def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:

@@ -11,7 +11,6 @@ import typer
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from data_contracts.run import RunRecord
-from flows.cli.computing import WorkersOption
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -22,6 +21,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
+from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.best_results import static_cameras
 from flows.run_record import latest_run, require_no_other_run
@@ -34,7 +34,7 @@ from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.store import Run, Store
 
-FRACTION = 0.1
+MIN_OFFSET_FRAMES = 0.1
 """Remaining offset that is worth a correction [frame]."""
 
 
@@ -240,7 +240,7 @@ def _print(
     if any(
         row.found is not None
         and row.std is not None
-        and abs(row.found - row.proposed) > max(FRACTION, 3.0 * row.std)
+        and abs(row.found - row.proposed) > max(MIN_OFFSET_FRAMES, 3.0 * row.std)
         for row in rows
     ):
         line(

@@ -19,7 +19,7 @@ KEEP_SECONDS = 5.0
 """Interval at which lost workers are restarted."""
 
 
-def starting_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCluster:
+def start_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateCluster:
     """Start workers on this machine, which at once import the modules that they will need.
 
     Args:
@@ -53,7 +53,7 @@ def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
 
 
 @contextmanager
-def kept_complete(cluster: PrivateCluster) -> Iterator[Callable[[int], None]]:
+def keep_workers(cluster: PrivateCluster) -> Iterator[Callable[[int], None]]:
     """Restart workers that are permanently gone, such as those that end while they start.
 
     Dask notices that they are gone, but starts others only on request. Yields a function that

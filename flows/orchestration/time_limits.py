@@ -9,7 +9,7 @@ from typing import Final
 from flows.method import METHOD
 from worldpose.errors import UsageError
 
-LONGEST: Final = 360.0
+DEFAULT_MINUTES: Final = 360.0
 """Default limit of a stage [min]; the longest unit so far took a tenth of it."""
 
 TimeLimits = Mapping[str, float]
@@ -18,7 +18,7 @@ TimeLimits = Mapping[str, float]
 
 def seconds_of(stage: str, limits: TimeLimits) -> float:
     """Return the time limit of the stage's units [s]."""
-    return 60.0 * limits.get(stage, LONGEST)
+    return 60.0 * limits.get(stage, DEFAULT_MINUTES)
 
 
 def parse_time_limits(given: Sequence[str]) -> TimeLimits:

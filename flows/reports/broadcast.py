@@ -42,11 +42,11 @@ from worldpose.reports.videos import overlay_frames
 from worldpose.store import Run
 from worldpose.video import open_video, write_video
 
-WORST: Final = 2
+WORST_FRAMES: Final = 2
 """Number of frames shown with the largest camera uncertainty [1]."""
 FRAME_RATE: Final = 25.0
 """Maximum frame rate of overlay videos, approximate [1/s]."""
-LENGTH: Final = 30.0
+MAX_VIDEO_S: Final = 30.0
 """Maximum duration of overlay videos [s]."""
 
 
@@ -74,7 +74,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
         pictures += _before_and_after(run, match, clip, tracks)
         pictures += flow_pictures(run, match, clip, camera)
         offset = unit_frames(match.folder.spec, clip).offset
-        for video_number in result.attrs["pick_next"][:WORST]:
+        for video_number in result.attrs["pick_next"][:WORST_FRAMES]:
             number = video_number - offset
             place = int(np.searchsorted(frame, number))
             with open_video(match.folder.videos[clip]) as video:
@@ -186,7 +186,7 @@ def write_broadcast_videos(
 def broadcast_video_frames(run: Run, clip: str, fps: float) -> NDArray[np.int64]:
     """Return the indices of the frames of a clip's video: the part of the largest error."""
     expected = np.nan_to_num(run[f"broadcast_calibration/{clip}"]["reprojection_error"].values)
-    most = round(LENGTH * fps)
+    most = round(MAX_VIDEO_S * fps)
     begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
     every = max(1, round(fps / FRAME_RATE))
     return np.arange(begin, min(begin + most, len(expected)), every)

@@ -17,7 +17,7 @@ from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.reports import CameraSummary, CaptionedImage
 from worldpose.reports.html_page import Table
 from worldpose.reports.static_cameras import (
-    NEAR,
+    NEAR_PAINT_PX,
     Click,
     ErrorMap,
     plot_calibration,
@@ -26,7 +26,7 @@ from worldpose.reports.static_cameras import (
 from worldpose.static_calibration.proposal import PROPOSED
 from worldpose.store import Run, Store
 
-SHOWN = 2
+MAX_CAMERAS = 2
 """Number of cameras shown with their clicks, weakest first."""
 
 _ORIGINS = {
@@ -85,7 +85,7 @@ def camera_pictures(
         for name in cameras
     }
     weakest = sorted((name for name in cameras if errors[name]), key=lambda name: -errors[name])
-    shown = weakest[:SHOWN] if match.folder.pitch is not None else ()
+    shown = weakest[:MAX_CAMERAS] if match.folder.pitch is not None else ()
     return [
         CaptionedImage(
             f"One of the least certain cameras, {name}: the pitch as it projects it, clicks "
@@ -121,8 +121,8 @@ def paint_pictures(
         CaptionedImage(
             f"Camera {name}: paint in its image, and the distance of every pixel from it, with the "
             "markings as the estimated camera projects them. Where any paint is within "
-            f"{NEAR:.0f} px, {share:.0%} of them lie on it. This is a separate check: cameras "
-            "are not estimated in this way.",
+            f"{NEAR_PAINT_PX:.0f} px, {share:.0%} of them lie on it. This is a separate check: "
+            "cameras are not estimated in this way.",
             png,
         )
     ]

@@ -25,9 +25,9 @@ from worldpose.reports.videos import overlay_frames
 from worldpose.store import Run, Store
 from worldpose.video import write_video
 
-LENGTH: Final = 30.0
+MAX_VIDEO_S: Final = 30.0
 """Maximum duration [s]; a longer clip is cut to the middle part."""
-RATE: Final = 25.0
+MAX_RATE: Final = 25.0
 """Maximum frames per second."""
 
 
@@ -73,7 +73,7 @@ def write_clip_video(
         made.replace(file)
         return
     fps = match.folder.spec.fps
-    every = max(1, round(fps / RATE))
+    every = max(1, round(fps / MAX_RATE))
     tracks = joint_tracks(run, clip)
     frames = video_frames(run, match, clip, owner)
     camera = static_cameras(run, match.folder.spec)[owner]
@@ -97,7 +97,7 @@ def video_frames(run: Run, match: Match, clip: str, owner: str) -> NDArray[np.in
     if owner == clip:
         frames = run[f"broadcast_calibration/{clip}"]["frame"].values
         return np.asarray(frames[broadcast_video_frames(run, clip, fps)])
-    every = max(1, round(fps / RATE))
+    every = max(1, round(fps / MAX_RATE))
     all_frames = joint_tracks(run, clip).frames
-    spare = max(0, len(all_frames) - round(LENGTH * fps)) // 2
+    spare = max(0, len(all_frames) - round(MAX_VIDEO_S * fps)) // 2
     return np.asarray(all_frames[spare : len(all_frames) - spare : every])

@@ -57,7 +57,7 @@ def clip_pictures(
             ),
             CaptionedImage(
                 f"{here}, from above. The more cameras see a place, the darker it is.",
-                plot_stadium(cameras, "", tracks, 0, pitch=pitch),
+                plot_stadium(cameras, "", tracks, pitch=pitch),
             ),
         ]
         bodies = body_tracks(run, clip)

@@ -15,13 +15,13 @@ from worldpose.reports import CaptionedImage
 from worldpose.reports.clips import ImageDetections, ReconstructedPeople, plot_detections
 from worldpose.store import Run, Store
 
-SHOWN: Final = 2
+MAX_VIEWS: Final = 2
 """Number of views shown: the worst, each of another person."""
-FRAMES: Final = 300
+EVALUATED_FRAMES: Final = 300
 """Frames of a clip that are evaluated, evenly spaced."""
-KNOWN: Final = 8
+MIN_JOINTS: Final = 8
 """Minimum number of joints of a person in a view."""
-_AROUND: Final = 2.5
+_CROP_HEIGHTS: Final = 2.5
 """Side length of the crop [height of the person]."""
 
 
@@ -34,7 +34,9 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
     Returns:
         Frame index, camera and person of each, and the median distance in percent.
     """
-    rows = np.unique(np.linspace(0, len(tracks.frames) - 1, FRAMES).round().astype(np.int64))
+    rows = np.unique(
+        np.linspace(0, len(tracks.frames) - 1, EVALUATED_FRAMES).round().astype(np.int64)
+    )
     numbers = tracks.frames[rows]
     tracked = run[f"tracking/{clip}"]["detection_index"].sel(frame=numbers)
     place = tracked.reindex(person=tracks.person_ids, fill_value=-1).values
@@ -45,10 +47,10 @@ def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[
         found = camera.project(tracks.joints[rows].reshape(-1, 3)).reshape(own.shape)
         off = np.linalg.norm(own - found, axis=-1)
         height = np.ptp(found[..., 1], axis=-1)
-        enough = (np.isfinite(off).sum(-1) >= KNOWN) & (place[:, c] >= 0)
+        enough = (np.isfinite(off).sum(-1) >= MIN_JOINTS) & (place[:, c] >= 0)
         away[:, c][enough] = np.nanmedian(off[enough], axis=-1) / height[enough]
     worst: list[tuple[int, ...]] = []
-    for _ in range(SHOWN):
+    for _ in range(MAX_VIEWS):
         if not np.isfinite(away).any():
             break
         row, camera_place, person = np.unravel_index(int(np.nanargmax(away)), away.shape)
@@ -71,7 +73,7 @@ def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> li
         if still is None and number == int(tracks.frames[0]):
             still = background_image(store, match, name)
         pixels = camera.project(tracks.joints[row, person])
-        side = _AROUND * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
+        side = _CROP_HEIGHTS * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
         png = plot_detections(
             camera,
             ImageDetections(

@@ -20,7 +20,7 @@ from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number
 from worldpose.store import Run
 
-MOST = 20
+MAX_ROWS = 20
 """Maximum number of rows of the outlier lists, worst first."""
 
 _BODIES = {
@@ -96,7 +96,7 @@ def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
             _number(float(result["click_surprise"].values[k])),
             str(result.attrs["click_problem"][k]),
         )
-        for k in np.flatnonzero(result["click_wrong"].values)[:MOST]
+        for k in np.flatnonzero(result["click_wrong"].values)[:MAX_ROWS]
     ]
     if not rows:
         return None
@@ -107,7 +107,7 @@ def _clicks(result: xr.Dataset, names: list[str]) -> Table | None:
 def _people(result: xr.Dataset, names: list[str]) -> Table | None:
     count = int(result.attrs["outliers_found"])
     frame, camera, person, joint, surprise = (
-        result[f"outlier_{name}"].values[:MOST]
+        result[f"outlier_{name}"].values[:MAX_ROWS]
         for name in ("frame", "camera", "person", "joint", "surprise")
     )
     if not len(frame):

@@ -260,7 +260,7 @@ def _count_text(found: DataSetStatistics) -> str:
     return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
 
 
-MOST = 200
+MAX_ROWS = 200
 """Maximum number of rows, the last ones."""
 
 
@@ -300,6 +300,6 @@ def review_table(match: Match) -> list[Table]:
             rows.append((when(said.withdrawn_at), said.who, "took back", what, said.why or ""))
     if not rows:
         return []
-    left = len(rows) - MOST
-    heading = f"The last {MOST}; {left} came before" if left > 0 else ""
-    return [Table(heading, ("when", "who", "", "what", "why"), tuple(rows[-MOST:]))]
+    left = len(rows) - MAX_ROWS
+    heading = f"The last {MAX_ROWS}; {left} came before" if left > 0 else ""
+    return [Table(heading, ("when", "who", "", "what", "why"), tuple(rows[-MAX_ROWS:]))]

@@ -17,7 +17,7 @@ from worldpose.body import OPEN_BODY, find_body
 from worldpose.errors import UsageError
 from worldpose.evaluation import EvaluationSettings, evaluate_joints
 from worldpose.formats import JointTracks
-from worldpose.formats.baselines import MethodResult, find_method, resample_result
+from worldpose.formats.baselines import Method, MethodResult, find_method, resample_result
 from worldpose.formats.challenge import RELEASE_SIZE
 from worldpose.geometry import Camera
 
@@ -66,21 +66,14 @@ def score_methods(
     first = first_frame if first_frame is not None else int(frames[0]) if len(frames) else 0
     model = find_body(body or OPEN_BODY)
     rate = fps or (None if spec is None else spec.fps)
-    _require_scored(named, seen_fps or {})
+    seen_fps = seen_fps or {}
+    _require_scored(named, seen_fps)
     scores = []
     for item in named:
-        name, found, path = item.partition("=")
-        method = find_method(name)
-        if not found or not Path(path).exists():
-            raise UsageError(
-                f"--method {item}",
-                expected=f"{name}=PATH of its result",
-                found=f"{path or 'no path'}, which does not exist",
-                todo="Name the file or folder of the method's result.",
-            )
-        result = method.read(Path(path), model, _image_size(camera))
-        if name in (seen_fps or {}):
-            result = resample_result(result, (seen_fps or {})[name], _clip_fps(rate, name))
+        method, path = _find_result(item)
+        result = method.read(path, model, _image_size(camera))
+        if method.name in seen_fps:
+            result = resample_result(result, seen_fps[method.name], _clip_fps(rate, method.name))
         if result.world != "shared" and (camera is None or result.boxes is None):
             raise UsageError(
                 f"--method {item}",
@@ -103,7 +96,7 @@ def score_methods(
             MethodScore(
                 method=method.name,
                 title=method.title,
-                source=Path(path).name,
+                source=path.name,
                 world=result.world,
                 body_model=model.name,
                 notes=dict(result.notes),
@@ -114,6 +107,20 @@ def score_methods(
             )
         )
     return tuple(scores)
+
+
+def _find_result(item: str) -> tuple[Method, Path]:
+    """Return the method and the file or folder of NAME=PATH; raise UsageError if it is absent."""
+    name, equals, path = item.partition("=")
+    method = find_method(name)
+    if not equals or not Path(path).exists():
+        raise UsageError(
+            f"--method {item}",
+            expected=f"{name}=PATH of its result",
+            found=f"{path or 'no path'}, which does not exist",
+            todo="Name the file or folder of the method's result.",
+        )
+    return method, Path(path)
 
 
 def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None:

@@ -28,9 +28,9 @@ Kind = Literal["match", "clip", "camera", "player"]
 Mark = Literal["better", "worse", "mixed", "unchanged", "only in A", "only in B"]
 
 KINDS: Final[tuple[Kind, ...]] = ("match", "clip", "camera", "player")
-PART: Final = 0.01
+MIN_RELATIVE_CHANGE: Final = 0.01
 """Minimum relative change of a metric [1]."""
-MATTERS: Final[Mapping[str, Mapping[str, float]]] = {
+MIN_CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
     "static_calibration": {"expected_ground_error_median_m": 1e-3, "clicks_wrong": 0.0},
     "tracking": {"mean_ray_distance_m": 1e-3, "unmatched_share": 1e-3, "undecided": 0.0},
     "bundle_adjustment": {"held_out_error_after_px": 0.01},
@@ -112,7 +112,7 @@ def _change(subject: Subject, before: Figures | None, after: Figures | None) -> 
 
 def _mark(figure: str, before: float, after: float) -> Mark:
     stage = figure.partition("/")[0]
-    least = max(PART * abs(before), MATTERS[stage][figure.rpartition(" ")[2]])
+    least = max(MIN_RELATIVE_CHANGE * abs(before), MIN_CHANGES[stage][figure.rpartition(" ")[2]])
     if abs(after - before) <= least:
         return "unchanged"
     return "better" if after < before else "worse"
@@ -125,7 +125,7 @@ def _subjects(record: RunRecord, names: Mapping[tuple[str, str], str]) -> dict[S
         stage, _, place = unit.partition("/")
         for name, value in figures.items():
             figure, _, part = name.partition(".")
-            if figure in MATTERS.get(stage, {}):
+            if figure in MIN_CHANGES.get(stage, {}):
                 subject = _subject(stage, place, part, names)
                 found.setdefault(subject, {})[f"{unit} {figure}"] = value
     return found
@@ -160,9 +160,9 @@ def _order(subject: Subject) -> tuple[int, list[str | int]]:
     return KINDS.index(kind), [int(part) if part.isdigit() else part for part in parts]
 
 
-FRAMES: Final = 50
+COMPARED_FRAMES: Final = 50
 """Compared frames, spread over the clip, so that people who are close only briefly differ."""
-NEAR: Final = 1.0
+MAX_DISTANCE_M: Final = 1.0
 """Maximum mean joint distance of one person [m]: no two people stay closer for long."""
 
 
@@ -206,7 +206,7 @@ class BodiesOfBoth:
 
     def pairs(self) -> dict[int, int]:
         """Map person indices of B to those of A, for matched people."""
-        step = max(len(self.frame) // FRAMES, 1)
+        step = max(len(self.frame) // COMPARED_FRAMES, 1)
         return pair_people(self.before[::step], self.after[::step])
 
 
@@ -247,11 +247,11 @@ def pair_people(before: Floats, after: Floats) -> dict[int, int]:
     return {
         other: int(person)
         for other, person in enumerate(nearest)
-        if mean[person].argmin() == other and mean[person, other] <= NEAR
+        if mean[person].argmin() == other and mean[person, other] <= MAX_DISTANCE_M
     }
 
 
-JOINTS: Final = 9
+MIN_JOINTS: Final = 9
 """Minimum number of a person's joints, of 17, inside the image."""
 
 
@@ -311,7 +311,7 @@ def _worst(
     inside = ((one >= 0) & (one < before[name].image_size)).all(axis=-1) & np.isfinite(away)
     joints = inside.sum(axis=-1)
     mean = np.where(inside, away, 0.0).sum(axis=-1) / np.maximum(joints, 1)
-    mean[joints < JOINTS] = -1.0
+    mean[joints < MIN_JOINTS] = -1.0
     frame, place = np.unravel_index(int(mean.argmax()), mean.shape)
     if mean[frame, place] < 0:
         return []

@@ -41,7 +41,7 @@ class Scores:
     evaluation: Evaluation
     people: tuple[PersonScore, ...]
     cameras: tuple[CameraScore, ...]
-    laid: ReferenceAlignment | None = None
+    alignment: ReferenceAlignment | None = None
     """Alignment of markers to the prediction, if markers are the ground truth."""
 
 
@@ -89,10 +89,10 @@ def score(
     truth = Side(None, {}) if measured else reference_side(reference)
     estimate = _prediction(prediction, project, truth, run_id=run_id, stage=stage)
     match = estimate.match or truth.match
-    laid = None
+    alignment = None
     if measured:
         rate = fps or (None if match is None else match.spec.fps)
-        tracks, laid = _laid_over(Path(reference), estimate.joints, rate, marker_map)
+        tracks, alignment = _align_markers(Path(reference), estimate.joints, rate, marker_map)
         truth = Side(tracks, {})
     spec = None if match is None else match.spec
     is_broadcast = estimate.match is not None and not estimate.match.spec.static_cameras
@@ -123,10 +123,10 @@ def score(
             found=f"{_contents(estimate)} against {_contents(truth)}",
             todo="Name files or folders with the same kind of data.",
         )
-    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras, laid)
+    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras, alignment)
 
 
-def _laid_over(
+def _align_markers(
     path: Path, prediction: JointTracks | None, fps: float | None, marker_map: Path | None
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Align a marker file with the prediction's frames and world; return its joints."""

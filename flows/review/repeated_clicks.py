@@ -17,11 +17,11 @@ from worldpose.ingest.pitch_file import read_pitch
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import calibrate_camera
 
-NAMED: Final = 1.0
+NAMED_WITHIN_M: Final = 1.0
 """Maximum distance to a point of the pitch at which a place has the point's name [m]."""
-FAR: Final = 2.0
+MIN_DISTANCE_M: Final = 2.0
 """Minimum distance from its label at which a click is assigned to another place [m]."""
-FARTHER: Final = 3.0
+MIN_RATIO: Final = 3.0
 """Minimum ratio of this distance to that of the other click for the assignment [1]."""
 
 
@@ -67,7 +67,7 @@ def _judge(folder: Path, each: RepeatedClick) -> str:
     places = [_ground(found.estimate.camera, template, np.array(pixel)) for pixel in each.pixels]
     off = [float(np.hypot(*(place - template.points[each.names[0]][:2]))) for place in places]
     meant, other = (0, 1) if off[0] <= off[1] else (1, 0)
-    if not off[other] > max(FAR, FARTHER * off[meant]):
+    if not off[other] > max(MIN_DISTANCE_M, MIN_RATIO * off[meant]):
         return undecided
     near = {
         name: float(np.hypot(*(at[:2] - places[other])))
@@ -76,7 +76,7 @@ def _judge(folder: Path, each: RepeatedClick) -> str:
     }
     nearest = min(near, key=lambda name: near[name])
     shown = "x {:.1f}, y {:.1f} m of the world".format(*places[other])
-    if near[nearest] < NAMED:
+    if near[nearest] < NAMED_WITHIN_M:
         shown += f", near {nearest}"
     return (
         f"By the other clicks the one at {_pixel(each.pixels[meant])} is {off[meant]:.1f} m from "

@@ -14,7 +14,7 @@ from prefect.artifacts import (
     update_progress_artifact,
 )
 
-from flows.progress import Reporter, in_time, reporting_to
+from flows.progress import Reporter, format_duration, reporting_to
 from flows.review.metric_words import in_short
 from flows.service.match_runs import artifact_key
 from flows.service.overview import Overview
@@ -51,7 +51,11 @@ class ArtifactReporter(Reporter):
     def _tell(self, text: str) -> None:
         artifact, at = self.artifact, self.run_progress
         if artifact is not None:
-            left = "" if at.seconds_left is None else f", about {in_time(at.seconds_left)} left"
+            left = (
+                ""
+                if at.seconds_left is None
+                else f", about {format_duration(at.seconds_left)} left"
+            )
             _show_artifact(
                 lambda: update_progress_artifact(
                     artifact, 100.0 * at.share, description=f"{text}{left}"
@@ -60,7 +64,7 @@ class ArtifactReporter(Reporter):
 
 
 @contextmanager
-def shown_at_prefect(store: Store, match_id: str) -> Iterator[None]:
+def show_at_prefect(store: Store, match_id: str) -> Iterator[None]:
     """Show progress of the enclosed run, and its outcome afterwards.
 
     Failures to show it are logged and stop nothing.

@@ -45,11 +45,11 @@ def worker(plan: ServePlan) -> None:
     import anyio
 
     from flows.service.deployments import install, work
-    from flows.service.recovery import begin_again
+    from flows.service.recovery import restart_lost_runs
 
     async def serve() -> None:
         installed = await install(plan)
-        await begin_again(plan, at_start=True)
+        await restart_lost_runs(plan, at_start=True)
         await work(plan, installed)
 
     anyio.run(serve)

@@ -32,7 +32,7 @@ from flows.reprocess import reprocess_matches
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest
-from flows.service.artifacts import shown_at_prefect
+from flows.service.artifacts import show_at_prefect
 from flows.service.inbox import take_in
 from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name
 from flows.service.plan import TITLES, ServePlan
@@ -101,7 +101,7 @@ def match(
     with alone_with(store, match_id):
         if iterations == 1:
             return require_complete(_run_until_decided(store, match_id, request))
-        with shown_at_prefect(store, match_id):
+        with show_at_prefect(store, match_id):
             given = open_match(store, match_id)
             request = _on_own_workers(request)
             return require_complete(iterate_match(store, given, request, iterations).record)
@@ -122,7 +122,7 @@ def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunR
                 continue
             if latest.state == "complete":
                 return latest
-        with shown_at_prefect(store, match_id):
+        with show_at_prefect(store, match_id):
             reporter().run_planned(expected_work(store, opened, plan.missing, latest))
             log = RunLog.begin(store, opened, stages, request.settings, policy, request.iteration)
             record = run_stages(log, request.time_limits)

@@ -50,7 +50,7 @@ KILLED: Final = "its process was killed"
 LOG = logging.getLogger("worldpose.operations")
 
 
-async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
+async def restart_lost_runs(plan: ServePlan, *, at_start: bool = False) -> list[str]:
     """Reschedule runs that were killed or lost their machines; return their names.
 
     Args:
@@ -73,7 +73,7 @@ async def begin_again(plan: ServePlan, *, at_start: bool = False) -> list[str]:
                 if await _is_dead(client, plan, run):
                     await client.set_flow_run_state(run.id, Crashed(message=KILLED), force=True)
         for run in await _runs(client, plan, (StateType.CRASHED, StateType.FAILED)):
-            if may_begin_again(run):
+            if may_restart(run):
                 why = KILLED if run.state_type == StateType.CRASHED else "its machines were lost"
                 LOG.warning("%s: %s; it restarts", run.name, why)
                 state = Scheduled(name="AwaitingRetry", message=why)
@@ -95,7 +95,7 @@ async def name_scheduled_runs(plan: ServePlan) -> None:
                         await client.update_flow_run(run.id, name=name)
 
 
-def may_begin_again(run: FlowRun) -> bool:
+def may_restart(run: FlowRun) -> bool:
     """Return whether a run may restart: its process was killed, or its machines were lost."""
     own_starts = run.run_count - min(_service_deaths(run), MOST_SERVICE_DEATHS)
     if run.state is None or own_starts >= MOST_BEGINNINGS:

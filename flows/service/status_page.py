@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from html import escape
 from typing import Any, Final
 from urllib.parse import quote
@@ -16,6 +15,7 @@ from starlette.background import BackgroundTask
 
 from data_contracts.operations import Arrival
 from flows.method import METHOD
+from flows.review.descriptions import when
 from flows.review.metric_words import in_short, reason_words
 from flows.service.layout import served_state
 from flows.service.overview import MatchStatus, Overview, UnitSummary, age
@@ -353,7 +353,7 @@ def _inbox(arrivals: Iterable[Arrival], begun: Collection[str]) -> str:
     rows = "".join(
         f'<tr><td data-of="arrival">{escape(each.name)}</td><td data-of="state">{each.state}</td>'
         f'<td data-of="priority">{each.priority}</td>'
-        f'<td data-of="since">{_date(each.changed_at)}</td>'
+        f'<td data-of="since">{when(each.changed_at)}</td>'
         f'<td data-of="match">{escape(each.match_id or "")}</td>'
         f"<td><small>{'' if each.match_id in begun else escape(in_browser(each.reason))}</small>"
         "</td></tr>"
@@ -406,7 +406,3 @@ def _time(seconds: float) -> str:
     if seconds < 3600:
         return f"{seconds / 60:.1f} min"
     return f"{seconds / 3600:.1f} h"
-
-
-def _date(at: datetime) -> str:
-    return f"{at:%Y-%m-%d %H:%M} UTC"

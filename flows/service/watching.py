@@ -33,7 +33,7 @@ from flows.service.match_runs import run_name
 from flows.service.metrics import ProjectMetrics, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan, deployment_names
-from flows.service.recovery import begin_again, may_begin_again, name_scheduled_runs
+from flows.service.recovery import may_restart, name_scheduled_runs, restart_lost_runs
 from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
@@ -66,15 +66,15 @@ def watch(plan: ServePlan) -> None:
 
 
 async def _watch(plan: ServePlan, store: Store) -> None:
-    teller = AlertDispatcher(
+    dispatcher = AlertDispatcher(
         plan.state_folder, senders_of(os.environ, plan.state_folder.alert_settings)
     )
     await asyncio.gather(  # each at its own interval: none blocks another
         _watch_bucket(plan),
         _watch_inbox(plan),
-        _begin_lost_runs_again(plan, store),
-        _watch_alerts(plan, store, teller),
-        *(_deliver(teller, sender) for sender in teller.senders),
+        _watch_lost_runs(plan, store),
+        _watch_alerts(plan, store, dispatcher),
+        *(_deliver(dispatcher, sender) for sender in dispatcher.senders),
     )
 
 
@@ -147,7 +147,7 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
     )
 
 
-async def _begin_lost_runs_again(plan: ServePlan, store: Store) -> None:
+async def _watch_lost_runs(plan: ServePlan, store: Store) -> None:
     trouble, naming = Trouble("looking for lost runs"), Trouble("naming runs and matches")
     while True:
         with naming.log_failure():
@@ -155,10 +155,10 @@ async def _begin_lost_runs_again(plan: ServePlan, store: Store) -> None:
             await offer_matches(plan, await asyncio.to_thread(store.matches))
         await asyncio.sleep(ALERT_SECONDS)
         with trouble.log_failure():
-            await begin_again(plan)
+            await restart_lost_runs(plan)
 
 
-async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) -> None:
+async def _watch_alerts(plan: ServePlan, store: Store, dispatcher: AlertDispatcher) -> None:
     overview = Overview(store)
     at_prefect = Trouble("asking Prefect for failed runs")
     trouble = Trouble("looking for alerts")
@@ -170,15 +170,15 @@ async def _watch_alerts(plan: ServePlan, store: Store, teller: AlertDispatcher) 
         with trouble.log_failure():
             matches = await asyncio.to_thread(overview.look)
             arrivals = plan.state_folder.arrivals().values()
-            await asyncio.to_thread(teller.hold, alerts_now(plan, matches, arrivals, failed))
+            await asyncio.to_thread(dispatcher.hold, alerts_now(plan, matches, arrivals, failed))
 
 
-async def _deliver(teller: AlertDispatcher, sender: Sender) -> None:
+async def _deliver(dispatcher: AlertDispatcher, sender: Sender) -> None:
     """Deliver alerts to one sender in its own thread, so that a slow sender delays no other."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
     while True:
         await asyncio.sleep(DELIVERY_SECONDS)
-        await asyncio.get_running_loop().run_in_executor(pool, teller.deliver, sender)
+        await asyncio.get_running_loop().run_in_executor(pool, dispatcher.deliver, sender)
 
 
 async def failed_runs(plan: ServePlan) -> list[FailedRun]:
@@ -201,7 +201,7 @@ async def failed_runs(plan: ServePlan) -> list[FailedRun]:
             str(run.parameters.get("match_id") or ""),
         )
         for run in runs
-        if not may_begin_again(run)
+        if not may_restart(run)
     ]
 
 

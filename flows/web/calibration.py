@@ -30,7 +30,7 @@ from worldpose.review.evidence import PitchDrawing, Preview, preview
 from worldpose.static_calibration import StaticCalibrationSettings, propose_camera
 from worldpose.video import open_video
 
-KEPT: Final = 2
+CACHED_IMAGES: Final = 2
 """Images that are kept decoded; a 4K one takes 25 MB."""
 _POINTS_ALONE: Final = StaticCalibrationSettings(lines=False)
 
@@ -85,7 +85,7 @@ class Pictures:
             if name not in self._decoded:
                 self._decoded[name] = _read(match, owner, frame)
             self._decoded.move_to_end(name)
-            while len(self._decoded) > KEPT:
+            while len(self._decoded) > CACHED_IMAGES:
                 self._decoded.popitem(last=False)
             return self._decoded[name]
 

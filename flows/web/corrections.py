@@ -21,7 +21,7 @@ from flows.web.decisions import Edits
 
 SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
-LISTED: Final = 200
+MAX_LISTED: Final = 200
 """Corrections of a group in one response, the last ones first."""
 
 
@@ -125,7 +125,7 @@ def routes(context: PageContext) -> APIRouter:
         return {
             "corrections": [
                 {**correction_json(each), "words": in_words(each), "objection": why}
-                for each, why in found[skip : skip + LISTED]
+                for each, why in found[skip : skip + MAX_LISTED]
             ],
             "count": len(found),
         }

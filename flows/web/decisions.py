@@ -14,7 +14,7 @@ from flows.review.verdicts import decide, still_waiting
 from flows.run_record import latest_run
 from flows.web.app_context import PageContext, Person
 
-EDITS: int = 200
+MAX_EDITS: int = 200
 """Maximum number of edits per request."""
 
 
@@ -45,7 +45,7 @@ class GivenEdit(Record):
 class Edits(Record):
     """Edits that are kept all or none."""
 
-    edits: tuple[GivenEdit, ...] = Field(min_length=1, max_length=EDITS)
+    edits: tuple[GivenEdit, ...] = Field(min_length=1, max_length=MAX_EDITS)
     """Edits in the order of application."""
     note: str = Field(default="", max_length=2000)
     """The person's comment."""

@@ -20,9 +20,9 @@ from flows.web.app_context import PageContext, Person
 from worldpose.errors import InputError
 from worldpose.store import Store
 
-LISTED: Final = 60
+MAX_LISTED: Final = 60
 """Maximum number of listed detections to review."""
-ACCEPTED: Final = 500
+MAX_ACCEPTED: Final = 500
 """Maximum number of detections accepted by name at once."""
 
 
@@ -31,7 +31,7 @@ class Accepting(Record):
 
     at_least: float | None = Field(default=None, ge=0, le=1)
     """Accept every detection with at least this score [1]; None = only those in `people`."""
-    people: tuple[tuple[Frame, DetectionIndex], ...] = Field(default=(), max_length=ACCEPTED)
+    people: tuple[tuple[Frame, DetectionIndex], ...] = Field(default=(), max_length=MAX_ACCEPTED)
     """Match frame, and index among the detections of the frame."""
 
 
@@ -96,7 +96,10 @@ def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
         (float(score), int(frame), int(detection))
         for each in left
         for frame, detection, score in zip(
-            each.frame[:LISTED], each.detection[:LISTED], each.score[:LISTED], strict=True
+            each.frame[:MAX_LISTED],
+            each.detection[:MAX_LISTED],
+            each.score[:MAX_LISTED],
+            strict=True,
         )
     )
     return {
@@ -104,7 +107,7 @@ def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
         "people": sum(each.people for each in left),
         "next": [
             {"frame": frame, "detection": detection, "score": round(score, 3)}
-            for score, frame, detection in rows[:LISTED]
+            for score, frame, detection in rows[:MAX_LISTED]
         ],
     }
 

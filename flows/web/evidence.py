@@ -32,7 +32,7 @@ from worldpose.review import requests_by_id
 from worldpose.review.evidence import Curve, clip_curves
 from worldpose.store import Run, Store, open_run
 
-KEPT: Final = 16
+CACHED_REVIEWS: Final = 16
 """Review requests whose images are kept in memory; drawing takes one or two seconds each."""
 
 MOST_CAMERAS: Final = 4
@@ -67,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
             raise HTTPException(404, "no such review")
         with lock:  # one at a time: drawing needs memory for all images
             if (match_id, request) not in drawn:
-                while len(drawn) >= KEPT:
+                while len(drawn) >= CACHED_REVIEWS:
                     drawn.pop(next(iter(drawn)))
                 drawn[match_id, request] = draw_evidence(context.store, match, asked)
             return drawn[match_id, request]

@@ -18,11 +18,11 @@ from worldpose.review.identities import Identities, find_sighting
 from worldpose.store import Store, open_run
 from worldpose.video import open_video
 
-WAYS: Final = 300
+TRAJECTORY_POINTS: Final = 300
 """Points of a person's trajectory that are sent."""
 HIPS: Final = (11, 12)
 """Indices of the hips in COCO-17."""
-AROUND: Final = 1.6
+CROP_HALF_HEIGHT_M: Final = 1.6
 """Half the height of a person's crop [m]."""
 
 
@@ -41,7 +41,7 @@ def routes(context: PageContext) -> APIRouter:
         match, found = open_identities(match_id, clip)
         spec = match.folder.spec
         first = int(found.frame[0])
-        step = max(1, len(found.frame) // WAYS)
+        step = max(1, len(found.frame) // TRAJECTORY_POINTS)
         pitch = match.folder.pitch
         return {
             "clip": clip,
@@ -123,7 +123,9 @@ def _crop(store: Store, match: Match, found: Identities, person: int, frame: int
     for c, name in enumerate(found.cameras):
         if found.detection_index[f, c, k] < 0 or name not in match.folder.videos:
             continue
-        ends = cameras[name].project(middle + np.array([[0, 0, AROUND], [0, 0, -AROUND]]))
+        ends = cameras[name].project(
+            middle + np.array([[0, 0, CROP_HALF_HEIGHT_M], [0, 0, -CROP_HALF_HEIGHT_M]])
+        )
         tall = float(np.linalg.norm(ends[0] - ends[1]))
         if np.isfinite(tall) and (best is None or tall > best[0]):
             best = (tall, name, cameras[name].project(middle[None])[0])

@@ -18,7 +18,7 @@ from flows.web.app_context import PageContext
 from worldpose.review import current_value, requests_by_id
 from worldpose.store import Run, open_run
 
-MOST: Final = 60
+MAX_LISTED: Final = 60
 """Maximum number of listed keypoints, by largest Mahalanobis distance."""
 Outlier = tuple[float, str, MovedPoint | MovedKeypoint | DeletedDetection, bool]
 """Mahalanobis distance [standard deviations], subject, edit that removes it, and whether it is
@@ -71,7 +71,7 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
     result = run[ADJUSTED]
     names = [str(name) for name in result["camera"].values]
     said = {_place(correction.edit) for correction in match.corrections}
-    for k in range(min(MOST, result.sizes["outlier"])):
+    for k in range(min(MAX_LISTED, result.sizes["outlier"])):
         frame, c, person, joint = (
             int(result[f"outlier_{name}"].values[k])
             for name in ("frame", "camera", "person", "joint")

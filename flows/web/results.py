@@ -29,7 +29,7 @@ from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scen
 from worldpose.store import Run, open_run
 
 BINARY: Final = "application/octet-stream"
-KEPT: Final = 12
+CACHED_FILES: Final = 12
 """Files that the server keeps; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
     "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; "
@@ -53,7 +53,7 @@ class _Files:
         with self._lock:
             if not file.is_file():
                 kept = sorted(file.parent.iterdir(), key=lambda each: each.stat().st_mtime)
-                for each in kept[: max(0, len(kept) - KEPT + 1)]:
+                for each in kept[: max(0, len(kept) - CACHED_FILES + 1)]:
                     each.unlink()
                 with TemporaryDirectory(prefix="worldpose-draft-") as draft:
                     made = Path(draft) / name

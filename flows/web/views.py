@@ -21,7 +21,7 @@ from worldpose.geometry import Camera
 from worldpose.review.evidence import check_views, epipolar_curves
 from worldpose.store import open_run
 
-KEPT: Final = 8
+CACHED_PEOPLE: Final = 8
 """People whose views are kept in memory while a keypoint is dragged."""
 
 
@@ -67,7 +67,7 @@ def routes(context: PageContext) -> APIRouter:
         said = len(match.journal.entries)
         place = (match_id, runs[-1:], said, owner, frame, detection)
         with lock:
-            while len(known) >= KEPT:
+            while len(known) >= CACHED_PEOPLE:
                 known.pop(next(iter(known)))
             group = known.get(place) or _group(context, match, owner, frame, detection)
             known[place] = group

@@ -6,7 +6,7 @@ from starlette.responses import JSONResponse
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from flows.orchestration.busy_database import REPETITIONS, RepeatBusy
+from flows.orchestration.prefect_server import REPETITIONS, RepeatBusy
 
 BROWSER = {"sec-fetch-mode": "cors"}
 

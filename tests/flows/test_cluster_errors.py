@@ -42,7 +42,7 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
     with (
         dask.config.set(soon),
         LocalCluster(**local_cluster_options(1)) as cluster,
-        local_cluster.kept_complete(cluster) as ask_for,
+        local_cluster.keep_workers(cluster) as ask_for,
         Client(cluster, set_as_default=False) as client,
     ):
         client.wait_for_workers(1, 60)

@@ -18,7 +18,7 @@ from rich.console import Console
 from data_contracts.match import MatchSpec
 from flows import progress
 from flows.cli import console
-from flows.progress import MOST_TOLD, Reporter, in_time
+from flows.progress import MOST_TOLD, Reporter, format_duration
 from flows.registering import open_match
 from flows.run_plan import plan_run
 from flows.run_record import (
@@ -112,7 +112,7 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     ],
 )
 def test_a_duration_is_short(seconds, text):
-    assert in_time(seconds) == text
+    assert format_duration(seconds) == text
 
 
 @pytest.mark.parametrize("verbose", [False, True])
@@ -226,7 +226,7 @@ INTERRUPTED_WHILE_PRINTING = """
 import os, signal, threading, time
 from rich.console import Console
 from flows.cli import console
-from flows.running import ending_at_once
+from flows.running import end_at_once
 
 class Terminal:  # its main thread is interrupted while the spinner's thread waits for it
     def write(self, text):
@@ -239,7 +239,7 @@ class Terminal:  # its main thread is interrupted while the spinner's thread wai
         pass
 
 console.errors = Console(file=Terminal(), force_terminal=True)
-with console.progress() as reporter, ending_at_once():
+with console.progress() as reporter, end_at_once():
     reporter.say("a line")
 """
 

@@ -3,12 +3,12 @@
 import pytest
 
 from flows.method import METHOD
-from flows.orchestration.time_limits import LONGEST, parse_time_limits, seconds_of
+from flows.orchestration.time_limits import DEFAULT_MINUTES, parse_time_limits, seconds_of
 from worldpose.errors import UsageError
 
 
 def test_a_number_is_for_every_stage_and_one_with_a_name_for_that():
-    assert seconds_of("tracking", {}) == 60.0 * LONGEST
+    assert seconds_of("tracking", {}) == 60.0 * DEFAULT_MINUTES
     limits = parse_time_limits(["30", "detection=120"])
     assert {stage.name for stage in METHOD} == limits.keys()
     assert (seconds_of("tracking", limits), seconds_of("detection", limits)) == (1800.0, 7200.0)

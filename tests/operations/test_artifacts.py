@@ -10,7 +10,7 @@ from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
 from flows.progress import reporter
-from flows.service.artifacts import shown_at_prefect
+from flows.service.artifacts import show_at_prefect
 from worldpose.store import Store
 
 
@@ -34,7 +34,7 @@ def artifact(server):
 def test_a_run_shows_its_progress_and_its_units(artifact, project_copy):
     store = Store.open(str(project_copy))
     key = "tiny-3-1-2s"
-    with shown_at_prefect(store, TINY):
+    with show_at_prefect(store, TINY):
         reporter().run_planned({"tracking": 30.0, "body_fitting": 10.0})
         reporter().stage_started("tracking", "who is who", units=2, missing=2)
         reporter().unit_done("tracking/a", 1.0, {})
@@ -54,7 +54,7 @@ def test_a_run_goes_on_where_nothing_can_be_shown(project_copy, caplog):
     absent = "http://127.0.0.1:9/api"
     with (
         temporary_settings({PREFECT_API_URL: absent}),
-        shown_at_prefect(Store.open(str(project_copy)), TINY),
+        show_at_prefect(Store.open(str(project_copy)), TINY),
     ):
         reporter().stage_started("tracking", "who is who", units=1, missing=1)
     assert "not shown at Prefect" in caplog.text

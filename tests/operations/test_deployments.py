@@ -25,7 +25,7 @@ from flows.service.deployments import DEPLOYED, RefusedRunError, install, requir
 from flows.service.forms import offer_matches
 from flows.service.match_runs import MatchRuns
 from flows.service.plan import FLOWS, ServePlan, deployment_name
-from flows.service.recovery import begin_again, name_scheduled_runs
+from flows.service.recovery import name_scheduled_runs, restart_lost_runs
 from flows.service.watching import failed_runs
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
@@ -283,21 +283,21 @@ def test_killed_runs_begin_again_and_no_others(plan, monkeypatch):
             return {run.name: run.state_name for run in await client.read_flow_runs()}
 
     asyncio.run(give_runs())
-    assert asyncio.run(begin_again(plan)) == ["crashed"]
+    assert asyncio.run(restart_lost_runs(plan)) == ["crashed"]
     # A run that has given a sign of life a moment ago is not looked after yet; later it is.
     monkeypatch.setattr(recovery, "SILENT", recovery.SILENT * 0)
-    assert asyncio.run(begin_again(plan)) == ["dead"]
+    assert asyncio.run(restart_lost_runs(plan)) == ["dead"]
     expected = {"crashed": "AwaitingRetry", "dead": "AwaitingRetry", "alive": "Running"}
     expected |= {"waits": "Suspended", "done": "Completed"}
     found = asyncio.run(states())
     assert {name: found[name] for name in expected} == expected
     # When the service starts, none of its runs is at work; on a server of others they may be.
     others = plan.model_copy(update={"owns_prefect": False})
-    assert asyncio.run(begin_again(others, at_start=True)) == ["alive"]  # silent there
+    assert asyncio.run(restart_lost_runs(others, at_start=True)) == ["alive"]  # silent there
     asyncio.run(set_state("alive", Running()))
-    assert asyncio.run(begin_again(plan, at_start=True)) == ["alive"]
+    assert asyncio.run(restart_lost_runs(plan, at_start=True)) == ["alive"]
     asyncio.run(set_state("alive", Cancelling()))
-    assert asyncio.run(begin_again(plan, at_start=True)) == []
+    assert asyncio.run(restart_lost_runs(plan, at_start=True)) == []
     assert asyncio.run(states())["alive"] == "Cancelled"
 
 
@@ -320,6 +320,6 @@ def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, monkeypatch):
 
     run = asyncio.run(kill_thrice())
     assert (run.state_type, run.run_count) == (StateType.CRASHED, 3)
-    assert "poison" not in asyncio.run(begin_again(plan))
+    assert "poison" not in asyncio.run(restart_lost_runs(plan))
     failed = {each.name: each for each in asyncio.run(failed_runs(plan))}
     assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")

@@ -14,7 +14,7 @@ from flows.service.recovery import (
     DEATHS,
     MOST_BEGINNINGS,
     MOST_SERVICE_DEATHS,
-    may_begin_again,
+    may_restart,
 )
 
 LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
@@ -31,20 +31,20 @@ LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler 
 )
 def test_runs_begin_again_that_ended_by_no_fault_of_their_own(state, again):
     run = FlowRun(flow_id=uuid4(), state=state, state_type=state.type, run_count=1)
-    assert may_begin_again(run) is again
+    assert may_restart(run) is again
     tired = run.model_copy(update={"run_count": MOST_BEGINNINGS})
-    assert not may_begin_again(tired)
+    assert not may_restart(tired)
 
 
 def test_a_start_that_ended_with_the_whole_service_does_not_count():
     state = Crashed(message="its process was killed")
     run = FlowRun(flow_id=uuid4(), state=state, state_type=state.type, run_count=MOST_BEGINNINGS)
-    assert not may_begin_again(run)
+    assert not may_restart(run)
     killed = run.model_copy(update={"labels": {DEATHS: 1}})
-    assert may_begin_again(killed)
-    assert not may_begin_again(killed.model_copy(update={"run_count": MOST_BEGINNINGS + 1}))
+    assert may_restart(killed)
+    assert not may_restart(killed.model_copy(update={"run_count": MOST_BEGINNINGS + 1}))
     often = {"labels": {DEATHS: 99}, "run_count": MOST_BEGINNINGS + MOST_SERVICE_DEATHS}
-    assert not may_begin_again(run.model_copy(update=often))
+    assert not may_restart(run.model_copy(update=often))
 
 
 class Server:
@@ -82,7 +82,7 @@ def test_a_run_whose_process_is_gone_begins_again_also_while_it_starts(
     monkeypatch.setattr(recovery, "get_client", lambda: server)
     monkeypatch.setattr(recovery, "is_alive", lambda pid: pid == 4711 and is_alive)
     plan = SimpleNamespace(owns_prefect=True, name="worldpose")
-    again = asyncio.run(recovery.begin_again(plan))
+    again = asyncio.run(recovery.restart_lost_runs(plan))
     expected = is_due and not is_alive
     assert again == (["inbox"] if expected else [])
     assert server.given == (["Crashed", "AwaitingRetry"] if expected else [])

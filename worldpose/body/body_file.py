@@ -243,13 +243,13 @@ def body_path(name: str, folder: Path = BODY_FOLDER) -> Path:
     return folder.expanduser() / f"{name}.npz"
 
 
-def digest_of_body(name: str, folder: Path = BODY_FOLDER) -> str:
+def digest_of_body(name: str) -> str:
     """Return the SHA-256 of an installed model's file.
 
     Raises:
         UsageError: no body of that name is installed.
     """
-    return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
+    return hashlib.sha256(_find_installed(name, BODY_FOLDER).read_bytes()).hexdigest()
 
 
 def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:

@@ -62,6 +62,12 @@ class BodyParameters:
         """Shape of the batch; () for a single body."""
         return self.transl.shape[:-1]
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(...), bodies without a missing value."""
+        finite = [np.isfinite(array).all(axis=-1) for array in self._arrays()]
+        return np.asarray(np.all(finite, axis=0), dtype=np.bool_)
+
     def __getitem__(self, index: Index) -> BodyParameters:
         return BodyParameters(*(array[index_leading(index, 1)] for array in self._arrays()))
 

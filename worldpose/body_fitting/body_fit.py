@@ -23,6 +23,7 @@ from worldpose.body.model import BODY_POSE
 from worldpose.body_fitting.bones import BONES, Shape
 from worldpose.body_fitting.extra_points import ExtraFit, prepare_points
 from worldpose.body_fitting.monocular import (
+    CORRELATION_S,
     MonocularPoses,
     MonocularPrior,
     carry_errors,
@@ -35,6 +36,7 @@ from worldpose.body_fitting.objective import (
     Ground,
     Pose,
     body_axes,
+    perceived_joints,
 )
 from worldpose.body_fitting.pose_space import GATHER, load_pose_prior, nearest_known
 from worldpose.body_fitting.ray_constraints import RayConstraints
@@ -61,8 +63,6 @@ MAX_OFFSET: Final = 3.0
 THREAD_FRAMES: Final = 10_000
 """Frames of a clip up to which two people are solved at the same time: the equations of a track
 take 60 KB per frame."""
-MONOCULAR_TIME: Final = 0.5
-"""Correlation time of monocular pose errors [s]: images hardly change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,16 +173,7 @@ def fit_bodies(
         for person in range(persons)
         if len(here := np.flatnonzero(seen[:, person]))
     }
-    by_person = {
-        person: Evidence.of(joints[span, person], covariance[span, person], fps, settings)
-        for person, span in spans.items()
-    }
-    there = seen
-    for view in evidence.ray_constraints:
-        there = there | view.seen
-        for person, span in spans.items():
-            points, across = view.points[span, person], view.across[span, person]
-            by_person[person] = by_person[person].add_rays(points, across, fps, settings)
+    by_person, present = _gather_evidence(evidence, covariance, seen, spans, settings)
     shapes = fit_shapes(
         solver,
         {
@@ -219,18 +210,43 @@ def fit_bodies(
             result.guided[spans[person], person] = prior.used
     for person, span in spans.items():
         result.filled[span, person] = ~seen[span, person]
-        gone = _long_gaps(there[span, person], settings.max_filled_gap_s * fps)
-        result.drop(person, span, gone)
-        if extra is not None:
-            extra.drop(person, span, gone)
-    if evidence.shared_covariance is not None:
-        for person, span in spans.items():
-            shared = _nearest_known(evidence.shared_covariance[span, person])
-            result.covariance[span, person] += shared[:, None]
-            if extra is not None:
-                extra.covariance[span, person] += shared[:, None]
+        gone = _long_gaps(present[span, person], settings.max_filled_gap_s * fps)
+        shared = evidence.shared_covariance
+        for arrays in (result,) if extra is None else (result, extra):
+            arrays.drop(person, span, gone)
+            if shared is not None:
+                arrays.covariance[span, person] += _nearest_known(shared[span, person])[:, None]
     fit = result.fit(shapes)
     return fit if extra is None else replace(fit, extra=extra.fit())
+
+
+def _gather_evidence(
+    evidence: ClipEvidence,
+    covariance: Floats,
+    seen: NDArray[np.bool_],
+    spans: Mapping[int, slice],
+    settings: BodyFittingSettings,
+) -> tuple[dict[int, Evidence], NDArray[np.bool_]]:
+    """Return each person's joints and lines of sight, and the frames (frames, persons) with any.
+
+    Args:
+        evidence: joints and lines of sight of the clip.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of the joints, without modelled bias.
+        seen: (frames, persons), persons with a joint.
+        spans: frames of each person.
+        settings: scale and correlation time of the noise.
+    """
+    fps, present = evidence.fps, seen
+    by_person = {
+        person: Evidence.of(evidence.joints[span, person], covariance[span, person], fps, settings)
+        for person, span in spans.items()
+    }
+    for view in evidence.ray_constraints:
+        present = present | view.seen
+        for person, span in spans.items():
+            points, across = view.points[span, person], view.across[span, person]
+            by_person[person] = by_person[person].add_rays(points, across, fps, settings)
+    return by_person, present
 
 
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
@@ -249,7 +265,7 @@ def _nearest_known(matrices: Floats) -> Floats:
     known = np.flatnonzero(np.isfinite(matrices).all(axis=(-1, -2)))
     if not len(known):
         return np.zeros_like(matrices)
-    nearest: Floats = matrices[nearest_known(known, len(matrices))]
+    nearest: Floats = matrices[nearest_known(known, np.arange(len(matrices)))]
     return nearest
 
 
@@ -264,7 +280,7 @@ def _monocular_priors(
     """Return monocular poses of persons for frames with few well-determined joints."""
     variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
     sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < MAX_DEVIATION**2
-    correlated_frames = 1.0 + MONOCULAR_TIME * fps
+    correlated_frames = 1.0 + CORRELATION_S * fps
     angles = result.body_pose @ GATHER.T
     precision = learn_precision(estimates, result.orient, angles, sure, correlated_frames)
     there = np.isfinite(estimates.angles[..., 0])
@@ -276,7 +292,7 @@ def _monocular_priors(
         orient, bend = estimates.orient[span, person], estimates.angles[span, person]
         off = deviations(orient, bend, result.orient[span, person], angles[span, person])
         off[~(there & sure)[span, person]] = np.nan
-        orient, bend, left = carry_errors(orient, bend, off, used, MONOCULAR_TIME * fps)
+        orient, bend, left = carry_errors(orient, bend, off, used, CORRELATION_S * fps)
         guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
     return guided
 
@@ -419,7 +435,7 @@ def report_fit(
         seen: static cameras (cameras,) and the detections behind the joints, left-right swaps
             undone.
     """
-    perceived = fit.joints + np.einsum("fpab,jb->fpja", body_axes(fit.joints), fit.offsets)
+    perceived = perceived_joints(fit.joints, fit.offsets)
     away = np.linalg.norm(joints - perceived, axis=-1)
     step = np.linalg.norm(np.diff(fit.joints[:, :, ANKLES], axis=0), axis=-1)
     jerk = np.linalg.norm(np.diff(fit.joints, n=3, axis=0), axis=-1) * fps**3

@@ -27,7 +27,7 @@ LIMBS: Final = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16))
 """Arms and legs of COCO-17, outward."""
 MAX_SHORTENING: Final = 0.15
 """Maximum relative shortening of bones [1]: beyond it noise is not small."""
-DEFINITION: Final = 0.02
+DEFINITION_STD_M: Final = 0.02
 """Distance between a detector's definition of a joint and the body model's [m]: no number of frames
 makes a bone's length more accurate than this times sqrt(2)."""
 
@@ -120,7 +120,7 @@ def fit_shape(model: BodyModel, bones: BoneLengths) -> Shape:
     directions = model.joint_directions[ends[:, 1]] - model.joint_directions[ends[:, 0]]
     seen = np.isfinite(bones.length)
     weight = np.zeros(len(BONES))
-    weight[seen] = 1.0 / (bones.variance[seen] + 2.0 * DEFINITION**2)
+    weight[seen] = 1.0 / (bones.variance[seen] + 2.0 * DEFINITION_STD_M**2)
     betas, precision = np.zeros(model.shapes), np.eye(model.shapes)
     # Lengths are almost linear in the betas: from the third step on nothing changes.
     for _ in range(5):

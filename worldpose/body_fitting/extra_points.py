@@ -30,7 +30,7 @@ OFFSET_STD_M: Final = 0.02
 caps of shoes are 1 to 3 cm thick."""
 OWN_STD_M: Final = 0.01
 """Difference of that offset between persons, per axis [m]."""
-ROUNDS: Final = 2
+PASSES: Final = 2
 """Estimates of the offsets, each from poses that know the one before."""
 SAMPLE_S: Final = 2.0
 """Time of each person from which offsets are learned [s]: they are few numbers."""
@@ -139,7 +139,7 @@ def learn_point_offsets(
         away: Floats = part.joints[:, len(COCO17) :] - places
         return np.asarray(np.einsum("fpba,fpb->fpa", turned, away))
 
-    for _ in range(ROUNDS):
+    for _ in range(PASSES):
         moved = move_points(solver, points, offsets)
         medians = []
         for own in map_in_threads(residuals, sample):

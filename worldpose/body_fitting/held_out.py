@@ -41,11 +41,11 @@ PIECE_S: Final = 0.5
 intervals say more than few long ones; much shorter ones would take the motion from the bodies."""
 MAX_BODIES: Final = 400
 """Bodies fitted for each group of cameras [1]: about half a second of one core."""
-FARTHEST_M: Final = 0.2
+MAX_DISTANCE_M: Final = 0.2
 """A keypoint farther than this from a joint counts as this far [m]: it shows something else."""
 MIN_CLUSTERS: Final = 3
 """Intervals of persons, and cameras, needed for a standard error [1]."""
-SURE: Final = 0.975
+CERTAINTY: Final = 0.975
 """Probability of `certain_excess`, by Student's distribution of the smaller number of clusters."""
 _GROUP_OF: Final = np.array(
     [
@@ -233,7 +233,7 @@ def _compare(
     scale = view.focal.mean() / np.maximum(place @ axis + depth, 1e-3)
     for joints in both:
         away = np.linalg.norm(view.project(joints[frame, person]) - seen, axis=-1) / scale
-        squares.append(np.minimum(away, FARTHEST_M) ** 2)
+        squares.append(np.minimum(away, MAX_DISTANCE_M) ** 2)
     row, joint = np.nonzero(np.isfinite(squares[0]) & np.isfinite(squares[1]))
     persons = detections.detection_index.shape[2]
     return (
@@ -263,7 +263,7 @@ def _summarize(
             continue
         squares = fitted[mine] - triangulated[mine]
         deviation = np.sqrt(_clustered_variance(squares, interval[mine], camera[mine]))
-        certain = squares.mean() - stdtrit(clusters - 1, SURE) * deviation
+        certain = squares.mean() - stdtrit(clusters - 1, CERTAINTY) * deviation
         one, two = np.sqrt(fitted[mine].mean()), np.sqrt(triangulated[mine].mean())
         # The difference of roots is the difference of the squares over their sum.
         found[:, group] = one, two, deviation / max(one + two, 1e-9), np.sqrt(max(certain, 0.0))

@@ -230,6 +230,8 @@ TAIL: Final = 2.5
 """Deviation, root mean square over the angles, at which an estimate has half its weight [standard
 deviations]: backs mistaken for fronts."""
 
+CORRELATION_S: Final = 0.5
+"""Correlation time of monocular pose errors [s]: images hardly change."""
 INDEPENDENT_SHARE: Final = 0.3
 """Share of an estimate's variance that is independent from frame to frame [1]."""
 MAX_CORRELATION_TIMES: Final = 2.0

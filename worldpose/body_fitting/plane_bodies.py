@@ -24,8 +24,9 @@ from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting.body_fit import BodyFit, FittedArrays
-from worldpose.body_fitting.bones import DEFINITION, shorten_limbs
+from worldpose.body_fitting.bones import DEFINITION_STD_M, shorten_limbs
 from worldpose.body_fitting.monocular import (
+    CORRELATION_S,
     PRIOR_SPREAD,
     MonocularEstimates,
     MonocularPoses,
@@ -42,7 +43,7 @@ from worldpose.body_fitting.objective import (
     Track,
     ankle_height,
 )
-from worldpose.body_fitting.pose_space import SIZE, load_pose_prior
+from worldpose.body_fitting.pose_space import SIZE, load_pose_prior, nearest_known
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import (
@@ -54,7 +55,7 @@ from worldpose.body_fitting.solver import (
 )
 from worldpose.errors import InputError
 from worldpose.geometry import Camera, Rigid
-from worldpose.tracking.ground_tracks import CORRELATION_S
+from worldpose.tracking.ground_tracks import CORRELATION_S as PLACE_CORRELATION_S
 
 HIPS: Final = (11, 12)
 """Hips in COCO-17; the place on the pitch is below their middle."""
@@ -64,26 +65,24 @@ MIN_GAIN: Final = 0.75
 """A body turned half round contradicts the estimates if it misses the keypoints by less than this
 share of what the body as estimated does [1]: sides of limbs and bends tell front from back. In two
 simulated worlds 1.5 to 3.4 for estimates as they are, and 0.4 to 0.6 for turned ones."""
-MONOCULAR_TIME_S: Final = 0.5
-"""Correlation time of monocular pose errors [s]: images hardly change."""
 START_WINDOW_S: Final = 0.2
 """Monocular poses so near in time make a start [s]: single frames with a wrong pose drop out."""
 MAX_BRIDGED_S: Final = 0.5
 """Frames farther than this from any monocular pose of the person have no body [s]."""
 MIN_KEYPOINTS: Final = 6
-"""Fewest keypoints of a frame that judge an estimate [1]."""
+"""Minimum keypoints of a frame to judge an estimate [1]."""
 MAX_MISFIT: Final = 0.85
 """An estimate whose keypoints miss the detected ones by more contradicts them, after alignment of
 position and size [root mean square, relative to that of the keypoints about their middle]. In two
 simulated worlds 0.2 to 0.6 with angles off by 8 degrees, up to 0.8 with 15 degrees, 0.9 to 1 for
 bodies that lie or stand on their heads."""
 MIN_AGREEING: Final = 0.5
-"""Least share of a person's estimates that agree with the keypoints [1]."""
+"""Minimum share of a person's estimates that agree with the keypoints [1]."""
 KEYPOINT_STD: Final = 0.07
 """Standard deviation of a keypoint per axis in the same measure [1]: 2 % of the person's height, as
 keypoints lie 0.28 heights from their middle."""
 MAX_FITTED_MISFIT: Final = 2.0
-"""Most misfit of a fitted body, median over frames, relative to the noise of keypoints [1]. In the
+"""Maximum misfit of a fitted body, median over frames, relative to the keypoints' noise [1]. In the
 two worlds 0.7 to 1.1, also where estimates are poor, and 1.6 to 5 where bodies look the other way
 or stand on their heads."""
 STEPS: Final = 10
@@ -215,7 +214,7 @@ def fit_bodies_on_plane(
         standing = stand_on_ground(solver, pose, evidence.place[:, person])
         placed[:, person] = keypoints(standing.parameters())
     misfit, _ = _misfit(placed, evidence)
-    missing = [_objection(misfit[:, person]) for person in range(persons)]
+    missing = [_find_contradiction(misfit[:, person]) for person in range(persons)]
     clip = _Clip(solver, evidence, lifted, poses, misfit <= MAX_MISFIT)
     people = {
         person: clip.open_person(person) for person in range(persons) if missing[person] is None
@@ -232,7 +231,7 @@ def fit_bodies_on_plane(
         track = clip.track(person, rows, evidence.fps, for_shape=False)
         pose, solved = solver.search(track, start, shapes.offsets)
         spread = pose_covariance(solved, pose, shapes.offsets)
-        bias = np.full(17, DEFINITION**2)[:, None, None] * np.eye(3)
+        bias = np.full(17, DEFINITION_STD_M**2)[:, None, None] * np.eye(3)
         result.put(solver, person, span, pose, spread + bias, shapes)
         result.covariance[span, person] += clip.depth_covariance(
             person, own, result.joints[span, person]
@@ -243,7 +242,7 @@ def fit_bodies_on_plane(
     fitted, noise = _misfit(result.joints, evidence)
     other, _ = _misfit(turned, evidence)
     for person in people:
-        missing[person] = _contradiction(
+        missing[person] = _judge_fit(
             fitted[:, person] / noise[:, person], other[:, person] / noise[:, person]
         )
         if missing[person] is not None:
@@ -297,7 +296,7 @@ class _Clip:
         place = self.evidence.place[:, person]
         known, at = np.isfinite(place).all(axis=-1), np.flatnonzero(self.agreeing[:, person])
         frames = np.arange(len(place))
-        covered = known & (_distance_to(at, frames) <= MAX_BRIDGED_S * fps)
+        covered = known & (np.abs(frames - nearest_known(at, frames)) <= MAX_BRIDGED_S * fps)
         first, last = np.flatnonzero(covered)[[0, -1]]
         span = slice(int(first), int(last) + 1)
         own = frames[span]
@@ -328,7 +327,7 @@ class _Clip:
             self.poses.angles[rows, person],
             self.agreeing[rows, person],
             np.eye(3 + SIZE) / PRIOR_SPREAD**2,
-            1.0 + MONOCULAR_TIME_S * fps,
+            1.0 + CORRELATION_S * fps,
         )
         return Track(
             self.solver.chained,
@@ -367,7 +366,7 @@ class _Clip:
         )
         known = np.isfinite(spread)
         # Two hips share the distance.
-        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + CORRELATION_S * fps)) * known
+        weight = 0.5 / (np.where(known, spread, 1.0) * (1.0 + PLACE_CORRELATION_S * fps)) * known
         by_place = np.zeros_like(by_ray)
         outer = np.nan_to_num(sight[:, :, None] * sight[:, None])
         by_place[:, HIPS] = (weight[:, None, None] * outer)[:, None]
@@ -481,7 +480,7 @@ def _misfit(joints: Floats, evidence: PlaneEvidence) -> tuple[Floats, Floats]:
         np.isfinite(image).all(axis=-1) & np.isfinite(evidence.keypoints).all(axis=-1)
     )
     count = both.sum(axis=-1)
-    ours, seen = (_centre(points, both) for points in (image, evidence.keypoints))
+    ours, seen = (_center_points(points, both) for points in (image, evidence.keypoints))
     with np.errstate(invalid="ignore", divide="ignore"):
         size = (ours * seen).sum(axis=(-1, -2)) / (ours**2).sum(axis=(-1, -2))
         away = seen - np.maximum(size, 0.0)[..., None, None] * ours
@@ -491,15 +490,15 @@ def _misfit(joints: Floats, evidence: PlaneEvidence) -> tuple[Floats, Floats]:
     return np.where(count >= MIN_KEYPOINTS, misfit, np.nan), noise
 
 
-def _centre(points: Floats, counted: Flags) -> Floats:
+def _center_points(points: Floats, counted: Flags) -> Floats:
     """Return points (frames, persons, 17, 2) relative to the middle of those counted, else 0."""
     kept = np.where(counted[..., None], points, 0.0)
     middle = kept.sum(axis=2) / np.maximum(counted.sum(axis=2), 1)[..., None]
     return np.where(counted[..., None], kept - middle[:, :, None], 0.0)
 
 
-def _objection(misfit: Floats) -> str | None:
-    """Return why a person gets no body, if so, by the misfit (frames,) of the estimates."""
+def _find_contradiction(misfit: Floats) -> str | None:
+    """Return why the misfit (frames,) of the estimates rules out a body; None if it does not."""
     compared = misfit[np.isfinite(misfit)]
     if not len(compared):
         return "no monocular estimate lies at the person's keypoints"
@@ -512,8 +511,8 @@ def _objection(misfit: Floats) -> str | None:
     return None
 
 
-def _contradiction(misfit: Floats, turned: Floats) -> str | None:
-    """Return why a person's fitted body is refused, if so.
+def _judge_fit(misfit: Floats, turned: Floats) -> str | None:
+    """Return why a person's fitted body is refused; None if it is accepted.
 
     Args:
         misfit: (frames,), of the fitted body, relative to the noise of keypoints.
@@ -536,13 +535,6 @@ def _contradiction(misfit: Floats, turned: Floats) -> str | None:
     return None
 
 
-def _distance_to(at: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the distance of each of `frames` from the nearest of the rising frames `at`."""
-    after = at[np.searchsorted(at, frames).clip(max=len(at) - 1)]
-    before = at[(np.searchsorted(at, frames, side="right") - 1).clip(min=0)]
-    return np.asarray(np.minimum(np.abs(frames - before), np.abs(after - frames)))
-
-
 def _smooth_poses(
     poses: MonocularPoses,
     person: int,
@@ -561,7 +553,7 @@ def _smooth_poses(
     """
     orient = np.empty((len(frames), 3, 3))
     angles = np.empty((len(frames), SIZE))
-    width = np.maximum(reach, _distance_to(at, frames))
+    width = np.maximum(reach, np.abs(frames - nearest_known(at, frames)))
     first = np.searchsorted(at, frames - width)
     last = np.searchsorted(at, frames + width, side="right")
     for row in range(len(frames)):

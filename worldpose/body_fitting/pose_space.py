@@ -172,12 +172,11 @@ def interpolate_gaps(joints: Floats) -> Floats:
     return full
 
 
-def nearest_known(known: NDArray[np.integer], frames: int) -> NDArray[np.integer]:
-    """Return for each of `frames` frames the nearest of the frames `known` (rising, not empty)."""
-    every = np.arange(frames)
-    after = np.searchsorted(known, every).clip(max=len(known) - 1)
+def nearest_known(known: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each of `frames` the nearest of the frames `known` (rising, not empty)."""
+    after = np.searchsorted(known, frames).clip(max=len(known) - 1)
     before = (after - 1).clip(min=0)
-    is_before = np.abs(every - known[before]) <= np.abs(known[after] - every)
+    is_before = np.abs(frames - known[before]) <= np.abs(known[after] - frames)
     return known[np.where(is_before, before, after)]
 
 
@@ -201,7 +200,7 @@ def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     turns = u @ vt
     sure = np.flatnonzero(seen.sum(-1) >= 3)
     if len(sure):
-        turns = turns[nearest_known(sure, len(torso))]
+        turns = turns[nearest_known(sure, np.arange(len(torso)))]
     else:
         turns = np.broadcast_to(
             Rigid.from_rotvec([np.pi / 2, 0.0, 0.0], np.zeros(3)).rotation, turns.shape

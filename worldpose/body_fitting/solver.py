@@ -53,7 +53,7 @@ accelerates as one: the search may count them all, the covariance of its poses m
 DAMPING: Final = 0.01
 """Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
 direction that uncertain."""
-FREE: Final = 1e9
+UNRELATED_ACCELERATION: Final = 1e9
 """Acceleration of a body whose frames say nothing of each other [m/s^2]."""
 
 
@@ -214,7 +214,7 @@ def factor(blocks: Floats) -> BandedFactor:
 
 Joints = tuple[Floats, Floats]
 
-PIECE: Final = 1.0
+PIECE_S: Final = 1.0
 """Length of the intervals sampled from long tracks [s]."""
 BIAS_PRIOR_WEIGHT: Final = 200.0
 """Weight of `bias_std_m` as a prior, in squared offsets [1]; a clip has 26 offsets."""
@@ -280,43 +280,25 @@ def solve_shapes(
     # A posterior of limited precision (Miller and Dunson 2019): errors of the model push the same
     # way in the frames of all persons.
     seconds = sum(len(piece.pose.transl) / piece.track.fps for piece in pieces)
-    firmness = max(1.0, seconds / settings.bias_time_s)
+    prior_weight = max(1.0, seconds / settings.bias_time_s)
     for step in range(settings.shape_steps if pieces else 0):
         if solver.ground is not None and step == settings.shape_steps // 2:
             pieces = [
                 replace(p, track=solver.find_standing_ankles(p.track, p.pose)) for p in pieces
             ]
-        offsets = MIRRORED_OFFSETS @ unknowns
-        inner, corners, gradients = [], {}, {}
-        for person, shape in prior_shapes.items():
-            own = np.linalg.inv(shape.covariance)
-            corners[person] = np.zeros((count + len(unknowns),) * 2)
-            corners[person][:count, :count] = own
-            gradients[person] = np.zeros(count + len(unknowns))
-            betas = next((p.pose.betas for p in pieces if p.person == person), shape.betas)
-            gradients[person][:count] = own @ (betas - shape.betas)
-
-        def eliminate(piece: Piece, offsets: Floats = offsets) -> tuple[NormalEquations, Floats]:
-            equations = piece.track.equations(piece.pose, offsets, bordered=True)
-            sides = np.concatenate([equations.border, equations.gradient[..., None]], axis=-1)
-            return equations, factor(equations.blocks).solve(sides)
-
-        for piece, (equations, solution) in zip(
-            pieces, map_in_threads(eliminate, pieces), strict=True
-        ):
-            inner.append(solution)
-            flat = equations.border.reshape(-1, len(equations.corner)).T
-            reduced = flat @ inner[-1].reshape(flat.shape[1], -1)
-            corners[piece.person] += equations.corner - reduced[:, :-1]
-            gradients[piece.person] += equations.border_gradient - reduced[:, -1]
-        matrix = firmness / expected * np.eye(len(unknowns))
+        solutions, corners, gradients = _eliminate_poses(
+            pieces, prior_shapes, MIRRORED_OFFSETS @ unknowns
+        )
+        matrix = prior_weight / expected * np.eye(len(unknowns))
         right = matrix @ unknowns
-        inverses, ways = {}, {}
+        inverses, by_offsets = {}, {}
         for person, corner in corners.items():
             inverses[person] = np.linalg.inv(corner[:count, :count])
-            ways[person] = inverses[person] @ corner[:count, count:]
-            matrix = matrix + corner[count:, count:] - corner[count:, :count] @ ways[person]
-            right = right + gradients[person][count:] - ways[person].T @ gradients[person][:count]
+            by_offsets[person] = inverses[person] @ corner[:count, count:]
+            matrix = matrix + corner[count:, count:] - corner[count:, :count] @ by_offsets[person]
+            right = (
+                right + gradients[person][count:] - by_offsets[person].T @ gradients[person][:count]
+            )
         spread = np.linalg.inv(matrix).astype(np.float64)
         change = -spread @ right
         unknowns = unknowns + change
@@ -327,11 +309,13 @@ def solve_shapes(
             expected = (size + prior) / (len(unknowns) + BIAS_PRIOR_WEIGHT)
         betas_change = {
             # Large steps of the first, roughest linearisation leave the range of human shapes.
-            person: np.clip(-inverses[person] @ slope[:count] - ways[person] @ change, -1.0, 1.0)
+            person: np.clip(
+                -inverses[person] @ slope[:count] - by_offsets[person] @ change, -1.0, 1.0
+            )
             for person, slope in gradients.items()
         }
         moved = []
-        for piece, solved in zip(pieces, inner, strict=True):
+        for piece, solved in zip(pieces, solutions, strict=True):
             shared = np.concatenate([betas_change[piece.person], change])
             pose_step = -solved[..., -1] - solved[..., :-1] @ shared
             moved.append(
@@ -339,11 +323,50 @@ def solve_shapes(
             )
         pieces = moved
         for piece in pieces:
-            way = ways[piece.person]
-            covariance = inverses[piece.person] + way @ spread @ way.T
+            by_offset = by_offsets[piece.person]
+            covariance = inverses[piece.person] + by_offset @ spread @ by_offset.T
             found[piece.person] = Shape(piece.pose.betas, covariance)
     by_joint = np.einsum("jau,uv,jbv->jab", MIRRORED_OFFSETS, spread, MIRRORED_OFFSETS)
     return Shapes(found, MIRRORED_OFFSETS @ unknowns, by_joint)
+
+
+def _eliminate_poses(
+    pieces: Sequence[Piece], priors: Mapping[int, Shape], offsets: Floats
+) -> tuple[list[Floats], dict[int, Floats], dict[int, Floats]]:
+    """Return the reduced normal equations of each person's betas with the shared offsets.
+
+    Args:
+        pieces: intervals of tracks.
+        priors: prior shape of each person.
+        offsets: (17, 3) [m], the detector's offsets.
+
+    Returns:
+        Solution of each piece for its border and gradient; matrix and gradient by person.
+    """
+    shared = MIRRORED_OFFSETS.shape[-1]
+    matrices, gradients = {}, {}
+    for person, shape in priors.items():
+        count = len(shape.betas)
+        own = np.linalg.inv(shape.covariance)
+        matrices[person] = np.zeros((count + shared,) * 2)
+        matrices[person][:count, :count] = own
+        gradients[person] = np.zeros(count + shared)
+        betas = next((p.pose.betas for p in pieces if p.person == person), shape.betas)
+        gradients[person][:count] = own @ (betas - shape.betas)
+
+    def eliminate(piece: Piece) -> tuple[NormalEquations, Floats]:
+        equations = piece.track.equations(piece.pose, offsets, bordered=True)
+        sides = np.concatenate([equations.border, equations.gradient[..., None]], axis=-1)
+        return equations, factor(equations.blocks).solve(sides)
+
+    solutions = []
+    for piece, (equations, solution) in zip(pieces, map_in_threads(eliminate, pieces), strict=True):
+        flat = equations.border.reshape(-1, len(equations.corner)).T
+        reduced = flat @ solution.reshape(flat.shape[1], -1)
+        matrices[piece.person] += equations.corner - reduced[:, :-1]
+        gradients[piece.person] += equations.border_gradient - reduced[:, -1]
+        solutions.append(solution)
+    return solutions, matrices, gradients
 
 
 def _sample_pieces(
@@ -380,7 +403,7 @@ def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> 
     """Return evenly spread intervals of `frames`, `shape_time_s` in total; all frames if fewer."""
     if frames <= settings.shape_time_s * fps:
         return [slice(0, frames)]
-    length = max(3, round(PIECE * fps))
-    count = max(1, round(settings.shape_time_s / PIECE))
+    length = max(3, round(PIECE_S * fps))
+    count = max(1, round(settings.shape_time_s / PIECE_S))
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return [slice(int(start), int(start) + length) for start in starts]

@@ -16,8 +16,8 @@ from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
     PointEvidence,
+    join_evidence,
     spread_noise,
-    together,
 )
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
@@ -205,12 +205,12 @@ def refine(
     share = estimate_flow_share(
         tracked.chain, tracked.keys.frames, deviation, settings.flow_drift_px
     )
+    terms = _Terms(tracked.flow, share, spread, settings)
     noise, matches = PlayerNoise(0.0, 0.0), None
     surface = tracked.keys.surface
-    solution: Solution | None = None
     offset: FeedOffset | None = None
-    points, before = clicks, camera
-    for number in range(settings.passes):
+    before = camera
+    for number in range(settings.passes):  # one or more
         samples = FieldSamples.of(pitch, learned.errors, surface)
         lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
         before = lines.camera if number == 0 else before
@@ -224,22 +224,12 @@ def refine(
             matches = match(lines.camera, people)
             players, noise = player_evidence(lines.camera, people, matches, settings)
             parts.append(players)
-        points = together(parts)
-        camera = lines.camera
-        for _ in range(_LEARNING):
-            scaled = learned.scale_noise(points)
-            followed = share / learned.lasting
-            problem = _problem(scaled, tracked.flow, followed, camera, spread, settings)
-            solution = solve(camera, problem, settings.max_iterations)
-            camera, before_learning = solution.camera, learned
-            learned = _learn(problem, solution, learned)
-            if learned.is_near(before_learning):
-                break
-            points = learned.errors.rescale(points, before_learning.errors)
-        assert solution is not None  # _LEARNING is one or more
+        problem, solution, learned = _fit_and_learn(
+            join_evidence(parts), lines.camera, learned, terms
+        )
+        camera = solution.camera
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (learned.errors.size_m * shown)[2:]
-    assert solution is not None  # settings require one iteration or more
     if settings.solver == "adam":
         solution = descend(tracked.chain.camera, problem, settings.adam_iterations)
     lasting = correlation_time(tracked.chain.camera, fps)
@@ -249,9 +239,9 @@ def refine(
     weights = Weights(
         flow_deviation_px=deviation,
         flow_share=share,
-        smooth_log_focal=_number(spread[3]),
-        smooth_k1=_number(spread[4]),
-        smooth_k2=_number(spread[5]),
+        smooth_log_focal=_finite_or_zero(spread[3]),
+        smooth_k1=_finite_or_zero(spread[4]),
+        smooth_k2=_finite_or_zero(spread[5]),
         smooth_frames=lasting,
         player_share=noise.share,
         player_frames=noise.frames,
@@ -270,9 +260,9 @@ def refine(
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
 
-_LEARNING: Final = 4
+_MAX_FITS: Final = 4
 """Maximum fits of a pass in which noise and paint errors are learned [1]."""
-_SAME: Final = 1.05
+_CONVERGED_RATIO: Final = 1.05
 """Ratio of two spreads that count as equal [1]."""
 _PRIOR_CLICKS: Final = 10.0
 """Coordinates that the assumed noise of clicks is worth in its estimate [1]."""
@@ -311,7 +301,7 @@ class _Learned:
             (self.clicks, other.clicks),
             (self.lasting, other.lasting),
         )
-        return all(1.0 / _SAME < one / two < _SAME for one, two in pairs)
+        return all(1.0 / _CONVERGED_RATIO < one / two < _CONVERGED_RATIO for one, two in pairs)
 
     def describe(self, pitch: PitchTemplate, problem: Problem, solution: Solution) -> PitchFit:
         """Return the pitch and the noise for the report."""
@@ -365,22 +355,55 @@ def _displace_by_size(problem: Problem, solution: Solution) -> PointEvidence:
     return displace(problem.points, problem, size)
 
 
-def _problem(
-    points: PointEvidence,
-    flow: FlowEvidence,
-    share: float,
-    camera: MovingCamera,
-    spread: Floats,
-    settings: BroadcastCalibrationSettings,
-) -> Problem:
-    return Problem(
-        points=points,
-        flow=flow,
-        prior=build_prior(settings.prior, camera.focal, camera.image_size),
-        smoothness=spread,
-        flow_weight=share * settings.flow_weight,
-        flow_loss=settings.loss_scale,
-    )
+@dataclass(frozen=True, eq=False)
+class _Terms:
+    """Terms of a clip's fit that stay the same in all passes.
+
+    Attributes:
+        flow: followed points.
+        share: factor on a followed point's loss [1].
+        spread: (7,) standard deviation of second differences.
+        settings: weights, noise and gates.
+    """
+
+    flow: FlowEvidence
+    share: float
+    spread: Floats
+    settings: BroadcastCalibrationSettings
+
+    def pose(self, points: PointEvidence, learned: _Learned, camera: MovingCamera) -> Problem:
+        """Return the fit of evidence, of the assumed noise, at the learned noise."""
+        settings = self.settings
+        return Problem(
+            points=learned.scale_noise(points),
+            flow=self.flow,
+            prior=build_prior(settings.prior, camera.focal, camera.image_size),
+            smoothness=self.spread,
+            flow_weight=self.share / learned.lasting * settings.flow_weight,
+            flow_loss=settings.loss_scale,
+        )
+
+
+def _fit_and_learn(
+    points: PointEvidence, camera: MovingCamera, learned: _Learned, terms: _Terms
+) -> tuple[Problem, Solution, _Learned]:
+    """Return fits that alternate with the spreads that their residuals show, until these settle.
+
+    Args:
+        points: evidence of the assumed noise.
+        camera: the start.
+        learned: spreads so far.
+        terms: all other terms of the fit.
+    """
+    for left in reversed(range(_MAX_FITS)):
+        problem = terms.pose(points, learned, camera)
+        solution = solve(camera, problem, terms.settings.max_iterations)
+        camera, before = solution.camera, learned
+        learned = _learn(problem, solution, learned)
+        if left == 0 or learned.is_near(before):
+            break
+        points = learned.errors.rescale(points, before.errors)
+    return problem, solution, learned
 
 
 def _select_flow(
@@ -415,7 +438,7 @@ def _keep_frames(
         yield picture
 
 
-def _number(value: float) -> float:
+def _finite_or_zero(value: float) -> float:
     """Return a spread for a record, which cannot hold infinity: 0 means none."""
     return float(value) if np.isfinite(value) else 0.0
 
@@ -502,9 +525,9 @@ def broadcast_attributes(
         },
         "drift": [float(drift) for drift in report.drift],
         "pick_next": [first + frame for frame in report.pick_next],
-        "markings_off": _pair(report.markings_off),
-        "players_off": _pair(report.players_off),
-        "pitch": _pitch(report.pitch),
+        "markings_off": _finite_or_none(report.markings_off),
+        "players_off": _finite_or_none(report.players_off),
+        "pitch": _pitch_record(report.pitch),
         "noise": {
             "paint_m": report.pitch.paint_m,
             "lines": report.pitch.line_noise,
@@ -515,7 +538,7 @@ def broadcast_attributes(
     }
 
 
-def _pitch(fit: PitchFit) -> dict[str, Any] | None:
+def _pitch_record(fit: PitchFit) -> dict[str, Any] | None:
     """Return the estimated pitch for a record; None if all is given."""
     spec = fit.spec
     if spec is None:
@@ -524,6 +547,6 @@ def _pitch(fit: PitchFit) -> dict[str, Any] | None:
     return {**chosen, "std_m": fit.size_std.tolist()}
 
 
-def _pair(values: tuple[float, float]) -> list[float | None]:
+def _finite_or_none(values: tuple[float, float]) -> list[float | None]:
     """Return values for a record, which cannot hold NaN."""
     return [value if np.isfinite(value) else None for value in values]

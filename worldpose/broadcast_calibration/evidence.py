@@ -225,7 +225,7 @@ def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
     )
 
 
-def together(parts: Sequence[PointEvidence]) -> PointEvidence:
+def join_evidence(parts: Sequence[PointEvidence]) -> PointEvidence:
     """Return the concatenated evidence, sorted by frame."""
     arrays = {
         name: np.concatenate([getattr(part, name) for part in [PointEvidence.none(), *parts]])

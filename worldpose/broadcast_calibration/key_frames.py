@@ -13,12 +13,13 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.broadcast_calibration import KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
+from data_contracts.static_calibration import DrawnMarking
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
@@ -40,9 +41,9 @@ from worldpose.static_calibration.parameters import nearest_on_markings
 from worldpose.static_calibration.sides import INDEPENDENT_S, MIN_EVIDENCE, compare_sides
 from worldpose.tracking import locate_feet
 
-_ROUNDS = 3
+_ITERATIONS = 3
 """Iterations that match drawn markings and painted lines again [1]."""
-_SAME_CENTER = 0.1
+_CENTER_TOLERANCE = 0.1
 """Largest distance of a proposal's center from the median one, of its distance to the centre spot
 [1]: from one frame alone the distance trades with the focal length."""
 _MIN_PROPOSALS = 2
@@ -90,7 +91,7 @@ def propose_key_frames(
 
     Raises:
         InputError: fewer than two frames have a clear proposal with one center; the people do not
-            tell the side, or contradict the stated one.
+            decide the side, or contradict the stated one.
     """
     clear, seen = [], 0
     for number, picture in pictures:
@@ -102,7 +103,7 @@ def propose_key_frames(
                 clear.append((number, proposal))
     centers = np.array([each.camera.center for _, each in clear]).reshape(-1, 3)
     middle = np.median(centers, axis=0) if len(clear) else np.zeros(3)
-    reach = _SAME_CENTER * float(np.linalg.norm(middle))
+    reach = _CENTER_TOLERANCE * float(np.linalg.norm(middle))
     agreed = np.linalg.norm(centers - middle, axis=1) <= reach
     if np.count_nonzero(agreed) < max(_MIN_PROPOSALS, len(clear) // 2 + 1):
         raise InputError(
@@ -131,13 +132,13 @@ def _must_turn(
     """Return whether the people stand where they are only after half a turn of the cameras.
 
     Raises:
-        InputError: they do not tell, or they contradict the stated side.
+        InputError: they do not decide, or they contradict the stated side.
     """
-    same, turned = (0.0, 0.0) if people is None else _agreement(cameras, pitch, people)
+    same, turned = (0.0, 0.0) if people is None else _compare_people(cameras, pitch, people)
     if side is None and abs(same - turned) < MIN_EVIDENCE:
         raise InputError(
             where,
-            expected="people of the static cameras in the clip, who tell the camera's side",
+            expected="people of the static cameras in the clip, who decide the camera's side",
             found=f"no agreement that decides between two sides (evidence "
             f"{abs(same - turned):.0f}, {MIN_EVIDENCE:g} needed)",
             todo="State the broadcast camera's side (near, far, left, right) in match.yaml.",
@@ -153,7 +154,7 @@ def _must_turn(
     return side is None and turned > same
 
 
-def _agreement(
+def _compare_people(
     cameras: Mapping[int, Camera], pitch: PitchTemplate, people: KnownPeople
 ) -> tuple[float, float]:
     """Return how well people agree if the cameras stand as assumed, and after half a turn.
@@ -227,38 +228,21 @@ def calibrate_keys(
     Raises:
         InputError: no key frame is usable; the message gives the reason for each.
     """
-    found: dict[int, StaticCalibration] = {}
-    refused: dict[int, str] = {}
-    for key in sorted(key_frames, key=lambda each: each.frame):
-        place = f"{where}: frame {key.frame}"
-        try:
-            # The joint fit of all key frames below adds painted lines.
-            found[key.frame - first] = calibrate_camera(
-                pitch, key.markings, image_size, settings=settings.key_frame, where=place
-            )
-        except (InputError, DegenerateError) as error:
-            refused[key.frame - first] = f"{error}"
-    if not found:
-        raise InputError(
-            where,
-            expected="a key frame that determines a camera",
-            found="; ".join(refused.values()) or "no key frame",
-            todo="Click points in frames that show an area's corners or the centre circle.",
-        )
-    clicked = {key.frame - first: key for key in key_frames}
+    clicked = {key.frame - first: key for key in sorted(key_frames, key=lambda each: each.frame)}
+    found, refused = _calibrate_each(pitch, clicked, image_size, settings, where)
     wrong = {frame: each.report.wrong for frame, each in found.items() if each.report.wrong}
     estimates = [each.estimate for each in found.values()]
-    camera = _of_one_place(estimates)
+    camera = _share_center(estimates)
     errors = PitchErrors.of(pitch, settings)
     surface = pitch.surface
     clicks = PointEvidence.none()
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         samples = FieldSamples.of(pitch, errors, surface)
         parts, lines = [], []
         for index, frame in enumerate(found):
             single = camera.frames(slice(index, index + 1))
             parts.append(
-                _clicks(
+                _click_evidence(
                     pitch,
                     clicked[frame],
                     index,
@@ -271,9 +255,9 @@ def calibrate_keys(
             if frame in pictures:
                 seen, _ = find_lines(single, samples, pictures[frame], None, settings)
                 lines.append(seen.in_frame(index))
-        clicks = together(parts)
+        clicks = join_evidence(parts)
         problem = Problem(
-            points=together([clicks, *lines]),
+            points=join_evidence([clicks, *lines]),
             flow=FlowEvidence.none(),
             prior=build_prior(settings.prior, camera.focal, camera.image_size),
         )
@@ -284,7 +268,39 @@ def calibrate_keys(
     return Keys(np.array(list(found)), camera, surface, clicks, refused, wrong)
 
 
-def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
+def _calibrate_each(
+    pitch: PitchTemplate,
+    clicked: Mapping[int, KeyFrame],
+    image_size: tuple[int, int],
+    settings: BroadcastCalibrationSettings,
+    where: str,
+) -> tuple[dict[int, StaticCalibration], dict[int, str]]:
+    """Return each key frame's camera from its clicks alone, and why others have none, by frame.
+
+    Raises:
+        InputError: no key frame is usable.
+    """
+    found: dict[int, StaticCalibration] = {}
+    refused: dict[int, str] = {}
+    for frame, key in clicked.items():
+        place = f"{where}: frame {key.frame}"
+        try:
+            found[frame] = calibrate_camera(
+                pitch, key.markings, image_size, settings=settings.key_frame, where=place
+            )
+        except (InputError, DegenerateError) as error:
+            refused[frame] = f"{error}"
+    if not found:
+        raise InputError(
+            where,
+            expected="a key frame that determines a camera",
+            found="; ".join(refused.values()) or "no key frame",
+            todo="Click points in frames that show an area's corners or the centre circle.",
+        )
+    return found, refused
+
+
+def _share_center(estimates: Sequence[CameraEstimate]) -> MovingCamera:
     """Return cameras with the covariance-weighted mean of centers and principal points."""
     information, right = np.zeros((5, 5)), np.zeros(5)
     for estimate in estimates:
@@ -303,11 +319,11 @@ def _of_one_place(estimates: Sequence[CameraEstimate]) -> MovingCamera:
         camera = estimate.camera
         batch = type(camera).stack([camera])
         single = MovingCamera.of(batch, shared[:3], shared[3:])
-        parts.append(_kept_aim(single, camera.center, camera.principal_point))
+        parts.append(_keep_aim(single, camera.center, camera.principal_point))
     return join_cameras(parts)
 
 
-def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
+def _keep_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
     """Return a single frame with rotation and focal length changed to show the same ground.
 
     Args:
@@ -326,7 +342,7 @@ def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> 
     off = np.append(
         (camera.image_size - 1.0 - 2.0 * camera.principal_point) / 2.0 / camera.focal[0], 1.0
     )
-    turned = _between(before.T @ off, new)
+    turned = _rotation_between(before.T @ off, new)
     zoom = np.linalg.norm(new) / np.linalg.norm(old)
     return MovingCamera(
         camera.center,
@@ -338,7 +354,7 @@ def _kept_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> 
     )
 
 
-def _between(one: Floats, other: Floats) -> Floats:
+def _rotation_between(one: Floats, other: Floats) -> Floats:
     """Return the shortest rotation (3, 3) from one direction to another."""
     a, b = one / np.linalg.norm(one), other / np.linalg.norm(other)
     axis, cos = np.cross(a, b), float(a @ b)
@@ -346,7 +362,7 @@ def _between(one: Floats, other: Floats) -> Floats:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cos))
 
 
-def _clicks(
+def _click_evidence(
     pitch: PitchTemplate,
     key: KeyFrame,
     index: int,
@@ -357,63 +373,74 @@ def _clicks(
 ) -> PointEvidence:
     """Return the evidence of one key frame's clicks without outliers."""
     points = [point for point in key.markings.points if point.name not in wrong]
-    drawn = [marking for marking in key.markings.drawn if marking.name not in wrong]
     template = {name: number for number, name in enumerate(pitch.points)}
     own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
     one, world = np.ones(own.shape), pitch.positions([point.name for point in points])
-    parts = [
-        PointEvidence.at_points(
-            ObservedPoints(
-                frame=np.full(len(points), index),
-                world=world,
-                image=np.array([point.xy for point in points]).reshape(-1, 2),
-                kind=CLICK,
-                source=np.full(len(points), -1),
-                ends=own,
-                shares=errors.shares(own, one),
-                by_size=errors.displacement_by_size(own, one, world),
-            ),
-            np.full(len(points), settings.click_noise_px),
-            settings.field_weight,
-            settings.loss_scale,
-        )
+    at_points = PointEvidence.at_points(
+        ObservedPoints(
+            frame=np.full(len(points), index),
+            world=world,
+            image=np.array([point.xy for point in points]).reshape(-1, 2),
+            kind=CLICK,
+            source=np.full(len(points), -1),
+            ends=own,
+            shares=errors.shares(own, one),
+            by_size=errors.displacement_by_size(own, one, world),
+        ),
+        np.full(len(points), settings.click_noise_px),
+        settings.field_weight,
+        settings.loss_scale,
+    )
+    drawn = [
+        _drawn_evidence(pitch, marking, index, camera, settings, errors)
+        for marking in key.markings.drawn
+        if marking.name not in wrong
     ]
-    numbers = camera.camera[0].numbers
-    for marking in drawn:
-        pixels = np.array(marking.xy).reshape(-1, 2)
-        samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
-        place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
-        nearest_on_markings(
-            numbers,
-            0.5 * float(np.hypot(*camera.image_size)),
-            samples,
-            np.array([0, len(samples)]),
-            pixels,
-            np.zeros(len(pixels), dtype=np.int64),
-            place,
-            normal,
-        )
-        known = np.isfinite(place).all(axis=-1)
-        names, shares = _locate_on_marking(pitch, marking.name, place[known])
-        ends = np.tile([template[name] for name in names], (int(known.sum()), 1))
-        parts.append(
-            PointEvidence.across_lines(
-                ObservedPoints(
-                    frame=np.full(int(known.sum()), index),
-                    world=place[known],
-                    image=pixels[known],
-                    kind=CLICK,
-                    source=np.full(int(known.sum()), -1),
-                    ends=ends,
-                    shares=errors.shares(ends, shares),
-                    by_size=errors.displacement_by_size(ends, shares, place[known]),
-                ),
-                normal[known],
-                np.full(int(known.sum()), settings.key_frame.drawn_noise_px),
-                settings.loss_scale,
-            )
-        )
-    return together(parts)
+    return join_evidence([at_points, *drawn])
+
+
+def _drawn_evidence(
+    pitch: PitchTemplate,
+    marking: DrawnMarking,
+    index: int,
+    camera: MovingCamera,
+    settings: BroadcastCalibrationSettings,
+    errors: PitchErrors,
+) -> PointEvidence:
+    """Return the evidence of a drawn marking: its pixels, across the nearest place on it."""
+    pixels = np.array(marking.xy).reshape(-1, 2)
+    samples = pitch.marking_points(marking.name, settings.key_frame.sample_spacing_m)
+    place, normal = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
+    nearest_on_markings(
+        camera.camera[0].numbers,
+        0.5 * float(np.hypot(*camera.image_size)),
+        samples,
+        np.array([0, len(samples)]),
+        pixels,
+        np.zeros(len(pixels), dtype=np.int64),
+        place,
+        normal,
+    )
+    known = np.isfinite(place).all(axis=-1)
+    pixels, place, normal = pixels[known], place[known], normal[known]
+    names, shares = _locate_on_marking(pitch, marking.name, place)
+    points = list(pitch.points)
+    ends = np.tile([points.index(name) for name in names], (len(pixels), 1))
+    return PointEvidence.across_lines(
+        ObservedPoints(
+            frame=np.full(len(pixels), index),
+            world=place,
+            image=pixels,
+            kind=CLICK,
+            source=np.full(len(pixels), -1),
+            ends=ends,
+            shares=errors.shares(ends, shares),
+            by_size=errors.displacement_by_size(ends, shares, place),
+        ),
+        normal,
+        np.full(len(pixels), settings.key_frame.drawn_noise_px),
+        settings.loss_scale,
+    )
 
 
 def _locate_on_marking(

@@ -15,7 +15,7 @@ from worldpose.broadcast_calibration.evidence import (
     ObservedPoints,
     PointEvidence,
     bounds,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
@@ -23,7 +23,13 @@ from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.pitch import PitchTemplate
 from worldpose.pitch.template import surface_shape
-from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
+from worldpose.static_calibration.line_detection import (
+    CANDIDATES,
+    CLEARANCE,
+    CrossSections,
+    find_bars,
+    fit_bars,
+)
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     LineSamples,
@@ -41,13 +47,13 @@ _LINE_WIDTH: Final = 0.12
 """Width of the paint [m]: the maximum of Law 1, which most pitches have."""
 _CONTRAST: Final = 6.0
 """Minimum brightness of paint above the grass on either side [levels of 255]."""
-_FEW: Final = 15
+_MIN_SAMPLES: Final = 15
 """Minimum line samples for a correction of the camera [1]."""
-_FINE: Final = 3.0
+_FINE_REACH: Final = 3.0
 """Half width of the second search, after the first has corrected the camera [px]."""
 _SCALES: Final = (12.0, 6.0, 3.0, 1.5, 1.0)
 """Decreasing scales of the loss of the correction [px]."""
-_HOLD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
+_STEP_STD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
 """Prior of a frame's correction of rotation [rad] and log focal, standard deviations."""
 
 
@@ -106,14 +112,16 @@ def find_lines(
         people: boxes (detections, 4) [px] that occlude lines; None = no people.
         settings: search width, noise, number of samples.
     """
-    first = _look(camera, samples, picture, people, settings, settings.line_search_px)
-    if len(first) < _FEW:
+    first = _measure_lines(camera, samples, picture, people, settings, settings.line_search_px)
+    if len(first) < _MIN_SAMPLES:
         return PointEvidence.none(), camera
     corrected = _correct_camera(camera, first)
-    return samples.lower(_look(corrected, samples, picture, people, settings, _FINE)), corrected
+    return samples.lower(
+        _measure_lines(corrected, samples, picture, people, settings, _FINE_REACH)
+    ), corrected
 
 
-def _look(
+def _measure_lines(
     camera: MovingCamera,
     samples: FieldSamples,
     picture: Image,
@@ -122,7 +130,7 @@ def _look(
     reach: float,
 ) -> PointEvidence:
     """Return bars of paint within reach of one frame's projected lines."""
-    lines = _near(camera, samples.lines)
+    lines = _select_near(camera, samples.lines)
     seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, EXACT_PAINT)
     index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
@@ -140,30 +148,9 @@ def _look(
     ]
     if not len(index):
         return PointEvidence.none()
-    count, sections = len(index), seen[index].sections
-    places, normals = sections.places, sections.normals
-    offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
-    find_bars(
-        picture,
-        sections,
-        np.full(count, reach),
-        _CONTRAST,
-        offsets,
-        strengths,
-    )
-    with np.errstate(divide="ignore"):
-        merit = np.log(strengths) - 0.5 * (2.0 * offsets / reach) ** 2
-    best = np.where(np.isnan(offsets), -np.inf, merit).argmax(axis=1)
-    exact, variances = np.empty(count), np.empty(count)
-    fit_bars(
-        picture,
-        sections,
-        offsets[np.arange(count), best],
-        _CONTRAST,
-        exact,
-        variances,
-    )
-    found = np.isfinite(exact)
+    sections = seen[index].sections
+    offsets, variances = _locate_bars(picture, sections, reach)
+    found = np.isfinite(offsets)
     chosen = lines[index[found]]
     world, ends, shares = chosen.points_world, chosen.ends, chosen.shares
     deviation = np.sqrt(variances[found] + settings.line_noise_px**2)
@@ -171,27 +158,44 @@ def _look(
         ObservedPoints(
             frame=np.zeros(int(found.sum()), dtype=np.int64),
             world=world,
-            image=(places + exact[:, None] * normals)[found],
+            image=(sections.places + offsets[:, None] * sections.normals)[found],
             kind=MARKING,
             source=chosen.marking,
             ends=ends,
             shares=samples.errors.shares(ends, shares),
             by_size=samples.errors.displacement_by_size(ends, shares, world),
         ),
-        normals[found],
+        sections.normals[found],
         deviation,
         settings.loss_scale,
     )
 
 
-def _near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
+def _locate_bars(picture: Image, sections: CrossSections, reach: float) -> tuple[Floats, Floats]:
+    """Return offsets of bars along the sections [px], NaN without one, and their variances [px^2].
+
+    Of several bars in a section, the strong one near its middle counts.
+    """
+    count = len(sections.places)
+    candidates, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
+    find_bars(picture, sections, np.full(count, reach), _CONTRAST, candidates, strengths)
+    with np.errstate(divide="ignore"):
+        merit = np.log(strengths) - 0.5 * (2.0 * candidates / reach) ** 2
+    best = np.where(np.isnan(candidates), -np.inf, merit).argmax(axis=1)
+    offsets, variances = np.empty(count), np.empty(count)
+    chosen = candidates[np.arange(count), best]
+    fit_bars(picture, sections, chosen, _CONTRAST, offsets, variances)
+    return offsets, variances
+
+
+def _select_near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
     """Return the samples in or near the image of a pinhole camera without distortion."""
-    gone = (lines.points_world - camera.center) @ camera.rotation[0].T
-    ahead = gone[:, 2] > 1.0
-    place = gone[:, :2] / np.where(ahead, gone[:, 2], 1.0)[:, None]
+    local = (lines.points_world - camera.center) @ camera.rotation[0].T
+    ahead = local[:, 2] > 1.0
+    place = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
     half = 0.6 * camera.image_size / camera.focal[0]
-    off = (camera.principal_point - 0.5 * camera.image_size) / camera.focal[0]
-    return lines[ahead & (np.abs(place + off) < half).all(axis=-1)]
+    shift = (camera.principal_point - 0.5 * camera.image_size) / camera.focal[0]
+    return lines[ahead & (np.abs(place + shift) < half).all(axis=-1)]
 
 
 def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
@@ -206,16 +210,16 @@ def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.boo
 def _correct_camera(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
     """Return a single frame with rotation and focal length fitted to its lines."""
     begin, edges = camera, bounds(lines.frame, 1)
-    gone = np.zeros(4)
+    step = np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
     for scale in _SCALES:
         equations = empty_equations(1, 5)
         scaled = replace(lines, whitening=across / scale, loss=np.ones(len(lines)))
         points = scaled.arrays(np.full_like(lines.ends, -1))
         add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
-        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _HOLD**2)
-        gone = gone - np.linalg.solve(normal, equations.right[0, :4] + gone / _HOLD**2)
-        camera = begin.take_step(np.append(gone, np.zeros(3))[None], np.zeros(5))
+        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _STEP_STD**2)
+        step = step - np.linalg.solve(normal, equations.right[0, :4] + step / _STEP_STD**2)
+        camera = begin.take_step(np.append(step, np.zeros(3))[None], np.zeros(5))
     return camera
 
 
@@ -276,4 +280,4 @@ def follow_lines(
         parts.append(found.in_frame(frame))
         cameras.append(corrected)
         before, after = single, corrected
-    return FollowedLines(together(parts), join_cameras(cameras))
+    return FollowedLines(join_evidence(parts), join_cameras(cameras))

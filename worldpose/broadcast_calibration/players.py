@@ -14,6 +14,7 @@ from worldpose.broadcast_calibration.evidence import PLAYER, ObservedPoints, Poi
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
+from worldpose.geometry.boxes import box_iou
 
 BONES: Final = np.array(
     [
@@ -22,13 +23,13 @@ BONES: Final = np.array(
     ]
 )
 """A tree over the 17 joints of COCO: J - 1 bones."""
-_LEAST: Final = 0.05
+_MIN_SIMILARITY: Final = 0.05
 """Minimum similarity of a pair [1]: a twentieth of shared area, or random bones."""
-_JOINTS: Final = 6
+_MIN_JOINTS: Final = 6
 """Minimum joints present on both sides of a pair [1]."""
-_START: Final = 0.05
+_DEFAULT_SHARE: Final = 0.05
 """Default keypoint deviation without an estimate, relative to the person's height in the image."""
-_LAG: Final = 1.0
+_MAX_LAG_S: Final = 1.0
 """Maximum correlation time of errors [s]."""
 
 
@@ -132,13 +133,8 @@ def similarity(projected: Floats, detected: Floats) -> Floats:
         projected: (persons, 17, 2) [px].
         detected: (detections, 17, 2) [px].
     """
-    one, two = boxes_of(projected)[:, None], boxes_of(detected)[None]
-    sides = np.minimum(one[..., 2:], two[..., 2:]) - np.maximum(one[..., :2], two[..., :2])
-    shared = np.maximum(sides, 0.0).prod(axis=-1)
-    union = (one[..., 2:] - one[..., :2]).prod(-1) + (two[..., 2:] - two[..., :2]).prod(-1)
-    union = union - shared
+    overlap = box_iou(boxes_of(projected), boxes_of(detected))
     with np.errstate(invalid="ignore", divide="ignore"):
-        overlap = np.where(union > 0.0, shared / union, 0.0)
         bones = [each[:, BONES[:, 1]] - each[:, BONES[:, 0]] for each in (projected, detected)]
         unit = [bone / np.linalg.norm(bone, axis=-1, keepdims=True) for bone in bones]
         cosine = np.einsum("ibk,jbk->ijb", unit[0], unit[1])
@@ -146,7 +142,7 @@ def similarity(projected: Floats, detected: Floats) -> Floats:
         mean = np.where(known, cosine, 0.0).sum(-1) / np.maximum(known.sum(-1), 1)
     one_seen, two_seen = (np.asarray(np.isfinite(p).all(-1)) for p in (projected, detected))
     both = one_seen[:, None] & two_seen[None]
-    alike = np.where(both.sum(-1) >= _JOINTS, overlap * mean, 0.0)
+    alike = np.where(both.sum(-1) >= _MIN_JOINTS, overlap * mean, 0.0)
     return np.where(np.isfinite(alike), alike, 0.0)
 
 
@@ -159,7 +155,7 @@ def match(camera: MovingCamera, people: People) -> Matches:
     for frame in range(frames):
         alike = similarity(projected[frame], people.keypoints[frame])
         for person, detection in zip(*linear_sum_assignment(-alike), strict=True):
-            if alike[person, detection] > _LEAST:
+            if alike[person, detection] > _MIN_SIMILARITY:
                 value = float(alike[person, detection])
                 rows.append((frame, int(person), int(detection), value))
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
@@ -193,7 +189,7 @@ def player_evidence(
         single = camera.frames(slice(int(frame), int(frame) + 1)).camera[0]
         projected[mine] = single.project(world[mine].reshape(-1, 3)).reshape(-1, *image.shape[1:])
     scaled = (projected - image) / np.maximum(tall, 1.0)[:, None, None]
-    noise = _noise(scaled, matches, people.fps)
+    noise = _estimate_noise(scaled, matches, people.fps)
     known = np.isfinite(scaled).all(axis=-1)
     frame = np.repeat(matches.frame[:, None], image.shape[1], axis=1)[known]
     deviation = noise.share * np.repeat(tall[:, None], image.shape[1], axis=1)[known]
@@ -212,11 +208,11 @@ def player_evidence(
     return evidence, noise
 
 
-def _noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
+def _estimate_noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
     """Return spread and correlation time of residuals (n, 17, 2), relative to heights."""
     known = scaled[np.isfinite(scaled)]
     if len(known) < 100:
-        return PlayerNoise(_START, 1.0)
+        return PlayerNoise(_DEFAULT_SHARE, 1.0)
     share = max(1.4826 * float(np.median(np.abs(known))), 1e-3)
     bounded = np.clip(scaled, -3.0 * share, 3.0 * share)
     persons = int(matches.person.max()) + 1
@@ -225,7 +221,7 @@ def _noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
     }
     power = float(np.nanmean(bounded**2))
     total = 1.0
-    for lag in range(1, max(1, round(_LAG * fps)) + 1):
+    for lag in range(1, max(1, round(_MAX_LAG_S * fps)) + 1):
         later = np.array(
             [where.get(int(key), -1) for key in (matches.frame + lag) * persons + matches.person]
         )
@@ -240,16 +236,16 @@ def _noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise:
     return PlayerNoise(share, total)
 
 
-_COARSE: Final = 25.0
+_MAX_OFFSET: Final = 25.0
 """Maximum offset of the search [frame]."""
-_COARSELY: Final = 80
+_COARSE_FRAMES: Final = 80
 """Maximum sample frames in the search over all offsets [1]."""
-_FINELY: Final = 400
+_FINE_FRAMES: Final = 400
 """Maximum sample frames about the best offset [1]."""
-_SHARE: Final = 0.03
+_TYPICAL_SHARE: Final = 0.03
 """Typical keypoint error, as a share of the person's height in the image [1]; the loss scale is
 three times this."""
-_LASTS: Final = 0.3
+_CORRELATION_S: Final = 0.3
 """Correlation time of one person's errors [s]."""
 
 
@@ -277,7 +273,7 @@ class FeedOffset:
 
 
 def estimate_feed_offset(
-    camera: MovingCamera, people: People, *, reach: float = _COARSE
+    camera: MovingCamera, people: People, *, reach: float = _MAX_OFFSET
 ) -> FeedOffset:
     """Return the clock offset between the feed and the static cameras.
 
@@ -294,16 +290,17 @@ def estimate_feed_offset(
     """
     whole = np.arange(-np.floor(reach), np.floor(reach) + 1.0)
     some, every = (
-        np.arange(0, len(camera), -(-len(camera) // most)) for most in (_COARSELY, _FINELY)
+        np.arange(0, len(camera), -(-len(camera) // most))
+        for most in (_COARSE_FRAMES, _FINE_FRAMES)
     )
-    coarse = np.array([_cost(camera, people, offset, some)[0] for offset in whole])
+    coarse = np.array([_mean_loss(camera, people, offset, some)[0] for offset in whole])
     if not np.isfinite(coarse).any():
         return FeedOffset(np.nan, np.inf, False, whole, coarse, 0)
     best = float(whole[int(np.nanargmin(coarse))])
     # Joints between integer frames would be means of two, with less noise: a parabola through
     # integer offsets avoids this bias.
     near = best + np.arange(-2.0, 3.0)
-    results = [_cost(camera, people, offset, every) for offset in near]
+    results = [_mean_loss(camera, people, offset, every) for offset in near]
     fine = np.array([cost for cost, _ in results])
     middle = int(np.nanargmin(fine)) if np.isfinite(fine).any() else 0
     pairs = results[middle][1]
@@ -315,13 +312,13 @@ def estimate_feed_offset(
     offset = float(near[middle] + 0.5 * (left - right) / bend)
     # Half a loss of one unit is one standard deviation; a person counts once per correlation time.
     stride = -(-len(camera) // len(every))
-    independent = pairs / max(1.0, _LASTS * people.fps / stride)
+    independent = pairs / max(1.0, _CORRELATION_S * people.fps / stride)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
     determined = error < 0.5
     return FeedOffset(offset if determined else np.nan, error, determined, near, fine, pairs)
 
 
-def _cost(
+def _mean_loss(
     camera: MovingCamera, people: People, offset: float, frames: NDArray[np.int64]
 ) -> tuple[float, int]:
     """Return the mean loss of a keypoint at an offset, and the number of pairs."""
@@ -340,7 +337,7 @@ def _cost(
     tall = np.ptp(np.nan_to_num(boxes_of(image)).reshape(-1, 2, 2)[..., 1], axis=-1)
     single = seen.camera[pairs.frame]
     off = single.project(world) - image
-    off = off / np.maximum(_SHARE * tall, 0.5)[:, None, None]
+    off = off / np.maximum(_TYPICAL_SHARE * tall, 0.5)[:, None, None]
     squared = (off**2).sum(axis=-1)
     squared = squared[np.isfinite(squared)]
     if not len(squared):

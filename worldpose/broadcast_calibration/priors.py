@@ -12,7 +12,7 @@ from data_contracts.arrays import Floats, Integers
 from data_contracts.records import Record
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastPrior
-from worldpose.broadcast_calibration.tracking import Chain
+from worldpose.broadcast_calibration.tracking import LENS_POWERS, Chain
 from worldpose.geometry import Rigid
 
 REFERENCE: Final = 2.19
@@ -112,14 +112,12 @@ def add_smoothness(camera: MovingCamera, spread: Floats, blocks: Floats, right: 
     return 0.5 * float((gone**2).sum())
 
 
-_HAND: Final = 2e-3
+_MAX_ROTATION_CHANGE: Final = 2e-3
 """Largest plausible second difference of the rotation at 50 frames per second [rad]: it bridges
 frames without evidence and does not affect others."""
-_LEAST: Final = np.array([1e-5, 1e-5, 1e-4, 1e-4])
+_MIN_CHANGE: Final = np.array([1e-5, 1e-5, 1e-4, 1e-4])
 """Minimum deviation of a second difference of log focal, k1, k2, k3."""
-_LENS: Final = np.array([1.6, 1.0, 1.0])
-"""Powers of the focal length that k1, k2, k3 grow with."""
-_WINDOW: Final = 0.2
+_WINDOW_S: Final = 0.2
 """Smoothing window of tracked focal lengths before differencing [s]."""
 
 
@@ -157,16 +155,16 @@ def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
         fps: frames per second.
     """
     spread = np.full(FRAME_SIZE, np.inf)
-    spread[:3] = _HAND * (50.0 / fps) ** 2
-    width = max(1, round(_WINDOW * fps))
+    spread[:3] = _MAX_ROTATION_CHANGE * (50.0 / fps) ** 2
+    width = max(1, round(_WINDOW_S * fps))
     if len(camera) < 3 * width:
         spread[3:] = 1.0
         return spread
-    change = float(np.sqrt(np.mean(_bends(camera, width) ** 2)))
+    change = float(np.sqrt(np.mean(_zoom_changes(camera, width) ** 2)))
     lens = np.median(np.abs(camera.distortion), axis=0)
     # The deviation of k3 uses at least the size of k2.
     lens[2] = max(lens[2], lens[1])
-    spread[3:] = np.maximum(np.concatenate([[change], change * _LENS * lens]), _LEAST)
+    spread[3:] = np.maximum(np.concatenate([[change], change * LENS_POWERS * lens]), _MIN_CHANGE)
     return spread
 
 
@@ -180,10 +178,10 @@ def correlation_time(camera: MovingCamera, fps: float) -> float:
         camera: all frames, as tracked.
         fps: frames per second.
     """
-    width = max(1, round(_WINDOW * fps))
+    width = max(1, round(_WINDOW_S * fps))
     if len(camera) < 3 * width:
         return 1.0
-    bends = _bends(camera, width)
+    bends = _zoom_changes(camera, width)
     power, total = float(np.mean(bends**2)), 1.0
     for lag in range(1, len(bends) // 2):
         correlation = float(np.mean(bends[lag:] * bends[:-lag])) / max(power, 1e-300)
@@ -193,7 +191,7 @@ def correlation_time(camera: MovingCamera, fps: float) -> float:
     return total
 
 
-def _bends(camera: MovingCamera, width: int) -> Floats:
+def _zoom_changes(camera: MovingCamera, width: int) -> Floats:
     """Return second differences of the log focal length, smoothed over `width` frames."""
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()

@@ -28,17 +28,17 @@ from worldpose.broadcast_calibration.tracking import Chain
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.pitch import PitchTemplate
 
-_FEW_LINES: Final = 30
+_MIN_LINES: Final = 30
 """Minimum line samples that determine a frame's camera [1]."""
-_FEW_PLAYERS: Final = 3
+_MIN_PLAYERS: Final = 3
 """Minimum players that determine a frame's camera [1]."""
-_PICKS: Final = 5
+_MAX_PICKS: Final = 5
 """Maximum number of proposed key frames."""
-_LATE: Final = 0.5
+_MAX_OFFSET: Final = 0.5
 """Clock offset above which the report warns [frame]."""
 _GRID: Final = 4.0
 """Grid spacing of places on the pitch for expected errors [m]."""
-_MISPLACED_M: Final = 0.3
+_MAX_PAINT_ERROR_M: Final = 0.3
 """Spread of markings about the Laws that asks for a review [m]: no painter errs by that much."""
 
 
@@ -159,34 +159,9 @@ def report_calibration(
         player_count = np.bincount(fit.matches.frame, minlength=frames)
     flow_count = np.bincount(tracked.flow.frame, minlength=frames)
     expected = expected_errors(camera, fit.uncertainty, pitch)
-    status = np.full(frames, FRAME_STATUS.index("bridged"), dtype=np.uint8)
-    linked = np.append(links.determined, False) | np.append(False, links.determined)
-    status[linked] = FRAME_STATUS.index("followed")
-    status[player_count >= _FEW_PLAYERS] = FRAME_STATUS.index("players")
-    status[line_count >= _FEW_LINES] = FRAME_STATUS.index("lines")
-    status[keys.frames] = FRAME_STATUS.index("key_frame")
+    status = _frame_status(tracked, line_count, player_count)
     earlier, later = median_residuals(fit.before, points), median_residuals(camera, points)
-    reasons = []
-    share = float(np.mean(expected > settings.weak_error_px))
-    if share > 0.05:
-        reasons.append(
-            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error_px:g} px"
-        )
-    bridged = int((status == FRAME_STATUS.index("bridged")).sum())
-    if bridged:
-        reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
-    if fit.pitch.paint_m > _MISPLACED_M:
-        reasons.append(
-            f"markings differ from the Laws by {fit.pitch.paint_m:.2f} m per axis: the pitch has "
-            "another size, or clicks have wrong names"
-        )
-    reasons += [
-        f"key frame {first + frame} is not used: {why}" for frame, why in keys.refused.items()
-    ]
-    reasons += [
-        f"key frame {first + frame} does not rest on {', '.join(names)}"
-        for frame, names in keys.wrong.items()
-    ]
+    reasons = _review_reasons(expected, status, keys, fit.pitch, settings, first)
     decisions = [
         f"a followed point counts {fit.weights.flow_share:.2g} of its loss, as tracking drifts",
         f"errors of a person last {fit.weights.player_frames:.1f} frames",
@@ -217,6 +192,59 @@ def report_calibration(
         decisions=tuple(decisions),
         reasons=tuple(reasons),
     )
+
+
+def _frame_status(
+    tracked: TrackedClip, line_count: Integers, player_count: Integers
+) -> NDArray[np.uint8]:
+    """Return the main evidence of each frame (frames,), an index into `FRAME_STATUS`."""
+    status = np.full(len(line_count), FRAME_STATUS.index("bridged"), dtype=np.uint8)
+    determined = tracked.chain.determined
+    linked = np.append(determined, False) | np.append(False, determined)
+    status[linked] = FRAME_STATUS.index("followed")
+    status[player_count >= _MIN_PLAYERS] = FRAME_STATUS.index("players")
+    status[line_count >= _MIN_LINES] = FRAME_STATUS.index("lines")
+    status[tracked.keys.frames] = FRAME_STATUS.index("key_frame")
+    return status
+
+
+def _review_reasons(
+    expected: Floats,
+    status: NDArray[np.uint8],
+    keys: Keys,
+    pitch: PitchFit,
+    settings: BroadcastCalibrationSettings,
+    first: int,
+) -> list[str]:
+    """Return why a person must review the clip, apart from its clock.
+
+    Args:
+        expected: (frames,) expected image error [px].
+        status: (frames,) main evidence.
+        keys: key frames, used and refused.
+        pitch: the pitch that the fit shows.
+        settings: thresholds.
+        first: number of the clip's first frame in its video.
+    """
+    reasons = []
+    share = float(np.mean(expected > settings.weak_error_px))
+    if share > 0.05:
+        reasons.append(
+            f"{100.0 * share:.0f} % of the frames expect errors over {settings.weak_error_px:g} px"
+        )
+    bridged = int((status == FRAME_STATUS.index("bridged")).sum())
+    if bridged:
+        reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
+    if pitch.paint_m > _MAX_PAINT_ERROR_M:
+        reasons.append(
+            f"markings differ from the Laws by {pitch.paint_m:.2f} m per axis: the pitch has "
+            "another size, or clicks have wrong names"
+        )
+    for frame, why in keys.refused.items():
+        reasons.append(f"key frame {first + frame} is not used: {why}")
+    for frame, names in keys.wrong.items():
+        reasons.append(f"key frame {first + frame} does not rest on {', '.join(names)}")
+    return reasons
 
 
 def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: PitchTemplate) -> Floats:
@@ -258,7 +286,7 @@ def _describe_offset(
     )
     if settings.feed_offset == "correct":
         return f"{sentence}: corrected", False
-    beyond = abs(offset.frames) - 2.0 * offset.standard_error > _LATE
+    beyond = abs(offset.frames) - 2.0 * offset.standard_error > _MAX_OFFSET
     todo = (
         f": lower the clip's broadcast_offset_frames by {offset.frames:.2f}, or set "
         "broadcast_calibration.feed_offset=correct"
@@ -283,9 +311,9 @@ def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: 
 def _select_picks(expected: Floats) -> tuple[int, ...]:
     """Return the frames of largest expected error, at a distance from one another."""
     left = np.where(np.isfinite(expected), expected, -1.0)
-    apart = max(1, len(expected) // (2 * _PICKS))
+    apart = max(1, len(expected) // (2 * _MAX_PICKS))
     picks: list[int] = []
-    while len(picks) < _PICKS and left.max() > 0.0:
+    while len(picks) < _MAX_PICKS and left.max() > 0.0:
         best = int(left.argmax())
         picks.append(best)
         left[max(0, best - apart) : best + apart + 1] = -1.0
@@ -325,8 +353,8 @@ def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float
     key = np.column_stack([points.frame[people], points.source[people]])
     _, person, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(person.ravel(), off[people, axis]) for axis in range(2)], axis=-1)
-    beside = np.linalg.norm(sums[: len(count)] / count[:, None], axis=-1)
+    distances = np.linalg.norm(sums[: len(count)] / count[:, None], axis=-1)
     return (
         float(np.median(across)) if len(across) else float("nan"),
-        float(np.median(beside)) if len(beside) else float("nan"),
+        float(np.median(distances)) if len(distances) else float("nan"),
     )

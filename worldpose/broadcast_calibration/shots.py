@@ -4,50 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from data_contracts.arrays import Image
-from data_contracts.records import Record
 from worldpose.broadcast_calibration.tracking import Followed, follow
 from worldpose.errors import InputError
 
 _POINTS: Final = 200
 """Approximate number of points followed between two frames [1]."""
-_GREEN: Final = ((25, 35, 25), (95, 255, 255))
+_GRASS: Final = ((25, 35, 25), (95, 255, 255))
 """Hue [2 deg], saturation and value [1/255] of grass in sun, shade and floodlight."""
-_LOOK: Final = 0.5
+_STATISTICS_S: Final = 0.5
 """Interval between frames for grass and people statistics [s]."""
-_SETTLED: Final = 1.0
+_MIN_SHOT_S: Final = 1.0
 """Minimum duration of a shot [s]; shorter parts belong to a transition between two shots."""
-_PICTURES: Final = 8
+_MAX_PREVIEWS: Final = 8
 """Maximum preview frames per shot [1]."""
-_UNLIKE: Final = 30.0
+_MAX_CHANGE: Final = 30.0
 """Mean change of brightness that separates two shots without followed points [1/255]."""
-
-
-class ProgrammeSettings(Record):
-    """Criteria for shots of a programme as clip proposals."""
-
-    rate_hz: float = Field(default=25.0, ge=1e-6, le=10000)
-    """Approximate sampling rate of frames [Hz]; it limits the accuracy of cuts."""
-    cut_share: float = Field(default=0.25, gt=0, lt=1)
-    """Minimum share of homography inliers within a shot, as in calibration [1]."""
-    min_transition_s: float = Field(default=0.1, ge=1e-6, le=10)
-    """Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
-    replay."""
-    min_duration_s: float = Field(default=4.0, ge=1e-6, le=1000)
-    """Minimum clip duration [s]."""
-    min_grass_share: float = Field(default=0.5, gt=0, lt=1)
-    """Minimum median share of grass in frames of a main camera [1]."""
-    max_person_height: float = Field(default=0.35, ge=1e-6, le=100)
-    """Maximum median height of the tallest region on the grass, in image heights [1]: people are a
-    tenth in a main camera, half and more in other cameras."""
-    min_pan: float = Field(default=0.25, ge=0, le=100)
-    """Minimum pan per clip, in image widths [1]: 7 degrees at a usual focal length."""
+_RATE_HZ: Final = 25.0
+"""Approximate sampling rate of frames [Hz]; it limits the accuracy of cuts."""
+_CUT_SHARE: Final = 0.25
+"""Minimum share of homography inliers within a shot, as in calibration [1]."""
+_MIN_TRANSITION_S: Final = 0.1
+"""Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
+replay."""
+_MIN_DURATION_S: Final = 4.0
+"""Minimum clip duration [s]."""
+_MIN_GRASS_SHARE: Final = 0.5
+"""Minimum median share of grass in frames of a main camera [1]."""
+_MAX_PERSON_HEIGHT: Final = 0.35
+"""Maximum median height of the tallest region on the grass, in image heights [1]: people are a
+tenth in a main camera, half and more in other cameras."""
+_MIN_PAN: Final = 0.25
+"""Minimum pan per clip, in image widths [1]: 7 degrees at a usual focal length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +88,7 @@ class _Course:
         grass, tallest = grass_and_people(picture)
         if len(self.grass) % self.every == 0:
             self.pictures.append(picture)
-            if len(self.pictures) > _PICTURES:
+            if len(self.pictures) > _MAX_PREVIEWS:
                 del self.pictures[1::2]
                 self.every *= 2
         self.grass.append(grass)
@@ -106,11 +100,7 @@ class _Course:
         self.left, self.right = min(self.left, self.aim), max(self.right, self.aim)
 
 
-def find_shots(
-    pictures: Iterable[tuple[int, Image | None]],
-    fps: float,
-    settings: ProgrammeSettings = ProgrammeSettings(),  # noqa: B008
-) -> Iterator[Shot]:
+def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iterator[Shot]:
     """Yield the shots of a programme in order, each with the reasons to reject it.
 
     One pass in bounded memory. Simple features select shots of the main camera: grass, the size of
@@ -120,25 +110,24 @@ def find_shots(
         pictures: numbers, rising by one, and small RGB frames, about 320 px wide; None for a
             damaged frame, which ends a shot.
         fps: frames per second.
-        settings: limits.
     """
-    stride = max(1, round(fps / settings.rate_hz))
-    looked = max(1, round(_LOOK * fps / stride))
+    stride = max(1, round(fps / _RATE_HZ))
+    interval = max(1, round(_STATISTICS_S * fps / stride))
     course: _Course | None = None
     before: Image | None = None
-    waiting: _Course | None = None
-    ended: int | None = None
+    shot: _Course | None = None
+    shot_before: int | None = None
     count = 0
-    for number, picture in pictures:
+    for number, picture in chain(pictures, [(0, None)]):  # the end ends a shot
         if number % stride:
             continue
-        same, moved = (False, 0.0) if before is None else _measure_motion(before, picture, settings)
+        same, moved = (False, 0.0) if before is None else _measure_motion(before, picture)
         if course is not None and not same:
-            if course.last - course.first >= _SETTLED * fps:
-                if waiting is not None:
-                    yield _shot(waiting, ended, course.first, fps, stride, settings)
-                    ended = waiting.last
-                waiting = course
+            if course.last - course.first >= _MIN_SHOT_S * fps:
+                if shot is not None:
+                    yield _shot(shot, shot_before, course.first, fps, stride)
+                    shot_before = shot.last
+                shot = course
             course = None
         before = picture
         if picture is None:
@@ -147,16 +136,11 @@ def find_shots(
             course, count = _Course(number, number), 0
         course.last = number
         course.turn(moved)
-        if count % looked == 0:
+        if count % interval == 0:
             course.look(picture)
         count += 1
-    if course is not None and course.last - course.first >= _SETTLED * fps:
-        if waiting is not None:
-            yield _shot(waiting, ended, course.first, fps, stride, settings)
-            ended = waiting.last
-        waiting = course
-    if waiting is not None:
-        yield _shot(waiting, ended, None, fps, stride, settings)
+    if shot is not None:
+        yield _shot(shot, shot_before, None, fps, stride)
 
 
 def grass_and_people(picture: Image) -> tuple[float, float]:
@@ -168,7 +152,7 @@ def grass_and_people(picture: Image) -> tuple[float, float]:
     Args:
         picture: RGB (height, width, 3), small.
     """
-    green = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), *map(np.array, _GREEN))
+    green = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), *map(np.array, _GRASS))
     kernel = np.ones((3, 3), np.uint8)
     # Remove green specks in the stands.
     grass = cv2.morphologyEx(green, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
@@ -184,9 +168,7 @@ def grass_and_people(picture: Image) -> tuple[float, float]:
     return share, tallest / len(picture)
 
 
-def _measure_motion(
-    before: Image, picture: Image | None, settings: ProgrammeSettings
-) -> tuple[bool, float]:
+def _measure_motion(before: Image, picture: Image | None) -> tuple[bool, float]:
     """Return whether a frame continues a shot, and its motion to the right [widths]."""
     if picture is None:
         return False, 0.0
@@ -195,44 +177,34 @@ def _measure_motion(
         for each in (before, picture)
     ]
     (followed,) = follow(grey, None, _POINTS)
-    if np.isnan(followed.together):
+    if np.isnan(followed.inlier_share):
         change = np.abs(grey[1].astype(np.float64) - grey[0]).mean()
-        return bool(change < _UNLIKE), 0.0
-    if followed.together < settings.cut_share:
+        return bool(change < _MAX_CHANGE), 0.0
+    if followed.inlier_share < _CUT_SHARE:
         return False, 0.0
     motion = np.median(followed.end[:, 0] - followed.start[:, 0])
     return True, float(motion) / picture.shape[1]
 
 
-def _shot(
-    course: _Course,
-    before: int | None,
-    after: int | None,
-    fps: float,
-    stride: int,
-    settings: ProgrammeSettings,
-) -> Shot:
+def _shot(course: _Course, before: int | None, after: int | None, fps: float, stride: int) -> Shot:
     """Return a finished shot; gaps to the neighbouring shots indicate wipes."""
     count = course.last - course.first + 1
     grass, tallest = float(np.median(course.grass)), float(np.median(course.tallest))
     pan, seconds = course.right - course.left, count / fps
     # Neighbouring samples are a stride apart, in a shot and across a cut.
-    wipe = settings.min_transition_s * fps + stride
+    wipe = _MIN_TRANSITION_S * fps + stride
     sides = (
         before is not None and course.first - before > wipe,
         after is not None and after - course.last > wipe,
     )
-    unfit = (
-        *(
-            (f"shorter than {settings.min_duration_s:g} s",)
-            if seconds < settings.min_duration_s
-            else ()
-        ),
-        *(("too little grass",) if grass < settings.min_grass_share else ()),
-        *(("people too large",) if tallest > settings.max_person_height else ()),
-        *(("hardly a pan",) if pan < settings.min_pan else ()),
-        *(("between two wipes, as replays are",) if all(sides) else ()),
-    )
+    faults = {
+        f"shorter than {_MIN_DURATION_S:g} s": seconds < _MIN_DURATION_S,
+        "too little grass": grass < _MIN_GRASS_SHARE,
+        "people too large": tallest > _MAX_PERSON_HEIGHT,
+        "hardly a pan": pan < _MIN_PAN,
+        "between two wipes, as replays are": all(sides),
+    }
+    unfit = tuple(fault for fault, found in faults.items() if found)
     return Shot(course.first, count, seconds, grass, tallest, pan, tuple(course.pictures), unfit)
 
 
@@ -243,7 +215,7 @@ def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
         followed: points between all neighbouring frames.
         share: minimum share of them consistent with one homography within a shot [1].
     """
-    return [number + 1 for number, pair in enumerate(followed) if pair.together < share]
+    return [number + 1 for number, pair in enumerate(followed) if pair.inlier_share < share]
 
 
 def require_one_shot(

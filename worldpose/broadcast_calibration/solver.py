@@ -26,9 +26,9 @@ from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
 
 _START_DAMPING: Final = 1e-4
 _MAX_DAMPING: Final = 1e9
-_SETTLED: Final = 1e-7
+_TOLERANCE: Final = 1e-7
 """Relative decrease of the cost that ends the iterations."""
-_OF_SIZE: Final = np.array([0, 1, 2, 5])
+_SIZE_ENTRIES: Final = np.array([0, 1, 2, 5])
 """Places of length, width, crown and end fall in the last two rows of the paint errors."""
 
 
@@ -89,7 +89,7 @@ class Problem:
         """
         if self.size_row < 0:
             return np.zeros(4)
-        return np.asarray(rows[self.size_row :].ravel()[_OF_SIZE])
+        return np.asarray(rows[self.size_row :].ravel()[_SIZE_ENTRIES])
 
     @cached_property
     def ends(self) -> Integers:
@@ -187,7 +187,7 @@ def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
         min_damping=1e-10,
         max_damping=_MAX_DAMPING,
         iterations=iterations,
-        converged=lambda before, after: 0.0 < before - after < _SETTLED * after,
+        converged=lambda before, after: 0.0 < before - after < _TOLERANCE * after,
     )
     found = minimize(start, step, schedule)
     last = found.state
@@ -222,16 +222,26 @@ class _State:
         return self.equations.cost
 
 
+def factorize(blocks: Floats) -> BandedFactor:
+    """Return the factors of the frames' blocks (3, frames, 7, 7).
+
+    Raises:
+        DegenerateError: the matrix is singular.
+    """
+    factor = BandedFactor.of(blocks)
+    if not factor.determined:
+        raise DegenerateError(
+            "broadcast camera: a frame's parameters have neither evidence nor prior. Pick a key "
+            "frame near the frames without lines, or give priors."
+        )
+    return factor
+
+
 def _solve_step(system: NormalEquations, damping: float) -> tuple[Floats, Floats]:
     """Return the damped Gauss-Newton step of the frames (frames, 7) and of shared parameters."""
     blocks = system.blocks.copy()
     blocks[0][:, range(FRAME_SIZE), range(FRAME_SIZE)] *= 1.0 + damping
-    factor = BandedFactor.of(blocks)
-    if not factor.determined:
-        raise DegenerateError(
-            "broadcast camera: a frame's numbers have neither evidence nor prior. Pick a key frame "
-            "near the frames without lines, or give priors."
-        )
+    factor = factorize(blocks)
     columns = np.concatenate([-system.right[..., None], system.border], axis=-1)
     solved = factor.solve(columns)
     corner = system.corner * (1.0 + damping * np.eye(len(system.corner)))
@@ -287,7 +297,7 @@ def _remove_fixed(problem: Problem, system: NormalEquations) -> None:
 RATE = 1e-3
 """Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""
 _DECAY = (0.9, 0.999)
-_SMALL = 1e-8
+_EPSILON = 1e-8
 
 
 def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
@@ -315,7 +325,7 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
         square = _DECAY[1] * square + (1.0 - _DECAY[1]) * gradient**2
         first = mean / (1.0 - _DECAY[0] ** iteration)
         second = square / (1.0 - _DECAY[1] ** iteration)
-        step = -RATE * unit * first / (np.sqrt(second) + _SMALL)
+        step = -RATE * unit * first / (np.sqrt(second) + _EPSILON)
         shared = step[frames:]
         camera = camera.take_step(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
         paint_offsets = paint_offsets + shared[CLIP_SIZE:].reshape(paint_offsets.shape)

@@ -77,28 +77,28 @@ def chain(
     first = key_frames[0]
     cameras[first] = keys.frames(slice(0, 1))
     for frame in range(first - 1, -1, -1):
-        cameras[frame] = advance(_there(cameras[frame + 1]), frame, True)
+        cameras[frame] = advance(_require(cameras[frame + 1]), frame, True)
     drift = []
     for number, (begin, end) in enumerate(pairwise(key_frames)):
         for frame in range(begin, end):
-            cameras[frame + 1] = advance(_there(cameras[frame]), frame, False)
-        reached, key = _there(cameras[end]), keys.frames(slice(number + 1, number + 2))
-        drift.append(_apart(reached, key))
+            cameras[frame + 1] = advance(_require(cameras[frame]), frame, False)
+        reached, key = _require(cameras[end]), keys.frames(slice(number + 1, number + 2))
+        drift.append(_direction_error(reached, key))
         for frame in range(begin + 1, end + 1):
             share = (frame - begin) / (end - begin)
-            cameras[frame] = _toward(_there(cameras[frame]), reached, key, share)
+            cameras[frame] = _correct_drift(_require(cameras[frame]), reached, key, share)
     for frame in range(key_frames[-1], frames - 1):
-        cameras[frame + 1] = advance(_there(cameras[frame]), frame, False)
-    whole = join_cameras([_there(camera) for camera in cameras])
+        cameras[frame + 1] = advance(_require(cameras[frame]), frame, False)
+    whole = join_cameras([_require(camera) for camera in cameras])
     return Chain(whole, kept, residual, determined, np.array(drift))
 
 
-def _there(camera: MovingCamera | None) -> MovingCamera:
+def _require(camera: MovingCamera | None) -> MovingCamera:
     assert camera is not None  # tracking reaches every frame from its neighbour
     return camera
 
 
-def _toward(
+def _correct_drift(
     camera: MovingCamera, reached: MovingCamera, key: MovingCamera, share: float
 ) -> MovingCamera:
     """Return a camera after a share of the step from one camera to another."""
@@ -110,7 +110,7 @@ def _toward(
     return camera.take_step(share * step, np.zeros(5))
 
 
-def _apart(one: MovingCamera, other: MovingCamera) -> float:
+def _direction_error(one: MovingCamera, other: MovingCamera) -> float:
     """Return the root mean square pixel distance of equal directions in two single cameras [px]."""
     width, height = one.image_size - 1.0
     grid = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
@@ -122,9 +122,9 @@ def _apart(one: MovingCamera, other: MovingCamera) -> float:
 
 _SCALES: Final = (20.0, 5.0, 1.5, 0.6, 0.6)
 """Decreasing scales of the loss [px]."""
-_LENS: Final = np.array([1.6, 1.0, 1.0])
+LENS_POWERS: Final = np.array([1.6, 1.0, 1.0])
 """Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
-_FEW: Final = 8
+_MIN_FOLLOWED: Final = 8
 """Minimum points for rotation and zoom [1]."""
 
 
@@ -157,7 +157,7 @@ def turn(camera: MovingCamera, followed: Followed) -> Turned:
         focal=np.repeat(camera.focal, 2),
         distortion=np.repeat(camera.distortion, 2, axis=0),
     )
-    return _fit_turn(both, followed, 4)
+    return _fit_turn(both, followed)
 
 
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
@@ -191,35 +191,33 @@ def modified_z_scores(residual: Floats) -> Floats:
     return np.asarray((0.6745 * off / spread).max(axis=-1))
 
 
-def _fit_turn(both: MovingCamera, followed: Followed, count: int) -> Turned:
-    """Return the second of two frames with fitted rotation and, if `count` is 4, zoom."""
-    if len(followed.start) < _FEW:
+def _fit_turn(both: MovingCamera, followed: Followed) -> Turned:
+    """Return the second of two frames with fitted rotation and zoom."""
+    if len(followed.start) < _MIN_FOLLOWED:
         return Turned(both, np.full((len(followed.start), 2), np.nan), False)
     bounds = np.array([0, len(followed.start), len(followed.start)])
     ones = np.ones(len(followed.start))
     # The median motion is a robust start.
     x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
-    both = _move_second(both, np.array([-y, x, 0.0, 0.0])[:count])
+    both = _move_second(both, np.array([-y, x, 0.0, 0.0]))
     for scale in _SCALES:
         equations = empty_equations(2, 5)
         flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
         add_flow(both.arrays, bounds, flow, equations)
-        normal = equations.blocks[0, 1, :count, :count]
+        normal = equations.blocks[0, 1, :4, :4]
         normal = normal + 1e-9 * np.diag(np.diag(normal))
         if not np.linalg.cond(normal) < 1e12:
             return Turned(both, flow_residuals(both, followed), False)
-        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :count])))
+        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :4])))
     return Turned(both, flow_residuals(both, followed), True)
 
 
 def _move_second(both: MovingCamera, step: Floats) -> MovingCamera:
-    """Return both frames after a step of the second: rotation (3,), or with log focal (4,)."""
+    """Return both frames after a step (4,) of the second: rotation, log focal length."""
     whole = np.zeros((2, 7))
-    whole[1, : len(step)] = step
+    whole[1, :4] = step
     moved = both.take_step(whole, np.zeros(5))
-    if len(step) == 3:
-        return moved
-    growth = (moved.focal[1] / moved.focal[0]) ** _LENS
+    growth = (moved.focal[1] / moved.focal[0]) ** LENS_POWERS
     lens = np.stack([both.distortion[0], both.distortion[0] * growth])
     return replace(moved, distortion=lens)
 
@@ -245,17 +243,17 @@ def _residuals(
 _WINDOW: Final = (21, 21)
 _LEVELS: Final = 4
 """Levels of the pyramid: motion up to 150 px per frame."""
-_RETURN: Final = 0.3
+_MAX_RETURN_ERROR: Final = 0.3
 """Maximum forward-backward error [px]."""
 _CELLS: Final = (16, 9)
 """Columns and rows of cells, each with its share of the points."""
-_QUALITY: Final = 0.002
+_MIN_STRENGTH: Final = 0.002
 """Minimum strength of a corner, relative to the strongest in the frame [1]."""
-_AWAY: Final = 0.15
+_BOX_MARGIN: Final = 0.15
 """Margin around a person's box, relative to its height [1]."""
-_CONSISTENT: Final = 1.5
+_INLIER_DISTANCE: Final = 1.5
 """Maximum inlier distance of a homography [px]."""
-_TELLING: Final = 12
+_MIN_POINTS: Final = 12
 """Minimum points to decide on a cut [1]."""
 
 
@@ -266,13 +264,13 @@ class Followed:
     Attributes:
         start: (n, 2) [px].
         end: (n, 2) [px].
-        together: share of the searched points that are inliers of one homography [1]; NaN with too
-            few points.
+        inlier_share: share of the searched points that are inliers of one homography [1]; NaN with
+            too few points.
     """
 
     start: Floats
     end: Floats
-    together: float
+    inlier_share: float
 
 
 def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list[Followed]:
@@ -299,26 +297,28 @@ def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list
 
 def _follow(before: Image, after: Image, people: Floats | None, points: int) -> Followed:
     start = _corners(before, people, points)
-    if len(start) < _TELLING:
+    if len(start) < _MIN_POINTS:
         return Followed(np.empty((0, 2)), np.empty((0, 2)), float("nan"))
     end, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, start.copy(), winSize=_WINDOW, maxLevel=_LEVELS
     )
-    home, back, _ = cv2.calcOpticalFlowPyrLK(
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(
         after, before, end, end.copy(), winSize=_WINDOW, maxLevel=_LEVELS
     )
     size = np.array([before.shape[1], before.shape[0]])
     # Near the border the window extends beyond the image.
     inside = ((end > _WINDOW[0] / 2) & (end < size - 1 - _WINDOW[0] / 2)).all(axis=-1)
-    same = np.linalg.norm(home - start, axis=-1) < _RETURN
+    same = np.linalg.norm(returned - start, axis=-1) < _MAX_RETURN_ERROR
     kept = (found[:, 0] == 1) & (back[:, 0] == 1) & same & inside
-    one, two = start[kept].astype(np.float64), end[kept].astype(np.float64)
-    looked = float(inside.sum())
-    if len(one) < _TELLING or looked < _TELLING:
-        return Followed(one, two, 0.0 if looked >= _TELLING else float("nan"))
-    _, agree = cv2.findHomography(one, two, cv2.RANSAC, _CONSISTENT)
-    together = 0.0 if agree is None else float(agree.sum()) / looked
-    return Followed(one, two, together)
+    matched_start, matched_end = start[kept].astype(np.float64), end[kept].astype(np.float64)
+    searched = float(inside.sum())
+    if len(matched_start) < _MIN_POINTS or searched < _MIN_POINTS:
+        return Followed(
+            matched_start, matched_end, 0.0 if searched >= _MIN_POINTS else float("nan")
+        )
+    _, agree = cv2.findHomography(matched_start, matched_end, cv2.RANSAC, _INLIER_DISTANCE)
+    share = 0.0 if agree is None else float(agree.sum()) / searched
+    return Followed(matched_start, matched_end, share)
 
 
 def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.float32]:
@@ -330,12 +330,12 @@ def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.f
     strength[:, :margin] = strength[:, -margin:] = 0.0
     for x0, y0, x1, y1 in np.empty((0, 4)) if people is None else people:
         if np.isfinite(x0 + y0 + x1 + y1):
-            away = _AWAY * (y1 - y0) + margin
+            away = _BOX_MARGIN * (y1 - y0) + margin
             left, right = max(0.5 * (x0 - away), 0.0), max(0.5 * (x1 + away), 0.0)
             top, bottom = max(0.5 * (y0 - away), 0.0), max(0.5 * (y1 + away), 0.0)
             strength[int(top) : int(bottom) + 1, int(left) : int(right) + 1] = 0.0
     peaks = strength == cv2.dilate(strength, np.ones((7, 7), np.uint8))
-    peaks &= strength > max(_QUALITY * float(strength.max()), 1e-7)
+    peaks &= strength > max(_MIN_STRENGTH * float(strength.max()), 1e-7)
     v, u = np.nonzero(peaks)
     height, width = half.shape
     cell = (u * _CELLS[0] // width) + _CELLS[0] * (v * _CELLS[1] // height)

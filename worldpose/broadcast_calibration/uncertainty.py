@@ -20,23 +20,15 @@ from worldpose.broadcast_calibration.normal_equations import (
     displacement,
     point_row,
 )
-from worldpose.broadcast_calibration.solver import Problem, Solution
+from worldpose.broadcast_calibration.solver import Problem, Solution, factorize
 from worldpose.compiled import compile_kernel
-from worldpose.errors import DegenerateError
-from worldpose.geometry.optimize.banded import BandedFactor
 
-_LENS: Final = 3
+_FIRST_LENS_ENTRY: Final = 3
 """Parameters of a frame's step before those of its lens."""
-_STRETCHES: Final = 64
+_MAX_INTERVALS: Final = 64
 """Maximum intervals per clip with a common error of lens second differences [1]."""
-_STRETCH: Final = 3.0
+_CELL_M: Final = 3.0
 """Cell size within which a marking has one common paint error [m]."""
-
-
-_UNDETERMINED: Final = (
-    "broadcast camera: a frame's numbers have neither evidence nor prior. Pick a key frame near "
-    "the frames without lines."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +94,7 @@ def compute_uncertainty(
         DegenerateError: the system is singular.
     """
     system = solution.equations.system
-    factor = BandedFactor.of(system.blocks)
-    if not factor.determined:
-        raise DegenerateError(_UNDETERMINED)
+    factor = factorize(system.blocks)
     by_shared = factor.solve(system.border)
     count = system.border.shape[2]
     flat = system.border.reshape(-1, count)
@@ -156,7 +146,7 @@ def lasting_samples(points: PointEvidence, off: Floats) -> float:
 
 def _cells(points: PointEvidence) -> Integers:
     """Return the kind, marking or person, and piece of the marking (n, 4) of each point."""
-    cell = np.floor(points.world[:, :2] / _STRETCH).astype(np.int64)
+    cell = np.floor(points.world[:, :2] / _CELL_M).astype(np.int64)
     cell[points.kind == PLAYER] = 0
     return np.column_stack([points.kind, points.source, cell])
 
@@ -168,9 +158,7 @@ def paint_variance(solution: Solution) -> Floats:
         DegenerateError: the system is singular.
     """
     system = solution.equations.system
-    factor = BandedFactor.of(system.blocks)
-    if not factor.determined:
-        raise DegenerateError(_UNDETERMINED)
+    factor = factorize(system.blocks)
     flat = system.border.reshape(-1, system.border.shape[2])
     solved = factor.solve(system.border).reshape(flat.shape)
     covariance = np.linalg.inv(system.corner - flat.T @ solved)
@@ -202,9 +190,9 @@ def _lasting_gradients(
     )
     evidence = points[chosen].arrays(problem.ends[chosen], problem.size_row)
     _add_gradients(camera.arrays, evidence, solution.paint_offsets, clusters, by_frame, by_shared)
-    together = np.flatnonzero(sources[:, 0] == PLAYER)
+    of_people = np.flatnonzero(sources[:, 0] == PLAYER)
     by_frame, by_shared = (
-        np.concatenate([each, each[..., together].sum(axis=-1, keepdims=True)], axis=-1)
+        np.concatenate([each, each[..., of_people].sum(axis=-1, keepdims=True)], axis=-1)
         for each in (by_frame, by_shared)
     )
     by_frame[problem.fixed_mask(len(camera))] = 0.0
@@ -218,9 +206,9 @@ def _lens_gradients(problem: Problem, frames: int, lasting: float) -> Floats:
     One column per lens parameter and interval of about `lasting` frames, for an error of one
     standard deviation; none without correlation.
     """
-    length = max(round(lasting), -(-frames // _STRETCHES))
+    length = max(round(lasting), -(-frames // _MAX_INTERVALS))
     numbers = np.flatnonzero(np.isfinite(problem.smoothness) & problem.free_frame)
-    numbers = numbers[numbers >= _LENS]
+    numbers = numbers[numbers >= _FIRST_LENS_ENTRY]
     starts = range(0, frames - 2, length) if lasting > 1.0 else range(0)
     # Intervals longer than the correlation time have a smaller common error.
     common = np.sqrt(min(1.0, lasting / length))
@@ -295,7 +283,7 @@ def _add_gradients(
                     by_shared[5 + 3 * row + one % 3, column] += moved
 
 
-_UNLIKELY = 1e-3
+_SIGNIFICANCE = 1e-3
 """Significance level of the test that clips have one center [1]."""
 
 
@@ -330,7 +318,7 @@ def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> Po
         [(c - middle) @ i @ (c - middle) for c, i in zip(centers, information, strict=True)]
     )
     freedom = 3 * (len(centers) - 1)
-    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, _UNLIKELY))
+    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, _SIGNIFICANCE))
     nothing = np.full(3, np.nan)
     return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))
 

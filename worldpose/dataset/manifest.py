@@ -15,9 +15,9 @@ from pydantic import PositiveFloat, TypeAdapter, ValidationError
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.release import ReleasedFile, ReleaseManifest
 from worldpose.errors import InputError
-from worldpose.formats.archives import Member, read_archive, write_archive
+from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
-from worldpose.formats.joints_file import JOINTS, JointTracks
+from worldpose.formats.joints_file import JointTracks
 
 MANIFEST: Final = "manifest.json"
 
@@ -145,13 +145,6 @@ def clip_frame_rate(rates: Mapping[str, float], clip: str) -> float | None:
 ORIGINS: Final = ("absent", "automatic", "filled", "corrected")
 """Meanings of the origin codes."""
 
-MEMBERS: Final = {
-    "frames": Member(("frames",), "int"),
-    "person_ids": Member(("persons",), "int"),
-    "origin": Member(("frames", "persons", JOINTS), "int"),
-    "origin_names": Member((len(ORIGINS),), "text"),
-}
-
 
 def origins_of(
     tracks: JointTracks, corrected: NDArray[np.bool_] | None = None
@@ -184,13 +177,3 @@ def write_origins(path: Path, tracks: JointTracks, origin: NDArray[np.uint8]) ->
             "origin_names": np.array(ORIGINS),
         },
     )
-
-
-def read_origins(path: Path) -> NDArray[np.int64]:
-    """Read the origins (frames, persons, 17) of a file.
-
-    Raises:
-        InputError: the file is invalid; the error names file and member.
-    """
-    origin: NDArray[np.int64] = read_archive(path, MEMBERS)["origin"]
-    return origin

@@ -39,7 +39,7 @@ CELL: Final = 2
 """Pixels of the crop per cell of the keypoint maps [px]."""
 MAP_COUNT: Final = 3
 """The target box, boxes of people in front of the target, and of people behind it: maps that the
-keypoint net takes beside a crop."""
+keypoint net takes with a crop."""
 EDGE_CELL: Final = 4
 """Pixels of the crop per cell of the edge maps [px]."""
 APART: Final = 3

@@ -145,18 +145,18 @@ class BundledPoseEstimator:
             boxes=np.full((len(boxes), 4), np.nan),
             fit=np.full(len(boxes), np.nan),
         )
-        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes, CROP)]
+        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
         for start in range(0, len(maps), BATCH):
             part = maps[start : start + BATCH]
-            end = start + len(part)
+            stop = start + len(part)
             crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
             around = np.zeros(
                 (BATCH, MAP_COUNT, CROP[1] // MAP_CELL, CROP[0] // MAP_CELL), dtype=np.float32
             )
             for index, mapping in enumerate(part):
                 crops[index] = cut_crop(image, mapping, CROP)
-                who = start + index
-                around[index] = surroundings(boxes[who], others[who], mapping, CROP)
+                person = start + index
+                around[index] = surroundings(boxes[person], others[person], mapping, CROP)
             with torch.inference_mode():
                 seen = Seen(*self._net(crops, around))
                 at, mass = decode_candidates(seen.maps, CANDIDATES)
@@ -167,9 +167,11 @@ class BundledPoseEstimator:
                 estimates.places[start + index] = pixels[index] @ scale.T + corner
                 sides = corners[index].reshape(2, 2) @ scale.T + corner
                 estimates.boxes[start + index] = sides.ravel()
-            estimates.mass[start:end] = mass.double().cpu().numpy()[: len(part)]
-            estimates.sure[start:end] = np.clip(sure.double().cpu().numpy()[: len(part)], 1e-3, 1.0)
-            estimates.fit[start:end] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
+            estimates.mass[start:stop] = mass.double().cpu().numpy()[: len(part)]
+            estimates.sure[start:stop] = np.clip(
+                sure.double().cpu().numpy()[: len(part)], 1e-3, 1.0
+            )
+            estimates.fit[start:stop] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
         height, width = image.shape[:2]
         limits = np.array([width, height, width, height]) - 0.5
         np.clip(estimates.boxes, -0.5, limits, out=estimates.boxes)
@@ -247,13 +249,15 @@ def assign_joints(places: Floats, mass: Floats, boxes: Floats) -> NDArray[np.int
     for _ in range(PASSES):
         before = taken.copy()
         for person in order[near[order].any(axis=1)]:
-            who = np.flatnonzero(near[person])
-            at = np.take_along_axis(places[who], taken[who][..., None, None], axis=2)
-            sure = np.take_along_axis(mass[who], taken[who][..., None], axis=2)
-            spread = JOINT_SPREAD * np.minimum(longer[who], longer[person])[:, None, None]
-            rival = _rivalry(places[person], at, sure, spread)
+            rivals = np.flatnonzero(near[person])
+            rival_joints = np.take_along_axis(
+                places[rivals], taken[rivals][..., None, None], axis=2
+            )
+            rival_mass = np.take_along_axis(mass[rivals], taken[rivals][..., None], axis=2)
+            spread = JOINT_SPREAD * np.minimum(longer[rivals], longer[person])[:, None, None]
+            rival = _rivalry(places[person], rival_joints, rival_mass, spread)
             rival += paired[:, None] * _rivalry(
-                places[person], at[:, other_side], sure[:, other_side], spread
+                places[person], rival_joints[:, other_side], rival_mass[:, other_side], spread
             )
             taken[person] = np.argmin(price[person] + RIVALRY * rival, axis=1)
         if np.array_equal(before, taken):
@@ -306,16 +310,14 @@ def _show_others(seen: CropEstimates, known: Floats, least: float) -> Flags:
     return np.asarray(real & apart & (seen.score >= least))
 
 
-def crops_around(boxes: Floats, size: tuple[int, int], margin: float = MARGIN) -> Floats:
+def crops_around(boxes: Floats) -> Floats:
     """Return the crops (people, 3) that show boxes whole: centre x, y [px], frame px per crop px.
 
     Args:
         boxes: (people, 4) x0, y0, x1, y1 [px].
-        size: width, height of a crop [px].
-        margin: size of the crop over that of the box.
     """
     sides = boxes[:, 2:] - boxes[:, :2]
-    scale = margin * np.max(sides / np.array(size), axis=1)
+    scale = MARGIN * np.max(sides / np.array(CROP), axis=1)
     middle = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     return np.column_stack([middle, np.maximum(scale, 1e-3)])
 
@@ -379,8 +381,8 @@ def _shrink(
     part = image[low[1] : end[1], low[0] : end[0]]
     if part.shape[1] < factor or part.shape[0] < factor:
         return part, np.column_stack([mapping[:, :2], mapping[:, 2] - low])
-    below, beside = cells[::-1] * factor - part.shape[:2]
-    whole = np.pad(part, ((0, below), (0, beside), (0, 0)), mode="edge")
+    below, right = cells[::-1] * factor - part.shape[:2]
+    whole = np.pad(part, ((0, below), (0, right), (0, 0)), mode="edge")
     small = np.asarray(cv2.resize(whole, cells.tolist(), interpolation=cv2.INTER_AREA), np.uint8)
     moved = (mapping[:, 2] - low - 0.5 * (factor - 1)) / factor
     return small, np.column_stack([mapping[:, :2] / factor, moved])

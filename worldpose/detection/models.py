@@ -39,7 +39,7 @@ SHIPPED_SCORE_MAP: Final = ScoreMap(slope=4.0, offset=-0.42)
 
 
 PULLED_RECORD: Final = "model.json"
-"""File of a pulled checkpoint with its `Checkpoint`, beside the folder `PULLED_FILES`."""
+"""File of a pulled checkpoint with its `Checkpoint`, next to the folder `PULLED_FILES`."""
 PULLED_FILES: Final = "files"
 
 
@@ -98,9 +98,9 @@ def _pose(settings: DetectionSettings) -> PoseEstimator:
         from worldpose.detection.onnx_nets import load_onnx_pose
 
         return load_onnx_pose(path, settings.device)
-    from worldpose.detection.transformers_nets import load_transformers_pose
+    from worldpose.detection.transformers_nets import TransformersPose
 
-    return load_transformers_pose(path, settings.device, settings.half)
+    return TransformersPose(path, settings.device, settings.half)
 
 
 def _detector(name: str, settings: DetectionSettings) -> Detector:
@@ -113,9 +113,9 @@ def _detector(name: str, settings: DetectionSettings) -> Detector:
 
         form = kind.partition("-")[2] or None
         return load_onnx_detector(path, settings.device, form, settings.person_classes)
-    from worldpose.detection.transformers_nets import load_transformers_detector
+    from worldpose.detection.transformers_nets import TransformersDetector
 
-    return load_transformers_detector(path, settings.device, settings.half)
+    return TransformersDetector(path, settings.device, settings.half)
 
 
 def load_bundled_detector(

@@ -5,7 +5,6 @@ Pose estimators are decoded here, detectors in `onnx_detectors`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -135,20 +134,6 @@ def open_session(file: Path, device: str) -> Any:  # noqa: ANN401
         ) from error
 
 
-def unknown_outputs(net: OnnxNet, expected: str) -> InputError:
-    """Return the error for a net with unknown outputs."""
-    return InputError(
-        net.where,
-        expected=expected,
-        found=f"outputs of shapes {_list_shapes(net.outputs)}",
-        todo="Export the net in one of these forms.",
-    )
-
-
-def _list_shapes(shapes: Sequence[tuple[int | None, ...]]) -> str:
-    return ", ".join(str(shape) for shape in shapes)
-
-
 def _import_runtime(where: str) -> ModuleType:
     try:
         runtime: ModuleType = import_module("onnxruntime")
@@ -257,8 +242,11 @@ def load_onnx_pose(file: Path, device: str = "cpu") -> PoseEstimator:
     columns = len(net.outputs) == 2 and all(len(o) == 3 and o[1] == 17 for o in net.outputs)
     maps = len(shape) == 4 and shape[1] == 17
     if not (single or columns or maps):
-        raise unknown_outputs(
-            net, "(batch, 1, 17, 3), twice (batch, 17, n), or (batch, 17, height, width)"
+        raise InputError(
+            net.where,
+            expected="(batch, 1, 17, 3), twice (batch, 17, n), or (batch, 17, height, width)",
+            found=f"outputs of shapes {', '.join(str(each) for each in net.outputs)}",
+            todo="Export the net in one of these forms.",
         )
     return _OnnxPose(net, normal=not single)
 

@@ -29,7 +29,7 @@ from worldpose.pitch import PitchTemplate
 
 HEAD_HEIGHT: Final = 1.75
 """Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""
-CUT: Final = 3.0
+CUT_PX: Final = 3.0
 """The lower border cuts off a box that ends this near to it [px]."""
 
 
@@ -49,7 +49,7 @@ def on_pitch(
         pitch: its lines and its surface.
         margin: largest distance outside of the lines that still counts as on the pitch [m].
     """
-    cut = boxes[:, 3] > image_size[1] - 1 - CUT
+    cut = boxes[:, 3] > image_size[1] - 1 - CUT_PX
     pixels = np.stack(
         [boxes[:, [0, 2]].mean(axis=1), np.where(cut, boxes[:, 1], boxes[:, 3])], axis=1
     )
@@ -73,11 +73,11 @@ def on_pitch(
         )
 
 
-CHUNK: Final = 64
+CHUNK_FRAMES: Final = 64
 """Frames per chunk."""
-NOBODY: Final = People(np.empty((0, 4)), np.empty(0))
+NO_PEOPLE: Final = People(np.empty((0, 4)), np.empty(0))
 """A frame without people."""
-LONG_CLIP: Final = 20
+SUSPICIOUS_FRAMES: Final = 20
 """Frames without any person that are suspicious."""
 
 
@@ -112,12 +112,12 @@ class DetectionReport:
     is_given: bool = False
 
     def why_no_person(self) -> str | None:
-        """Return the likely reason why a clip of `LONG_CLIP` frames or more shows no person.
+        """Return the likely reason why a clip of `SUSPICIOUS_FRAMES` or more shows no person.
 
         None: people were found, or the clip is shorter.
         """
         frames = self.frames - len(self.unreadable)
-        if self.detections or frames < LONG_CLIP:
+        if self.detections or frames < SUSPICIOUS_FRAMES:
             return None
         found = f"no person in {frames} frames: "
         if self.is_given:
@@ -220,7 +220,7 @@ class PeopleFinder:
                 )
             )
         else:
-            found = ((number, image, given.get(number, NOBODY)) for number, image in frames)
+            found = ((number, image, given.get(number, NO_PEOPLE)) for number, image in frames)
             self.report.boxes = sum(len(people.scores) for people in given.values())
         rows: list[KeypointDetections] = []
         numbers: list[int] = []
@@ -232,7 +232,7 @@ class PeopleFinder:
             else:
                 rows.append(self._find_poses(image, people, place))
                 self.report.empty += not len(rows[-1].score)
-            if len(rows) == CHUNK:
+            if len(rows) == CHUNK_FRAMES:
                 yield self._chunk(numbers, rows)
                 rows, numbers = [], []
         if rows:
@@ -248,16 +248,16 @@ class PeopleFinder:
             else detector.detect_parts(images, self._parts)
             for detector in self._detectors
         ]
-        everybody = []
+        people_by_frame = []
         for members in zip(*found, strict=True):
             if settings.fusion == "weighted":
                 people = fuse(list(members), settings.nms_iou)
             else:
-                together = People(
+                pooled = People(
                     np.concatenate([member.boxes for member in members]),
                     np.concatenate([member.scores for member in members]),
                 )
-                people = suppress(together, settings.nms_iou)
+                people = suppress(pooled, settings.nms_iou)
             kept = (people.scores >= settings.low_score_threshold) & (box_areas(people.boxes) > 0.0)
             people = People(people.boxes[kept], people.scores[kept])
             self.report.boxes += len(people.scores)
@@ -265,8 +265,8 @@ class PeopleFinder:
                 inside = self._inside(people, images[0], place)
                 self.report.crowd += int(np.count_nonzero(~inside))
                 people = People(people.boxes[inside], people.scores[inside])
-            everybody.append(people)
-        return everybody
+            people_by_frame.append(people)
+        return people_by_frame
 
     def _inside(self, people: People, image: Image, place: Place) -> Flags:
         """Return whether people's feet are on the pitch or near it (people,)."""

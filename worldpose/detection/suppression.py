@@ -86,13 +86,13 @@ def fuse(members: list[People], overlap: float) -> People:
     each = [suppress(member, overlap) for member in members]
     if len(each) == 1:
         return each[0]
-    everybody = People(
+    pooled = People(
         np.concatenate([member.boxes for member in each]),
         np.concatenate([member.scores for member in each]),
     )
-    order = _best_first(everybody)
+    order = _best_first(pooled)
     member = np.concatenate([np.full(len(p.scores), m) for m, p in enumerate(each)])[order]
-    boxes, scores = everybody.boxes[order], everybody.scores[order]
+    boxes, scores = pooled.boxes[order], pooled.scores[order]
     fused, weight = np.empty((0, 4)), np.empty(0)
     joined: list[set[int]] = []
     for box, score, who in zip(boxes, scores, member, strict=True):

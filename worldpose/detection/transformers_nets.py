@@ -14,7 +14,7 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection.interfaces import MIN_SCORE, Detector, People, PoseEstimator
+from worldpose.detection.interfaces import MIN_SCORE, People
 from worldpose.errors import InputError
 
 DETECTORS: Final = ("rt_detr", "rt_detr_v2", "d_fine", "detr")
@@ -25,29 +25,20 @@ PERSON: Final = 0
 """Class of people where the checkpoint does not name its classes."""
 
 
-def load_transformers_detector(folder: Path, device: str = "cpu", half: bool = False) -> Detector:
-    """Return a detector of people from a saved checkpoint.
-
-    Args:
-        folder: folder with config.json, model.safetensors and preprocessor_config.json.
-        device: `cpu` or `cuda`.
-        half: compute in half precision, on a GPU only.
-
-    Raises:
-        InputError: transformers or a GPU is missing, or the folder holds no such detector.
-    """
-    return _TransformersDetector(folder, device, half)
-
-
-def load_transformers_pose(folder: Path, device: str = "cpu", half: bool = False) -> PoseEstimator:
-    """Return a ViTPose from a saved checkpoint; arguments and errors are those of the detector."""
-    return _TransformersPose(folder, device, half)
-
-
-class _TransformersDetector:
-    """A net of the DETR family."""
+class TransformersDetector:
+    """A detector of the DETR family."""
 
     def __init__(self, folder: Path, device: str, half: bool) -> None:
+        """Load a saved checkpoint.
+
+        Args:
+            folder: folder with config.json, model.safetensors and preprocessor_config.json.
+            device: `cpu` or `cuda`.
+            half: compute in half precision, on a GPU only.
+
+        Raises:
+            InputError: transformers or a GPU is missing, or the folder holds no such net.
+        """
         self._torch, library = _libraries(folder)
         kind = _kind(folder, library, DETECTORS)
         # The processors without a suffix need torchvision.
@@ -86,10 +77,11 @@ class _TransformersDetector:
         return people
 
 
-class _TransformersPose:
+class TransformersPose:
     """A ViTPose estimator."""
 
     def __init__(self, folder: Path, device: str, half: bool) -> None:
+        """Load a saved checkpoint; arguments and errors are those of `TransformersDetector`."""
         self._torch, library = _libraries(folder)
         _kind(folder, library, POSES)
         self._processor = _load_net(folder, library.VitPoseImageProcessorPil)
@@ -177,7 +169,7 @@ def _place_net(net: Any, torch: ModuleType, folder: Path, device: str, half: boo
 
 
 def _tensors(
-    given: Mapping[str, Any], owner: _TransformersDetector | _TransformersPose
+    given: Mapping[str, Any], owner: TransformersDetector | TransformersPose
 ) -> dict[str, Any]:
     pixels = given["pixel_values"].to(owner._device)
     return {"pixel_values": pixels.half() if owner._half and owner._device == "cuda" else pixels}

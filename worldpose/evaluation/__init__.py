@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
-    from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
+    from worldpose.evaluation.cameras import CameraErrorSettings, CameraScore, evaluate_cameras
+    from worldpose.evaluation.matching import EvaluationSettings
     from worldpose.evaluation.metrics import PersonScore, evaluate_joints
-    from worldpose.evaluation.settings import CameraErrorSettings, EvaluationSettings
 
 __all__ = [
     "CameraErrorSettings",
@@ -27,16 +27,14 @@ __getattr__ = import_on_use(
     __name__,
     {
         "worldpose.evaluation.cameras": (
+            "CameraErrorSettings",
             "CameraScore",
             "evaluate_cameras",
         ),
+        "worldpose.evaluation.matching": ("EvaluationSettings",),
         "worldpose.evaluation.metrics": (
             "PersonScore",
             "evaluate_joints",
-        ),
-        "worldpose.evaluation.settings": (
-            "CameraErrorSettings",
-            "EvaluationSettings",
         ),
     },
 )

@@ -7,13 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from data_contracts.evaluation import CameraErrors, CameraEvaluation
 from data_contracts.records import Record
 from worldpose.errors import InputError
-from worldpose.evaluation.settings import CameraErrorSettings
 from worldpose.geometry import Camera, Rays
 from worldpose.pitch import PitchTemplate
+
+
+class CameraErrorSettings(Record):
+    """Grid of test points for camera errors."""
+
+    spacing_m: float = Field(default=2.5, ge=1e-6, le=1000)
+    """Spacing of the grid over the pitch [m]: some 1200 points, of which a tight broadcast frame
+    shows about a hundred."""
+    player_height_m: float = Field(default=1.0, ge=1e-6, le=100)
+    """Height above the surface of the points for the reprojection error [m]: a player's middle,
+    since cameras that are accurate on the grass can be wrong above it."""
 
 
 class CameraScore(Record):

@@ -10,12 +10,10 @@ from typing import Final
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.optimize import minimize_scalar
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from data_contracts.records import Record
 from worldpose.errors import DegenerateError, InputError
 from worldpose.evaluation.matching import (
     joint_distances,
@@ -30,6 +28,12 @@ METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit in such files [m]."""
 SUFFIXES: Final = (".c3d", ".trc")
 """Suffixes of marker files."""
+_MAX_OFFSET_S: Final = 2.0
+"""Maximum clock offset of the search, either way [s]."""
+_STEP_S: Final = 0.2
+"""Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
+_MATCH_GATE_M: Final = 1.0
+"""Maximum mean joint distance of matched persons after alignment [m], as in the evaluation."""
 People = Mapping[str, Mapping[str, tuple[str, ...]]]
 """Markers by person and joint; their mean is the joint."""
 
@@ -186,17 +190,6 @@ def _wrong(where: object, expected: str, found: str) -> InputError:
     )
 
 
-class ReferenceSettings(Record):
-    """Search range and gate of the alignment."""
-
-    max_offset_s: float = Field(default=2.0, gt=0)
-    """Maximum clock offset of the search, either way [s]."""
-    step_s: float = Field(default=0.2, gt=0)
-    """Step of the initial grid over clock offsets [s]: a walk of 30 cm, within the gate."""
-    match_gate_m: float = Field(default=1.0, gt=0)
-    """Maximum mean joint distance of matched persons after alignment [m], as in the evaluation."""
-
-
 @dataclass(frozen=True, eq=False)
 class ReferenceAlignment:
     """Clock offset and motion that align a reference to a prediction."""
@@ -214,7 +207,6 @@ def align_reference(
     joints: Floats,
     rate: float,
     fps: float,
-    settings: ReferenceSettings | None = None,
 ) -> tuple[JointTracks, ReferenceAlignment]:
     """Return the reference in the prediction's frames and world, and its alignment.
 
@@ -227,25 +219,22 @@ def align_reference(
         joints: (samples, persons, 17, 3) [m] in the reference's world; NaN where missing.
         rate: samples per second [1/s].
         fps: match frames per second [1/s].
-        settings: the defaults if None.
 
     Raises:
         DegenerateError: prediction and reference match at no offset.
     """
-    settings = settings or ReferenceSettings()
     times = prediction.frames / fps
-    count = int(np.ceil(settings.max_offset_s / settings.step_s))
-    grid = np.arange(-count, count + 1) * settings.step_s
+    count = int(np.ceil(_MAX_OFFSET_S / _STEP_S))
+    grid = np.arange(-count, count + 1) * _STEP_S
     tried = [
-        (_match_cost(prediction.joints, sample_joints(joints, rate, times + o), settings), o)
-        for o in grid
+        (_match_cost(prediction.joints, sample_joints(joints, rate, times + o)), o) for o in grid
     ]
     best, offset = min(tried, key=lambda pair: pair[0][0])
     _, match = best
     if match is None:
         raise DegenerateError(
             "the reference matches the prediction nowhere within "
-            f"{settings.max_offset_s:g} s of difference between their clocks"
+            f"{_MAX_OFFSET_S:g} s of difference between their clocks"
         )
 
     def error(shift: float) -> float:
@@ -254,7 +243,7 @@ def align_reference(
     # Tenths of a millisecond: a millimetre of a runner's path.
     found = minimize_scalar(
         error,
-        bounds=(offset - settings.step_s, offset + settings.step_s),
+        bounds=(offset - _STEP_S, offset + _STEP_S),
         method="bounded",
         options={"xatol": 1e-4},
     )
@@ -287,25 +276,21 @@ def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:
     return np.where(inside[:, None, None, None], between, np.nan)
 
 
-def _match_cost(
-    people: Floats, reference: Floats, settings: ReferenceSettings
-) -> tuple[float, NDArray[np.int64] | None]:
+def _match_cost(people: Floats, reference: Floats) -> tuple[float, NDArray[np.int64] | None]:
     """Return the sum of joint distances, clipped at the gate, and the match after registration."""
-    motion = register_world(reference, people, settings.match_gate_m)
+    motion = register_world(reference, people, _MATCH_GATE_M)
     if motion is None:
         return np.inf, None
     moved = motion.apply(reference.reshape(len(reference), -1, 3)).reshape(reference.shape)
     distances = joint_distances(people, moved)
-    match = match_people(distances, settings.match_gate_m)
+    match = match_people(distances, _MATCH_GATE_M)
     there = int(np.isfinite(reference[..., 0]).any(-1).sum())
     if not (match >= 0).any():
         return np.inf, None
     chosen = np.take_along_axis(distances, np.maximum(match, 0)[..., None], axis=2)[..., 0]
-    total = np.where(match >= 0, chosen, 0.0).sum() + settings.match_gate_m * (
-        there - (match >= 0).sum()
-    )
+    total = np.where(match >= 0, chosen, 0.0).sum() + _MATCH_GATE_M * (there - (match >= 0).sum())
     # Missing people cost the gate, so that a short overlap that fits by chance does not win.
-    missing = settings.match_gate_m * (len(reference) * reference.shape[1] - there)
+    missing = _MATCH_GATE_M * (len(reference) * reference.shape[1] - there)
     return float(total + missing), match
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from data_contracts.evaluation import Evaluation
 from data_contracts.records import Record
 from worldpose.evaluation.matching import (
+    EvaluationSettings,
     identity_scores,
     joint_distances,
     match_people,
@@ -18,7 +19,6 @@ from worldpose.evaluation.matching import (
     select_frames,
     take_matched,
 )
-from worldpose.evaluation.settings import EvaluationSettings
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.geometry.rigid import align

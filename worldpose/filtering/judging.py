@@ -128,7 +128,6 @@ def measure_held_out(
     used: KeypointDetections,
     detected: AnyFloats,
     settings: TriangulationSettings,
-    camera_covariance: Floats | None = None,
 ) -> HeldOut | None:
     """Return the prediction error in held-out cameras; None without data.
 
@@ -143,7 +142,6 @@ def measure_held_out(
         used: detections for triangulation; NaN where rejected.
         detected: (frames, cameras, detections, 17, 2) [px], all keypoints; NaN where not found.
         settings: settings of triangulation.
-        camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
     """
     count = cameras.batch_shape[0]
     if count - max(1, count // FOLDS) < settings.min_views:
@@ -153,7 +151,7 @@ def measure_held_out(
     for left_out in range(min(FOLDS, count)):
         index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
         others = replace(used, detection_index=index.astype(np.int16))
-        placed = triangulate_joints(cameras, others, settings, camera_covariance)
+        placed = triangulate_joints(cameras, others, settings)
         for camera in np.flatnonzero(fold == left_out):
             seen = np.asarray(detected[:, camera], dtype=np.float64)
             away = _distances(cameras[int(camera)], seen, placed.joints)

@@ -222,9 +222,7 @@ def _read_pickle(file: Path) -> dict[str, Any]:
     """Return the entries of an OpenCap pickle as numbers and lists, width before height."""
     from worldpose.pickles import plain, read_notes  # late: it imports scipy
 
-    size = require_file(file)
-    if size > SETTINGS_BYTES:
-        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{size} bytes")
+    require_file(file, SETTINGS_BYTES)
     try:
         content = plain(read_notes(file))
     except (OSError, ValueError) as error:
@@ -349,9 +347,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
     cameras = []
     for file in files:
         where = str(file)
-        size = require_file(file)
-        if size > SETTINGS_BYTES:
-            raise calibration_error(where, f"at most {SETTINGS_BYTES} bytes", f"{size} bytes")
+        require_file(file, SETTINGS_BYTES)
         try:
             numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
         except (OSError, ValueError) as error:

@@ -42,9 +42,7 @@ def read_calibration_xml(path: Path) -> dict[str, CameraCalibration]:
             finite number, no rotation, a lens that OpenCV's model does not describe, no camera, or
             two cameras of one name; the error names file, camera and attribute.
     """
-    size = require_file(path)
-    if size > 16 * SETTINGS_BYTES:
-        raise calibration_error(str(path), f"at most {16 * SETTINGS_BYTES} bytes", f"{size} bytes")
+    require_file(path, 16 * SETTINGS_BYTES)
     try:
         root = ET.fromstring(path.read_bytes(), ET.XMLParser(target=_PlainTree()))
     except (ET.ParseError, ValueError, LookupError, OSError) as error:

@@ -266,7 +266,7 @@ def read_boxes(file: Path, size: tuple[int, int], frames: int) -> GivenBoxes:
 
 def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
     """Return the number and text of each line that is not empty, and its numbers."""
-    size = require_file(file)
+    require_file(file, BOX_BYTES)
 
     def wrong(where: str, expected: str, found: str) -> InputError:
         return InputError(
@@ -276,8 +276,6 @@ def _read_rows(file: Path) -> tuple[list[tuple[int, str]], NDArray[np.float64]]:
             todo="Write lines of MOTChallenge: frame,id,left,top,width,height,confidence.",
         )
 
-    if size > BOX_BYTES:
-        raise wrong(str(file), f"at most {BOX_BYTES} bytes", f"{size}")
     try:
         text = file.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:

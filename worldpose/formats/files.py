@@ -35,12 +35,13 @@ def whole_file(path: Path) -> Iterator[Path]:
         # In a subfolder: a temporary folder is private, but the file gets the usual permissions.
         draft = Path(workshop) / path.name
         yield draft
-        _sync(draft)
+        sync_path(draft)
         draft.replace(path)
-    _sync(path.parent)
+    sync_path(path.parent)
 
 
-def _sync(path: Path) -> None:
+def sync_path(path: Path) -> None:
+    """Sync a file, or the entries of a folder, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -108,11 +109,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     return tables
 
 
-def require_file(path: Path) -> int:
-    """Return the size of a regular file [byte].
+def require_file(path: Path, limit: int | None = None) -> int:
+    """Return the size of a regular file of at most `limit` bytes, if there is a limit [byte].
 
     Raises:
-        InputError: there is no such file, it is not a regular file, or it is unreachable.
+        InputError: there is no such file, it is not a regular file, it is unreachable, or it is
+            too large.
     """
     try:
         if not path.is_file():
@@ -122,7 +124,7 @@ def require_file(path: Path) -> int:
                 found="something else" if path.exists() else "nothing",
                 todo="Put the file there, or correct the name.",
             )
-        return path.stat().st_size
+        size = path.stat().st_size
     except (OSError, ValueError) as error:
         raise InputError(
             str(path),
@@ -130,17 +132,18 @@ def require_file(path: Path) -> int:
             found=str(error),
             todo="Check its name and rights.",
         ) from error
-
-
-def _read_text(path: Path, limit: int) -> str:
-    size = require_file(path)
-    if size > limit:
+    if limit is not None and size > limit:
         raise InputError(
             str(path),
             expected=f"at most {limit} bytes",
             found=f"{size} bytes",
-            todo="Check that it is the file that is meant.",
+            todo="Check that the path names the file that you mean.",
         )
+    return size
+
+
+def _read_text(path: Path, limit: int) -> str:
+    require_file(path, limit)
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
@@ -234,14 +237,7 @@ class JsonItems:
         Raises:
             InputError: no such file, or too large.
         """
-        size = require_file(path)
-        if size > limit:
-            raise InputError(
-                str(path),
-                expected=f"at most {limit} bytes",
-                found=f"{size} bytes",
-                todo="Check that it is the file that is meant.",
-            )
+        require_file(path, limit)
         self.path, self.key = path, key
         self.is_mapping = False
         self.has_list = False

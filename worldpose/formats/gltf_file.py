@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Floats, Integers
 from worldpose.body import SKELETONS, BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
@@ -138,7 +138,7 @@ def write_gltf(
     Raises:
         InputError: no person has a body.
     """
-    present = [person for person in people if body_frames(person.poses).any()]
+    present = [person for person in people if person.poses.known.any()]
     if not present:
         raise InputError(
             str(path),
@@ -235,7 +235,7 @@ class _Writer:
 
     def add_person(self, person: AnimatedBody, number: int) -> int:
         """Add a person's joints, motion and surface; return the node."""
-        there = body_frames(person.poses)
+        there = person.poses.known
         rows = np.flatnonzero(there)
         poses = person.poses[rows]
         betas = poses.betas[0]
@@ -271,7 +271,7 @@ class _Writer:
 
     def _add_surface(self, person: AnimatedBody, number: int, rest: Floats, first: int) -> None:
         """Add a surface to the nodes without a parent: its joints alone place it."""
-        betas = person.poses.betas[np.flatnonzero(body_frames(person.poses))[0]]
+        betas = person.poses.betas[np.flatnonzero(person.poses.known)[0]]
         surface = (self.model.template + self.model.shape_directions @ betas).astype(np.float32)
         colour = colorsys.hsv_to_rgb(number * 0.618 % 1.0, 0.45, 0.85)
         material = {
@@ -416,13 +416,6 @@ def paint_strips(markings: Sequence[Floats]) -> tuple[Floats, Integers]:
         ]
         first += 2 * len(line)
     return np.concatenate(vertices), np.concatenate(triangles)
-
-
-def body_frames(poses: BodyParameters) -> Flags:
-    """Return the frames (frames,) that have a body."""
-    parts = (poses.betas, poses.global_orient, poses.body_pose, poses.transl)
-    there: Flags = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
-    return there
 
 
 def _quantize_rotations(rotations: Floats, parents: NDArray[np.int64]) -> NDArray[np.int16]:

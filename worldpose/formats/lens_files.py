@@ -42,7 +42,7 @@ DISTORTION_NAMES: Final = (
 )
 ARRAY_BYTES: Final = 1 << 26
 """Largest size of an npz file's arrays [byte]: calibrations may keep the corners of all boards."""
-SQUARE: Final = 0.02
+MAX_ASPECT_ERROR: Final = 0.02
 """Largest difference of fx and fy of square pixels [1]; their mean is used."""
 
 
@@ -137,9 +137,7 @@ def write_lens_toml(path: Path, lenses: Mapping[str, LensCalibration]) -> None:
 def _read_file(file: Path) -> dict[str, Any]:
     """Return the arrays and numbers of a file by name."""
     suffix = file.suffix.lower()
-    bytes_there = require_file(file)
-    if bytes_there > SETTINGS_BYTES:
-        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{bytes_there}")
+    require_file(file, SETTINGS_BYTES)
     try:
         if suffix == ".npy":
             array = np.load(file, allow_pickle=False)
@@ -164,9 +162,7 @@ def read_file_storage(file: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is too large, or not of that kind, or has none of these.
     """
-    size = require_file(file)
-    if size > SETTINGS_BYTES:
-        raise calibration_error(str(file), f"at most {SETTINGS_BYTES} bytes", f"{size}")
+    require_file(file, SETTINGS_BYTES)
     import cv2  # late: it takes 0.2 s, and few commands read such a file
 
     try:
@@ -225,7 +221,7 @@ def _lens(
     optics = read_optics(where, table)
     require_optics(where, optics.size, optics.focal, optics.principal_point)
     fx, fy = optics.focal.tolist()
-    if abs(fx - fy) > SQUARE * fx:
+    if abs(fx - fy) > MAX_ASPECT_ERROR * fx:
         raise calibration_error(
             f"{where}.matrix", "fx and fy of square pixels, within 2 %", f"{fx:g} and {fy:g}"
         )

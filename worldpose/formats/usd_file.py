@@ -13,7 +13,7 @@ from data_contracts.arrays import Floats
 from worldpose.body import SKELETONS, BodyModel
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.files import whole_file
-from worldpose.formats.gltf_file import FACING, INFLUENCES, AnimatedBody, body_frames
+from worldpose.formats.gltf_file import FACING, INFLUENCES, AnimatedBody
 from worldpose.geometry import Camera
 
 APERTURE_MM: Final = 36.0
@@ -52,7 +52,7 @@ def write_usd(
         InputError: no person has a body.
         UsageError: the library is not installed.
     """
-    present = [person for person in people if body_frames(person.poses).any()]
+    present = [person for person in people if person.poses.known.any()]
     if not present:
         raise InputError(
             str(path),
@@ -113,7 +113,7 @@ class _Writer:
     def add_person(self, person: AnimatedBody, number: int, *, surface: bool) -> None:
         """Add a person's skeleton, motion and surface."""
         model = self.model
-        there = body_frames(person.poses)
+        there = person.poses.known
         rows = np.flatnonzero(there)
         poses = person.poses[rows]
         betas = poses.betas[0]

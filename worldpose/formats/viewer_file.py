@@ -136,7 +136,7 @@ class ViewerClip:
         """Columns of people with a body in at least one frame."""
         if self.bodies is None:
             return np.zeros(0, dtype=np.int64)
-        return np.flatnonzero(_has_body(self.bodies).any(axis=0))
+        return np.flatnonzero(self.bodies.known.any(axis=0))
 
 
 def encode_scene(clip: ViewerClip) -> bytes:
@@ -193,7 +193,7 @@ def encode_frames(clip: ViewerClip, first: int, count: int) -> bytes:
     columns = clip.with_body
     if clip.bodies is not None and clip.model is not None and len(columns):
         poses = clip.bodies[here, columns]
-        there = _has_body(poses)
+        there = poses.known
         turned, units = _quantize_rotations(clip.model, poses, there)
         arrays["turns"], arrays["turn_units"] = turned, units
         arrays["place"] = np.where(there[..., None], poses.transl, np.nan).astype("<f4")
@@ -339,13 +339,6 @@ def _pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> byte
     return struct.pack("<I", len(text)) + text + b"".join(blobs)
 
 
-def _has_body(bodies: BodyParameters) -> Flags:
-    """Return where a body is known (frames, people)."""
-    parts = (bodies.betas, bodies.global_orient, bodies.body_pose, bodies.transl)
-    known: Flags = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
-    return known
-
-
 def _quantize_rotations(
     model: BodyModel, poses: BodyParameters, there: Flags
 ) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
@@ -404,7 +397,7 @@ def _rest_arrays(clip: ViewerClip) -> Arrays:
     assert model is not None  # there are bodies
     assert bodies is not None
     columns = clip.with_body
-    rows = _has_body(bodies)[:, columns].argmax(axis=0)  # the shape is one per person and clip
+    rows = bodies.known[:, columns].argmax(axis=0)  # the shape is one per person and clip
     betas = bodies.betas[rows, columns]
     rest = model.joint_template + np.einsum("jcs,ps->pjc", model.joint_directions, betas)
     arrays: Arrays = {"rest_joints": rest.astype("<f4"), "parents": model.parents.astype("<i2")}

@@ -1,8 +1,8 @@
-"""Readers and writers of clicked markings, validated against the match's pitch."""
+"""Readers of clicked markings, validated against the match's pitch."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
@@ -107,14 +107,6 @@ def read_key_frames(folder: Path, spec: MatchSpec, pitch: PitchSpec | None) -> d
     return {name: picked[name] for name in clips if name in picked}
 
 
-def write_key_frames(folder: Path, key_frames: Mapping[str, KeyFrames]) -> None:
-    """Write each clip's file into a match folder."""
-    for clip_id, picked in key_frames.items():
-        file = folder / key_frames_file(clip_id)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(picked.model_dump_json(indent=2) + "\n", encoding="utf-8")
-
-
 def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> Iterator[Path]:
     """Yield the files of a folder of the match, sorted; raise InputError for an unknown name."""
     for name in sorted(path.name for path in (folder / place).glob("[!.]*")):
@@ -165,14 +157,6 @@ def _require_markings(
     for place, _, along in drawn:
         for number, pixel in enumerate(along):
             _require_inside(f"{file}: {place}.xy[{number}]", pixel, camera)
-
-
-def write_clicked_markings(folder: Path, clicked: Mapping[str, ClickedMarkings]) -> None:
-    """Write each camera's file into a match folder."""
-    for camera_id, markings in clicked.items():
-        file = folder / clicked_file(camera_id)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(markings.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
 def _require_known(

@@ -29,9 +29,9 @@ from worldpose.pitch.template import law_points
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""
-SNAP: Final = 0.1
+SNAP_M: Final = 0.1
 """A place closer to a known point than this is that point [m]: labels are rounded."""
-AGAIN: Final = ".again"
+REPEATED_SUFFIX: Final = ".again"
 """Suffix of the second click with one label."""
 
 
@@ -219,9 +219,9 @@ class _Labels:
             seen[name] += 1
             where = (float(pixel[0]), float(pixel[1]))
             if seen[name] > 1:
-                place, names = self._place(name), (name, name + AGAIN)
+                place, names = self._place(name), (name, name + REPEATED_SUFFIX)
                 if seen[name] > 2:
-                    names = (name, f"{name}{AGAIN}{seen[name]}")
+                    names = (name, f"{name}{REPEATED_SUFFIX}{seen[name]}")
                 self._report.repeated.append(
                     RepeatedClick(owner, image.name, label, names, (first[name], where))
                 )
@@ -251,7 +251,7 @@ class _Labels:
         if abs(x) > 0.5 * self._pitch.length + 30.0 or abs(y) > 0.5 * self._pitch.width + 30.0:
             raise self._unknown(image, label, self._template.points)
         for name, place in self._known.items():
-            if np.hypot(*(place - [x, y])) < SNAP:
+            if np.hypot(*(place - [x, y])) < SNAP_M:
                 return name
         name = f"at_{x:.2f}_{y:.2f}"
         height = float(self._template.height(np.array(x), np.array(y)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from data_contracts.cameras import CameraCalibration, LensCalibration
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
 from worldpose.formats.calibration_forms import (
@@ -21,7 +22,7 @@ from worldpose.formats.calibration_forms import (
     find_calibration,
     read_calibration,
 )
-from worldpose.formats.detection_files import read_openpose_folder
+from worldpose.formats.detection_files import OpenPoseFolder, read_openpose_folder
 from worldpose.formats.files import read_toml, whole_file
 from worldpose.formats.keypoint_files import on_frames, read_observations, seen_frames
 from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens_toml
@@ -32,7 +33,7 @@ from worldpose.video import FrameIndex, VideoReader, index_frames
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
-BLACK: Final = 16.0
+MAX_BLACK: Final = 16.0
 """Largest mean brightness of a black bar [1, of 255]: the black of limited-range video."""
 
 
@@ -67,12 +68,7 @@ def import_match(
     cameras = read_calibration(calibration)
     files = files_by_camera(detections, list(cameras), calibration, (".json", ".npz"))
     people = {name: read_observations(file) for name, file in files.items()}
-    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
-    if not seen:
-        raise InputError(
-            str(detections), expected="people", found="none in any file", todo="Check the detector."
-        )
-    first, last = min(frame for frame, _ in seen), max(frame for _, frame in seen)
+    first, stop = _find_people(detections, people)
     content = {
         "match_id": match_id if match_id is not None else name_of(out),
         "fps": fps,
@@ -80,12 +76,12 @@ def import_match(
             {"id": name, "width": camera.image_size[0], "height": camera.image_size[1]}
             for name, camera in cameras.items()
         ],
-        "clips": [{"id": "clip", "first_frame": first, "frame_count": last - first + 1}],
+        "clips": [{"id": "clip", "first_frame": first, "frame_count": stop - first}],
         "pitch": pitch,
     }
     spec = validate_record(MatchSpec, content, str(out / "match.yaml"))
     for name, file in files.items():
-        people[name] = on_frames(file, people[name], [(first, last - first + 1)])
+        people[name] = on_frames(file, people[name], [(first, stop - first)])
     write_match(out, spec, calibrations=cameras, observations=people)
     return spec
 
@@ -336,8 +332,8 @@ def _has_black_bars(frame: Image, bar: NDArray[np.float64]) -> bool:
     lines = frame.mean(axis=(axis, 2)).astype(np.float64)
     black = np.concatenate([lines[:width], lines[len(lines) - width :]])
     # The line next to a bar with a fraction is a mixture.
-    beside = [lines[width + 2], lines[-width - 3]]
-    return width > 0 and bool(black.max() < BLACK and min(beside) > BLACK)
+    next_lines = [lines[width + 2], lines[-width - 3]]
+    return width > 0 and bool(black.max() < MAX_BLACK and min(next_lines) > MAX_BLACK)
 
 
 def import_pose2sim(
@@ -347,13 +343,12 @@ def import_pose2sim(
 
     The calibration is the one in `calibration/`, of the trial or of the folder above it, as in
     Pose2Sim's batches, in any form that `read_calibration` reads; without it each video is a
-    camera. 2D poses
-    are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each camera; without them
-    people are detected in the videos of `videos/`. Poses and videos belong to the cameras of their
-    names, or, as in Pose2Sim, in alphabetical order to the cameras in the calibration's order.
-    `frame_rate` and `frame_range` of Config.toml hold. Where a video is smaller or larger than the
-    calibrated images, with or without black bars, its camera is in the video's pixels, as the 2D
-    poses are.
+    camera. 2D poses are in `pose-sync/`, or else `pose/`, in a folder `<camera>_json` for each
+    camera; without them people are detected in the videos of `videos/`. Poses and videos belong to
+    the cameras of their names, or, as in Pose2Sim, in alphabetical order to the cameras in the
+    calibration's order. `frame_rate` and `frame_range` of Config.toml hold. Where a video is
+    smaller or larger than the calibrated images, with or without black bars, its camera is in the
+    video's pixels, as the 2D poses are.
 
     Args:
         project: folder of a trial.
@@ -407,25 +402,11 @@ def import_pose2sim(
     sizes = {name: index.size for name, index in indices.items()}
     sizes |= {name: camera.image_size for name, camera in cameras.items()}
     rate = fps if fps is not None else settings.get("frame_rate")
-    if rate is None and not indices:
-        raise InputError(
-            f"{config}: project.frame_rate",
-            expected="frames per second, as there are no videos to take them from",
-            found="'auto'",
-            todo="Write for example frame_rate = 60, or give --fps.",
-        )
-    if rate is None:
-        rate = round(next(iter(indices.values())).fps, 3)
+    rate = _measure_rate(config, list(indices.values())) if rate is None else rate
     counts = [len(index.on_clock(rate, str(videos[name]))) for name, index in indices.items()]
     read = {name: read_openpose_folder(place) for name, place in poses.items()}
     people = {name: found.people for name, found in read.items()}
-    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
-    if people and not seen:
-        raise InputError(
-            str(folder), expected="people", found="none in any frame", todo="Check the estimator."
-        )
-    first = min((a for a, _ in seen), default=0)
-    stop = max((b + 1 for _, b in seen), default=min(counts, default=0))
+    first, stop = _find_people(folder, people) if people else (0, min(counts, default=0))
     first, stop = settings.get("frame_range", (first, stop))
     content = {
         "match_id": match_id if match_id is not None else name_of(out),
@@ -449,19 +430,45 @@ def import_pose2sim(
             shutil.copyfile(file, building / "videos" / file.name)
 
     write_match(out, spec, calibrations=cameras, observations=people, further=copy)
+    return spec, notes + _describe_poses(folder, read)
+
+
+def _find_people(folder: Path, people: Mapping[str, KeypointDetections]) -> tuple[int, int]:
+    """Return the first frame with a person in any camera, and the one after the last."""
+    seen = [frames for frames in map(seen_frames, people.values()) if frames is not None]
+    if not seen:
+        raise InputError(
+            str(folder), expected="people", found="none in any frame", todo="Check the detector."
+        )
+    return min(first for first, _ in seen), max(last + 1 for _, last in seen)
+
+
+def _describe_poses(folder: Path, read: Mapping[str, OpenPoseFolder]) -> list[str]:
+    """Return sentences about the 2D poses of cameras and what of them is kept."""
+    if not read:
+        return [
+            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
+            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
+        ]
     kinds = {found.kind: found.people.points for found in read.values() if found.kind}
-    notes += [
+    return [
         f"2D poses: {folder}, {kind}; kept are the 17 keypoints of COCO"
         + (" and heels and toes" if points else "")
         + ("" if kind == "COCO-17" else "; those of hands, face and trunk are left out")
         for kind, points in sorted(kinds.items())
     ]
-    if not poses:
-        notes.append(
-            f"no 2D poses in {folder}: the run detects people in the videos; the bundled detector "
-            "is for people of 28 to 160 px, others need --set detection.detector=onnx:FILE"
+
+
+def _measure_rate(config: Path, indices: Sequence[FrameIndex]) -> float:
+    """Return the frame rate of the first video [1/s]; raise InputError without videos."""
+    if not indices:
+        raise InputError(
+            f"{config}: project.frame_rate",
+            expected="frames per second, as there are no videos to take them from",
+            found="'auto'",
+            todo="Write for example frame_rate = 60, or give --fps.",
         )
-    return spec, notes
+    return round(indices[0].fps, 3)
 
 
 def _read_pose2sim_settings(project: Path) -> tuple[dict[str, Any], Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -23,9 +22,9 @@ from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
-from worldpose.formats.files import FULL, whole_file
+from worldpose.formats.files import FULL, sync_path, whole_file
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.ingest.annotations import write_clicked_markings, write_key_frames
+from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
@@ -97,14 +96,20 @@ def write_match(
                 read_keypoint_arrays(file)
             if pitch is not None:
                 _write_pitch(building, spec, pitch)
-            write_clicked_markings(building, clicked)
-            write_key_frames(building, key_frames)
+            records: dict[str, ClickedMarkings | KeyFrames] = {
+                **{clicked_file(name): each for name, each in clicked.items()},
+                **{key_frames_file(name): each for name, each in key_frames.items()},
+            }
+            for name, record in records.items():
+                (building / name).parent.mkdir(parents=True, exist_ok=True)
+                (building / name).write_text(record.model_dump_json(indent=2) + "\n", "utf-8")
             for camera_id, picture in stills.items():
                 write_still(building / _still_name(spec, camera_id), picture)
             if further is not None:
                 further(building)
             read_match(building)
-            _sync(building)
+            for path in (building, *building.rglob("*")):
+                sync_path(path)
             try:
                 building.rename(folder)  # replaces an empty folder, fails on any other
             except OSError:
@@ -119,7 +124,7 @@ def write_match(
             found=error.strerror or str(error),
             todo="Free some, or choose another place; nothing was written.",
         ) from error
-    _sync_folder(folder.parent)
+    sync_path(folder.parent)
 
 
 def _require_known(spec: MatchSpec, names: list[str]) -> None:
@@ -187,23 +192,6 @@ def _write_pitch(folder: Path, spec: MatchSpec, pitch: PitchSpec) -> None:
     path = folder / (spec.pitch or "pitch.json")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(pitch.model_dump_json(indent=2) + "\n", encoding="utf-8")
-
-
-def _sync(folder: Path) -> None:
-    """Sync every file and folder of the tree to disk."""
-    for parent, _, names in os.walk(folder):
-        for name in names:
-            with (Path(parent) / name).open("rb") as file:
-                os.fsync(file.fileno())
-        _sync_folder(Path(parent))
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def write_offsets(folder: Path, offsets: Mapping[str, int]) -> None:

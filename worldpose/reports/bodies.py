@@ -120,8 +120,8 @@ def _rim(owner: NDArray[np.int16]) -> NDArray[np.bool_]:
     """Return the mask (height, width) of body pixels next to background or another body."""
     around = np.pad(owner, 1, mode="edge")
     inner = around[1:-1, 1:-1]
-    beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
-    differs = np.any([inner != other for other in beside], axis=0)
+    neighbours = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
+    differs = np.any([inner != other for other in neighbours], axis=0)
     return np.asarray(differs & (inner != NOBODY))
 
 
@@ -152,7 +152,7 @@ def _unit(vectors: Singles) -> Singles:
 
 WIDTH: Final = 1540
 """Width of the image [px]."""
-SHARE: Final = 0.3
+IMAGE_SHARE: Final = 0.3
 """Share of the camera's image to show: players of 80 px are then 210 px tall."""
 _GROUND: Final = (206, 217, 202)
 _PALE: Final = 0.35
@@ -215,7 +215,7 @@ def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
         bodies: (persons, points, 3) [m], world.
     """
     size = np.asarray(camera.image_size, dtype=np.float64)
-    side = SHARE * size
+    side = IMAGE_SHARE * size
     middles = camera.project(bodies.mean(axis=1))
     inside: NDArray[np.bool_] = np.all((middles >= 0.0) & (middles < size), axis=-1)
     if not inside.any():

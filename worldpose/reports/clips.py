@@ -115,7 +115,7 @@ def _frame(
     return middle - half, middle + half
 
 
-REACH: Final = 130.0
+VIEW_LENGTH_M: Final = 130.0
 """Length of a drawn field of view [m]: a little more than a pitch's length."""
 
 
@@ -161,11 +161,10 @@ def plot_stadium(
     cameras: Mapping[str, Camera],
     title: str,
     tracks: JointTracks,
-    frame: int,
     *,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of the stadium from above in one frame: cameras, fields of view, people.
+    """Return a PNG of the stadium from above in the first frame: cameras, fields of view, people.
 
     Shading shows the ground in each camera's field of view, on and near the pitch if there is one:
     the more cameras see a place, the darker it is.
@@ -174,10 +173,9 @@ def plot_stadium(
         cameras: single cameras by id.
         title: names the frame.
         tracks: people, one colour each, with their ids.
-        frame: index in `tracks` of the frame to draw.
         pitch: draw its markings; None without a pitch.
     """
-    hips = tracks.joints[frame][:, HIPS, :2].mean(axis=1)
+    hips = tracks.joints[0][:, HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
         places.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
@@ -231,7 +229,7 @@ def plot_stadium(
 
 
 def visible_ground(camera: Camera) -> NDArray[np.float64]:
-    """Return corners (n, 2) [m] of the ground in a camera's field of view, up to `REACH` away.
+    """Return corners (n, 2) [m] of the ground in a camera's field of view, to `VIEW_LENGTH_M`.
 
     The ground is the plane z = 0, world.
     """
@@ -246,7 +244,9 @@ def visible_ground(camera: Camera) -> NDArray[np.float64]:
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -camera.center[2] / directions[:, 2] * flat
         # Rays that go up never meet the ground: clip them to the drawn length.
-        distance = np.where((directions[:, 2] < 0.0) & (distance < REACH), distance, REACH)
+        distance = np.where(
+            (directions[:, 2] < 0.0) & (distance < VIEW_LENGTH_M), distance, VIEW_LENGTH_M
+        )
         return np.asarray(camera.center[:2] + directions[:, :2] / flat[:, None] * distance[:, None])
 
 

@@ -145,13 +145,13 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
 
 CONTRAST: Final = 18
 """Minimum brightness of paint above both sides [levels of 255]."""
-WIDEST: Final = 15
+MAX_WIDTH_PX: Final = 15
 """Maximum width of lines [px]."""
-LONGEST: Final = 300.0
+MAX_DISTANCE_PX: Final = 300.0
 """Distance from which the map is white [px]."""
-ON: Final = 1.5
+ON_PAINT_PX: Final = 1.5
 """Maximum distance to paint of a marking sample on paint [px]."""
-NEAR: Final = 12.0
+NEAR_PAINT_PX: Final = 12.0
 """Maximum distance of samples to paint [px]; beyond, they are occluded, or their paint is faint."""
 
 
@@ -164,14 +164,14 @@ def detect_paint(still: Image) -> NDArray[np.bool_]:
         still: (height, width, 3), RGB.
     """
     grey = cv2.GaussianBlur(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), (3, 3), 0)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST, WIDEST))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (MAX_WIDTH_PX, MAX_WIDTH_PX))
     bright = np.asarray(cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, disc)) > CONTRAST
     # Paint is colourless; shirts and boards mostly are not.
     spread = still.max(-1).astype(np.int16) - still.min(-1)
     found: NDArray[np.bool_] = bright & (spread < 70) & (grey > 90)
     # Remove specks.
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
-    long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * WIDEST
+    long = np.maximum(sizes[:, cv2.CC_STAT_WIDTH], sizes[:, cv2.CC_STAT_HEIGHT]) >= 2 * MAX_WIDTH_PX
     long[0] = False
     return np.asarray(long[labels])
 
@@ -202,7 +202,7 @@ def marking_distances(
         inside = ((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5)).all(-1)
     u, v = np.rint(pixels[inside]).astype(int).T
     found: NDArray[np.float64] = distance[v, u].astype(np.float64)
-    return np.asarray(found[found < NEAR])
+    return np.asarray(found[found < NEAR_PAINT_PX])
 
 
 def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
@@ -222,7 +222,7 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     left, right = figure.subplots(1, 2)
     left.imshow(np.where(paint, 255, 18).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
     # The square root makes distances of a few pixels visible.
-    right.imshow(np.sqrt(np.minimum(distance, LONGEST)), cmap="gray", vmin=0.0)
+    right.imshow(np.sqrt(np.minimum(distance, MAX_DISTANCE_PX)), cmap="gray", vmin=0.0)
     for line in markings(pitch):
         right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
     for axes, title in (
@@ -232,4 +232,4 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         style(axes)
         axes.set_title(title, color=INK, loc="left", fontsize=12)
-    return png(figure), float((off < ON).mean()) if len(off) else float("nan")
+    return png(figure), float((off < ON_PAINT_PX).mean()) if len(off) else float("nan")

@@ -19,7 +19,7 @@ from worldpose.formats.annotations.annotated_images import AnnotatedImage, Annot
 
 DetectionEdit: TypeAlias = AddedDetection | DeletedDetection | MovedKeypoint
 DETECTION_EDITS = (AddedDetection, DeletedDetection, MovedKeypoint)
-SAME: Final = 0.01
+TOLERANCE_PX: Final = 0.01
 """Maximum difference of equal keypoints [px]: the store has single precision, and pages show
 rounded values."""
 
@@ -94,7 +94,7 @@ def find_objection(found: KeypointDetections, edit: DetectionEdit) -> str | None
     now = found.keypoints[row, edit.detection, COCO17.index(edit.joint)].astype(np.float64)
     if np.isnan(now).any():
         return f"{edit.joint} of {place} is not seen" if edit.was or edit.xy is None else None
-    if edit.was is None or np.abs(now - edit.was).max() > SAME:
+    if edit.was is None or np.abs(now - edit.was).max() > TOLERANCE_PX:
         was, seen = edit.was or "not seen", [round(float(value), 2) for value in now]
         return f"{edit.joint} of {place} was {was} when it was corrected, and is {seen} now"
     return None
@@ -188,7 +188,7 @@ def find_changes(
                 continue
             now = there[detection]
             edits += _list_moved(at, person.keypoints, now.keypoints)
-            boxes += bool(np.abs(now.box - person.box).max() > SAME)
+            boxes += bool(np.abs(now.box - person.box).max() > TOLERANCE_PX)
         for person in picture.people:
             if person.detection is None:
                 edits.append(_describe_added(camera, int(number), free, person))
@@ -206,7 +206,7 @@ def _list_moved(at: dict[str, object], before: Floats, now: Floats) -> list[Move
     edits = []
     for joint, was, xy in zip(COCO17, before, now, strict=True):
         old, new = _pixel(was), _pixel(xy)
-        if old == new or (old and new and np.abs(was - xy).max() <= SAME):
+        if old == new or (old and new and np.abs(was - xy).max() <= TOLERANCE_PX):
             continue
         edits.append(MovedKeypoint.model_validate({**at, "joint": joint, "was": old, "xy": new}))
     return edits

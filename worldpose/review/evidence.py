@@ -137,14 +137,14 @@ def _medians(values: Floats) -> Floats:
     return found
 
 
-HEIGHTS: Final = (-0.3, 3.2)
+JOINT_HEIGHTS_M: Final = (-0.3, 3.2)
 """Range of joint heights above the ground [m]: the ground may be lower at its edges, and arms are
 raised in a jump."""
-DISTANCES: Final = (0.5, 300.0)
+CAMERA_DISTANCES_M: Final = (0.5, 300.0)
 """Range of distances between people and cameras [m]: across the largest stadium."""
-BEGIN: Final = 33
+INITIAL_SAMPLES: Final = 33
 """Initial samples along a ray."""
-APART: Final = 12.0
+MAX_SPACING_PX: Final = 12.0
 """Maximum spacing of a curve's points [px]: arc and chord differ by less than a hundredth of a
 pixel in a lens that bends a line by 10 px over 400."""
 HALVINGS: Final = 8
@@ -192,12 +192,12 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     def project_along(along: Floats) -> Floats:
         return target.project(origin + along[:, None] * direction)
 
-    along = np.linspace(span[0], span[1], BEGIN)
+    along = np.linspace(span[0], span[1], INITIAL_SAMPLES)
     places = project_along(along)
     for _ in range(HALVINGS):
         gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
         inside = _is_inside(places, target)
-        wide = np.flatnonzero((gap > APART) & (inside[1:] | inside[:-1]))
+        wide = np.flatnonzero((gap > MAX_SPACING_PX) & (inside[1:] | inside[:-1]))
         # One end may be behind the camera, or outside the valid range of its lens model.
         cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
         halved = np.union1d(wide, cut)
@@ -267,11 +267,11 @@ def _span(rays: Rays) -> tuple[float, float] | None:
     if not rays.valid[0]:
         return None
     height, slope = float(rays.origins[0, 2]), float(rays.directions[0, 2])
-    low, high = HEIGHTS
+    low, high = JOINT_HEIGHTS_M
     if abs(slope) < 1e-9:
-        return DISTANCES if low <= height <= high else None
+        return CAMERA_DISTANCES_M if low <= height <= high else None
     ends = sorted(((low - height) / slope, (high - height) / slope))
-    span = max(ends[0], DISTANCES[0]), min(ends[1], DISTANCES[1])
+    span = max(ends[0], CAMERA_DISTANCES_M[0]), min(ends[1], CAMERA_DISTANCES_M[1])
     return span if span[0] < span[1] else None
 
 
@@ -281,7 +281,7 @@ def _is_inside(places: Floats, camera: Camera) -> NDArray[np.bool_]:
     return np.asarray(inside.all(axis=1), dtype=np.bool_)
 
 
-SPACING = 0.5
+MARKING_SPACING_M = 0.5
 """Spacing of points along a drawn marking [m]: the chords of a curved marking are only a few pixels
 long."""
 MARGIN = 0.25
@@ -303,7 +303,7 @@ class PitchDrawing:
     def markings(self) -> dict[str, NDArray[np.float64]]:
         """Points (n, 3) [m], world, along every marking, by name."""
         names = self.template.marking_names
-        return {name: self.template.marking_points(name, SPACING) for name in names}
+        return {name: self.template.marking_points(name, MARKING_SPACING_M) for name in names}
 
     @cached_property
     def points(self) -> NDArray[np.float64]:

@@ -221,24 +221,16 @@ def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
     return None
 
 
-def find_sighting(
-    found: Identities, person: int, first: int | None = None, last: int | None = None
-) -> Sighting | None:
+def find_sighting(found: Identities, person: int, first: int = 0) -> Sighting | None:
     """Return a person's detection with the smallest ray distance, None without detections.
 
     Args:
         found: the identities.
         person: an id in them.
-        first: first match frame to look in; None = the clip's.
-        last: last match frame to look in; None = the clip's.
+        first: first match frame to search.
     """
     k = found.person.tolist().index(person)
-    inside = np.ones(len(found.frame), dtype=np.bool_)
-    if first is not None:
-        inside &= found.frame >= first
-    if last is not None:
-        inside &= found.frame <= last
-    seen = (found.detection_index[:, :, k] >= 0) & inside[:, None]
+    seen = (found.detection_index[:, :, k] >= 0) & (found.frame >= first)[:, None]
     if not seen.any():
         return None
     distance = np.where(seen, np.nan_to_num(found.ray_distance[:, :, k], nan=1e9), np.inf)

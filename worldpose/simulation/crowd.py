@@ -103,7 +103,7 @@ def take_corner(
     packs = center + half * rng.uniform([-0.5, -0.6], [0.3, 0.6], (PACKS, 2)) * [out, 1.0]
     homes = packs[rng.integers(PACKS, size=len(attackers))]
     homes = homes + 1.0 * rng.standard_normal(homes.shape)
-    feints = FEINT * _draw_steps(time, len(attackers), FEINT_TIME, rng)
+    feints = FEINT * _draw_steps(time, len(attackers), rng)
     balls = np.arange(FIRST_BALL, time[-1], BALL_EVERY)
     drops = goal + rng.uniform([3.5, -5.0], [8.0, 5.0], (len(balls), 2)) * [-out, 1.0]
     around = rng.standard_normal((len(balls), len(attackers), 2))
@@ -244,14 +244,12 @@ def _draw_jumps(
     return leaps
 
 
-def _draw_steps(
-    time: Floats, count: int, every: tuple[float, float], rng: np.random.Generator
-) -> Floats:
-    """Return standard normal steps (samples, count, 2), constant for a random time [s] each."""
+def _draw_steps(time: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Return standard normal steps (samples, count, 2), constant for a random feint time each."""
     steps = np.empty((len(time), count, 2))
     for person in range(count):
-        intervals = int((time[-1] - time[0]) / every[0]) + 2
-        ends = time[0] + np.cumsum(rng.uniform(every[0], every[1], intervals))
+        intervals = int((time[-1] - time[0]) / FEINT_TIME[0]) + 2
+        ends = time[0] + np.cumsum(rng.uniform(FEINT_TIME[0], FEINT_TIME[1], intervals))
         steps[:, person] = rng.standard_normal((len(ends) + 1, 2))[np.searchsorted(ends, time)]
     return steps
 

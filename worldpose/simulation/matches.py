@@ -147,10 +147,9 @@ def film_scene(
     seed: int,
     folder: Path,
     *,
-    clip_id: str,
-    stills: bool = False,
-    masks: bool = False,
-    advance: Advance | None = None,
+    stills: bool,
+    masks: bool,
+    advance: Advance | None,
 ) -> None:
     """Write the videos of all cameras into a match folder, frame by frame.
 
@@ -167,24 +166,23 @@ def film_scene(
         scenario: its look, and its frame rate.
         seed: seed of the stadium, kits and noise.
         folder: folder of the match.
-        clip_id: names the broadcast camera's files.
         stills: write stills, too.
         masks: write masks, too.
         advance: called with the camera or clip, its finished frames and its number of frames.
     """
     stage = _FilmSet(scene, scenario, seed)
-    names = [*scene.cameras, *([] if scene.broadcast is None else [clip_id])]
+    names = [*scene.cameras, *([] if scene.broadcast is None else [CLIP_ID])]
 
     def report_progress(name: str, frames: int, done: int) -> None:
         if advance is not None:
             advance(name, done, frames)
 
     def film(name: str) -> None:
-        frames = stage.broadcast() if name == clip_id else stage.static(name)
-        part = "broadcast" if name == clip_id else "videos"
+        frames = stage.broadcast() if name == CLIP_ID else stage.static(name)
+        part = "broadcast" if name == CLIP_ID else "videos"
         file = folder / part / f"{name}.mp4"
         file.parent.mkdir(exist_ok=True)
-        still = folder / "stills" / f"{name}.png" if stills and name != clip_id else None
+        still = folder / "stills" / f"{name}.png" if stills and name != CLIP_ID else None
         mask = folder / "reference" / "masks" / name if masks else None
         kept = _Labels(still, mask, partial(report_progress, name, len(stage.times) - 1))
         write_video(file, kept.collect_labels(frames), scenario.fps)
@@ -388,7 +386,6 @@ def simulate_match(
                 scenario,
                 seed,
                 folder,
-                clip_id=CLIP_ID,
                 stills=options.stills,
                 masks=options.masks,
                 advance=advance,

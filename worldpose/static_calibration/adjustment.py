@@ -74,10 +74,6 @@ class Problem:
             drawn_noise=self.drawn_noise[markings[self.evidence.drawn_marking]],
         )
 
-    def on_evidence(self, evidence: Evidence) -> Problem:
-        """Return the problem with the same clicks at other places of the world."""
-        return replace(self, evidence=evidence)
-
     def with_survey_error(
         self, row: NDArray[np.float64], settings: StaticCalibrationSettings
     ) -> Problem:
@@ -97,28 +93,26 @@ class Problem:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Fits:
-    """Fitted cameras, their costs and information matrices.
+class Fits(NamedTuple):
+    """Cameras, their costs and information matrices, written by the kernels.
 
     Attributes:
-        rows: (b, 22) cameras, see `worldpose.geometry.projection`.
+        rows: (b, 22) cameras, see `worldpose.geometry.projection`: starts, then fitted ones.
         cost: (b,) half the sum of squared, loss-weighted residuals and priors.
         information: (b, 12, 12) inverse covariance of a step from the evidence and the prior.
         evidence_information: (b, 12, 12) contribution of the evidence alone.
     """
 
-    rows: NDArray[np.float64]
-    cost: NDArray[np.float64]
-    information: NDArray[np.float64]
-    evidence_information: NDArray[np.float64]
+    rows: Floats
+    cost: Floats
+    information: Floats
+    evidence_information: Floats
 
 
 def build_problem(
     evidence: Evidence,
     image_size: tuple[int, int],
     settings: StaticCalibrationSettings,
-    distortion: str | None = None,
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
 ) -> Problem:
@@ -128,13 +122,12 @@ def build_problem(
         evidence: clicks and drawn markings.
         image_size: width, height [px].
         settings: noise, prior, free coefficients.
-        distortion: radial coefficients to solve for, if not those of the settings.
         where: file or camera, for messages.
         lens: replaces the prior of focal length, principal point and distortion.
     """
     width, height = image_size
     known = settings.prior
-    radial = {"none": 0, "k1": 1, "k1_k2": 2, "k1_k2_k3": 3}[distortion or settings.distortion]
+    radial = {"none": 0, "k1": 1, "k1_k2": 2, "k1_k2_k3": 3}[settings.distortion]
     free = np.ones(len(PARAMETERS), dtype=np.bool_)
     free[9 + radial :] = False
     middle = (0.5 * (width - 1), 0.5 * (height - 1))
@@ -184,11 +177,11 @@ def adjust(
     starts = rows.copy()
     if problem.lens is not None:
         starts[:, 6:8] = problem.lens.distortion[2:4]  # tangential terms, which no fit changes
-    found = Solutions(
+    found = Fits(
         rows=starts,
         cost=np.empty(count),
         information=np.empty((count, SIZE, SIZE)),
-        observed=np.empty((count, SIZE, SIZE)),
+        evidence_information=np.empty((count, SIZE, SIZE)),
     )
     given = Measurements(
         points_world=evidence.points_world,
@@ -206,7 +199,45 @@ def adjust(
         drawn_loss=float(problem.drawn_loss),
     )
     descend(given, iterations, found)
-    return Fits(found.rows, found.cost, found.information, found.observed)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of clicks and drawn pixels at a camera, and their derivatives by a step [px].
+
+    Attributes:
+        click: (n, 2) projected minus clicked.
+        by_click: (n, 2, 12).
+        drawn: (d,) distances to the projected marking.
+        by_drawn: (d, 12).
+    """
+
+    click: Floats
+    by_click: Floats
+    drawn: Floats
+    by_drawn: Floats
+
+
+def compute_residuals(problem: Problem, row: Floats) -> Residuals:
+    """Return all residuals at a camera (22,); derivatives by fixed parameters are zero."""
+    evidence = problem.evidence
+    n, d = len(evidence.points), len(evidence.drawn_image)
+    found = Residuals(np.empty((n, 2)), np.empty((n, 2, SIZE)), np.empty(d), np.empty((d, SIZE)))
+    point_residuals(row, evidence.points_world, evidence.points_image, found.click, found.by_click)
+    drawn_residuals(
+        row,
+        problem.half_diagonal,
+        evidence.samples_world,
+        evidence.bounds,
+        evidence.drawn_image,
+        evidence.drawn_marking,
+        found.drawn,
+        found.by_drawn,
+    )
+    return replace(
+        found, by_click=found.by_click * problem.free, by_drawn=found.by_drawn * problem.free
+    )
 
 
 def camera_row(camera: Camera) -> NDArray[np.float64]:
@@ -275,33 +306,17 @@ class Linearization(NamedTuple):
 
     Attributes:
         information: (12, 12) information of evidence and prior.
-        observed: (12, 12) contribution of the evidence alone.
+        evidence_information: (12, 12) contribution of the evidence alone.
         gradient: (12,) gradient of the cost.
     """
 
     information: Floats
-    observed: Floats
+    evidence_information: Floats
     gradient: Floats
 
 
-class Solutions(NamedTuple):
-    """Cameras and their costs and information matrices, written by the kernels.
-
-    Attributes:
-        rows: (b, 22) starts, replaced by the fitted cameras.
-        cost: (b,).
-        information: (b, 12, 12) information of evidence and prior.
-        observed: (b, 12, 12) contribution of the evidence alone.
-    """
-
-    rows: Floats
-    cost: Floats
-    information: Floats
-    observed: Floats
-
-
 @compile_kernel
-def descend(given: Measurements, iterations: int, found: Solutions) -> None:
+def descend(given: Measurements, iterations: int, found: Fits) -> None:
     """Minimize the cost from each row in place; see `adjust`.
 
     Args:
@@ -309,7 +324,7 @@ def descend(given: Measurements, iterations: int, found: Solutions) -> None:
         iterations: at most, per start; 0 only evaluates the starts.
         found: starts in its rows; written.
     """
-    rows, cost, information, observed = found.rows, found.cost, found.information, found.observed
+    rows, cost, information = found.rows, found.cost, found.information
     free = given.free
     trial = np.empty(22)
     system = np.empty((SIZE, SIZE))
@@ -329,7 +344,7 @@ def descend(given: Measurements, iterations: int, found: Solutions) -> None:
                 rows[b] = trial
                 cost[b] = reached
                 information[b] = new.information
-                observed[b] = new.observed
+                found.evidence_information[b] = new.evidence_information
                 gradient[:] = new.gradient
                 damping = max(0.1 * damping, 1e-9)
             else:
@@ -348,7 +363,8 @@ def descend(given: Measurements, iterations: int, found: Solutions) -> None:
 @compile_kernel
 def _linearize(c: Floats, given: Measurements, written: Linearization) -> float:
     """Return the cost at a camera; write information and gradient, zero for fixed parameters."""
-    information, observed, gradient = written.information, written.observed, written.gradient
+    information, observed = written.information, written.evidence_information
+    gradient = written.gradient
     free, spread, drawn_spread = given.free, given.click_noise, given.drawn_noise
     n, d = len(given.points_world), len(given.drawn_image)
     click = np.empty((n, 2))

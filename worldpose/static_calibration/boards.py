@@ -13,13 +13,15 @@ from data_contracts.cameras import LensCalibration
 from worldpose.errors import InputError
 
 MIN_VIEWS: Final = 4
-"""Least images with a board [1]: leaving out one must leave three, which determine a lens."""
+"""Minimum images with a board [1]: leaving out one must leave three, which determine a lens."""
+MAX_VIEWS: Final = 40
+"""Maximum views of a video [1]."""
 MIN_CORNERS: Final = 8
-"""Least corners of a board in an image [1]."""
-MAX_BEND: Final = 0.25
-"""Largest mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
+"""Minimum corners of a board in an image [1]."""
+MAX_PLANE_ERROR: Final = 0.25
+"""Maximum mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
 that were counted wrongly have errors of whole squares."""
-OUTLIER: Final = 2.0
+OUTLIER_RATIO: Final = 2.0
 """The worst image is left out if the residual is larger with it by this factor [1]."""
 MIN_RESIDUAL_PX: Final = 0.3
 """Residual up to which no image is left out [px]."""
@@ -28,8 +30,8 @@ SAME_VIEW: Final = 0.02
 SUBPIXEL_WINDOW: Final = 5
 """Half the side of the window in which a corner of a ChArUco board is refined [px]."""
 MAX_FOCAL_STD: Final = 0.05
-"""Largest relative deviation of the focal length [1]; boards that all face the camera do not tell
-it."""
+"""Maximum relative deviation of the focal length [1]; boards that all face the camera do not
+determine it."""
 
 
 @dataclass(frozen=True)
@@ -180,11 +182,11 @@ def calibrate_lens(
         size: width and height of all images [px].
 
     Raises:
-        InputError: too few images with a board, or the boards do not tell the focal length.
+        InputError: too few images with a board, or the boards do not determine the focal length.
     """
     reasons = ["" if view is not None else "no whole board found" for view in views]
     for n, view in enumerate(views):
-        if view is not None and view.bend > MAX_BEND:
+        if view is not None and view.bend > MAX_PLANE_ERROR:
             reasons[n] = "its corners are not those of a flat board"
     while True:
         chosen = [n for n, reason in enumerate(reasons) if not reason]
@@ -203,7 +205,7 @@ def calibrate_lens(
         if error[worst] <= MIN_RESIDUAL_PX or len(kept) == MIN_VIEWS:
             break
         others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
-        if _rms(np.concatenate(residuals)) <= OUTLIER * _rms(np.concatenate(others)):
+        if _rms(np.concatenate(residuals)) <= OUTLIER_RATIO * _rms(np.concatenate(others)):
             break
         reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
     left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
@@ -213,7 +215,7 @@ def calibrate_lens(
     if std[0] > MAX_FOCAL_STD * numbers[0]:
         raise InputError(
             f"{camera}: board images",
-            expected=f"boards that tell the focal length within {100 * MAX_FOCAL_STD:g} %",
+            expected=f"boards that determine the focal length within {100 * MAX_FOCAL_STD:g} %",
             found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
             todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
         )
@@ -226,9 +228,9 @@ def calibrate_lens(
         focal_px=float(numbers[0]),
         principal_point_px=(float(numbers[1]), float(numbers[2])),
         distortion=(*(float(one) for one in numbers[3:7]), 0.0),
-        focal_std_px=float(max(std[0], LEAST_STD_PX)),
-        principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), LEAST_STD_PX)),
-        distortion_std=float(max(corner_std, LEAST_DISTORTION_STD)),
+        focal_std_px=float(max(std[0], MIN_STD_PX)),
+        principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), MIN_STD_PX)),
+        distortion_std=float(max(corner_std, MIN_DISTORTION_STD)),
     )
     pixels = np.concatenate([view.pixels for view in kept])
     fields = np.clip((8 * pixels / np.array(size)).astype(int), 0, 7)
@@ -243,9 +245,9 @@ def calibrate_lens(
     )
 
 
-LEAST_STD_PX: Final = 0.1
-"""Least stated deviation of focal length and principal point [px]."""
-LEAST_DISTORTION_STD: Final = 1e-4
+MIN_STD_PX: Final = 0.1
+"""Minimum stated deviation of focal length and principal point [px]."""
+MIN_DISTORTION_STD: Final = 1e-4
 """The same of the corner's displacement [1]."""
 
 
@@ -264,34 +266,33 @@ def _solve(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[Floats, l
     middle = 0.5 * (np.array(size) - 1.0)
     start = np.array([[max(size), 0.0, middle[0]], [0.0, max(size), middle[1]], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
-    none = np.zeros(5)
-    _, matrix, distortion, turns, ways = cv2.calibrateCamera(
-        objects, images, size, start, none, flags=flags
+    distortion_guess = np.zeros(5)
+    _, matrix, distortion, rvecs, tvecs = cv2.calibrateCamera(
+        objects, images, size, start, distortion_guess, flags=flags
     )
     residuals = []
-    for each, view, turn, way in zip(places, views, turns, ways, strict=True):
-        shown, _ = cv2.projectPoints(each, turn, way, matrix, distortion)
+    for each, view, rvec, tvec in zip(places, views, rvecs, tvecs, strict=True):
+        shown, _ = cv2.projectPoints(each, rvec, tvec, matrix, distortion)
         residuals.append(view.pixels - shown.reshape(-1, 2))
-    numbers = [matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
-    return np.array(numbers, dtype=np.float64), residuals
+    intrinsics = [matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
+    return np.array(intrinsics, dtype=np.float64), residuals
 
 
 def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
-    """Return how much the distortion moves the image's farthest corner, by its distance [1]."""
+    """Return the relative displacement of the image's farthest corner by the distortion [1]."""
     far = np.maximum(numbers[1:3], np.array(size) - numbers[1:3]) / numbers[0]
     squared = float((far**2).sum())
     return float(numbers[3] * squared + numbers[4] * squared**2)
 
 
 def choose_views(
-    frames: Iterable[Image], board: Board, most: int = 40
+    frames: Iterable[Image], board: Board
 ) -> tuple[list[BoardView | None], tuple[int, int]]:
     """Return different views of a board in the frames of a video, and the frames' size.
 
     Args:
         frames: (height, width, 3) each.
         board: the board.
-        most: most views.
     """
     views: list[BoardView | None] = []
     size = (0, 0)
@@ -301,7 +302,7 @@ def choose_views(
         if view is None or any(_is_same(view, other, size[0]) for other in views if other):
             continue
         views.append(view)
-        if len(views) == most:
+        if len(views) == MAX_VIEWS:
             break
     return views, size
 

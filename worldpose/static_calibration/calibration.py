@@ -49,18 +49,18 @@ from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_CROPPED: Final = 0.15
+_CROP_SPREAD: Final = 0.15
 """Spread of a cropped image's principal point, in widths [1]: covers crops of half the size."""
 _MAX_CROP: Final = 0.5
 """Largest offset of a cropped image's principal point from its center, in widths and in heights
 [1]: a corner of an image of twice its size."""
-_FOR_CROP: Final = 7
+_MIN_FOR_CROP: Final = 7
 """Minimum clicked points, or markings, that distinguish a crop from wrong names [1]."""
 _MAX_LEFT_OUT: Final = 16
 """Maximum clicks for leave-one-out starts [1]."""
 _OTHER_STARTS: Final = 2
 """Leave-one-out starts to refine, the best first [1]."""
-_FOR_K3: Final = 24
+_MIN_FOR_K3: Final = 24
 """Minimum residuals to try k3 [1]: twice the parameters."""
 _POSE_SPREAD: Final = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
 """Spread of pose and focal length without information [rad, m, 1]: the clicks do not determine
@@ -69,22 +69,22 @@ _MIN_UNKNOWN: Final = 2
 """Undetermined directions of pose and focal length from which the check fails [1]."""
 _MIRRORED_GAIN: Final = 0.25
 """Names count as mirrored if mirroring leaves less than this share of the cost [1]."""
-_SUSPICIOUS: Final = 0.2
+_SUSPICIOUS_SHARE: Final = 0.2
 """Share of outliers above which the check tries mirrored names [1]."""
-_FAR: Final = 4.0
+_SUSPICIOUS_MISFIT: Final = 4.0
 """Mean loss per observation in the stated noise [1] from which to try other explanations."""
-_MANY: Final = 9.0
+_COMPARISON_LOSS: Final = 9.0
 """Cauchy scale of clicks [standard deviations] while mirrored names compete."""
-_BELIEVED: Final = 0.1
+_MAX_OUTLIER_SHARE: Final = 0.1
 """Maximum share of outliers of a camera that rests on an assumption [1]."""
-_CLOSE: Final = 4.0
+_MAX_MISFIT: Final = 4.0
 """Maximum mean loss per observation of such a camera [1]: twice the stated noise."""
 _SAME_SIZE: Final = 0.5
 """Difference in length or width that clicks cannot resolve [m]."""
 _UNIT_GAIN: Final = 14.0
 """Twice the logarithm of the minimum probability ratio in favor of a pitch in yards [1]: a
 thousand, since the fault is rare."""
-_YARD: Final = 0.9144
+_YARD_M: Final = 0.9144
 """[m]"""
 
 
@@ -246,7 +246,7 @@ def _extend_to_all(
 def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierFit], str]]]:
     """Yield alternative problems, each with a function that describes its assumption."""
     evidence, prior = problem.evidence, problem.prior.copy()
-    prior[4] = _CROPPED * problem.image_size[0]
+    prior[4] = _CROP_SPREAD * problem.image_size[0]
     middle = problem.prior[2:4]
 
     def shift(fit: InlierFit) -> str:
@@ -261,7 +261,7 @@ def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierF
         points = np.ones(len(evidence.points), dtype=np.bool_)
         alone = problem.select(points, np.zeros(len(evidence.markings), dtype=np.bool_))
         yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"
-    if max(len(evidence.points), len(evidence.markings)) >= _FOR_CROP:
+    if max(len(evidence.points), len(evidence.markings)) >= _MIN_FOR_CROP:
         yield replace(problem, prior=prior), shift
 
 
@@ -273,8 +273,8 @@ def _try_k3(found: Explanation) -> Explanation:
     count = 2 * int(fit.inliers.sum()) + len(problem.evidence.drawn_image)
     if settings.distortion != "k1_k2":
         return replace(found, assumptions=decisions)
-    if count < _FOR_K3:
-        decision = f"k3 kept 0: {count} residuals, tried from {_FOR_K3}"
+    if count < _MIN_FOR_K3:
+        decision = f"k3 kept 0: {count} residuals, tried from {_MIN_FOR_K3}"
         return replace(found, assumptions=(*decisions, decision))
     wider = replace(problem, free=np.arange(len(PARAMETERS)) < len(PARAMETERS))
     more = fit_inliers(wider, fit.row, settings)
@@ -294,12 +294,12 @@ def is_suspicious(fit: InlierFit, factor: float) -> bool:
         fit: fit to the clicks.
         factor: its noise over the stated noise.
     """
-    return _outlier_share(fit) > _SUSPICIOUS or fit.misfit * factor**2 >= _FAR
+    return _outlier_share(fit) > _SUSPICIOUS_SHARE or fit.misfit * factor**2 >= _SUSPICIOUS_MISFIT
 
 
 def _explains(fit: InlierFit) -> bool:
     """Return whether a fit has few outliers and small residuals."""
-    return _outlier_share(fit) <= _BELIEVED and bool(fit.misfit < _CLOSE)
+    return _outlier_share(fit) <= _MAX_OUTLIER_SHARE and bool(fit.misfit < _MAX_MISFIT)
 
 
 def check_mirrored(found: Explanation) -> None:
@@ -359,7 +359,7 @@ class _PitchSize:
 
 
 def _size_in_yards(pitch: PitchTemplate) -> _PitchSize:
-    return _PitchSize(_YARD * pitch.length, _YARD * pitch.width, "it seems to be in yards")
+    return _PitchSize(_YARD_M * pitch.length, _YARD_M * pitch.width, "it seems to be in yards")
 
 
 def check_unit(
@@ -392,7 +392,7 @@ def check_unit(
         negative_log_posterior(each, factor=each.noise_factor(settings), with_prior=True)
         for each in (found, best)
     )
-    if in_yards < given - _UNIT_GAIN and _outlier_share(found.fit) <= _BELIEVED:
+    if in_yards < given - _UNIT_GAIN and _outlier_share(found.fit) <= _MAX_OUTLIER_SHARE:
         raise _size_error(problem, pitch, size)
 
 
@@ -455,7 +455,7 @@ def _start_on_pitch(
     rows = cameras_from_homographies(other, settings.prior, leave_out=False)
     if not len(rows):
         return None
-    start = adjust(other, rows, click_loss=_MANY)
+    start = adjust(other, rows, click_loss=_COMPARISON_LOSS)
     return other, start.rows[np.argmin(start.cost)]
 
 
@@ -500,8 +500,8 @@ def _is_mirrored(found: Explanation) -> bool:
     rows = cameras_from_homographies(mirrored, settings.prior, leave_out=False)
     if not len(rows):
         rows = plausible_cameras(mirrored, settings.prior)
-        weighed = adjust(mirrored, rows, click_loss=_MANY, iterations=0)
+        weighed = adjust(mirrored, rows, click_loss=_COMPARISON_LOSS, iterations=0)
         rows = rows[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
-    best = adjust(mirrored, rows, click_loss=_MANY).cost.min()
-    given = adjust(problem, found.fit.row[None], click_loss=_MANY).cost[0]
+    best = adjust(mirrored, rows, click_loss=_COMPARISON_LOSS).cost.min()
+    given = adjust(problem, found.fit.row[None], click_loss=_COMPARISON_LOSS).cost[0]
     return bool(best < _MIRRORED_GAIN * given)

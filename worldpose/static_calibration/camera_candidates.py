@@ -26,31 +26,34 @@ from worldpose.static_calibration.settings import CameraPrior
 
 TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
 """Tilts below the horizon to try [rad]."""
-_LEVEL: Final = np.radians(5.0)
+_MAX_ANGLE: Final = np.radians(5.0)
 """Deviation of two segments from a right angle, or from parallels, on the pitch [rad]."""
 SEGMENTS: Final = 12
 """Maximum segments to name, those with the most paint [1]."""
-_BEYOND: Final = (0.15, 1.5)
+_OVERSHOOT: Final = (0.15, 1.5)
 """Reach of a segment beyond its marking: share of its length [1], and [m]."""
 _HEIGHTS: Final = (1.8, 80.0)
 """Heights of cameras above the pitch [m]."""
-_FARTHEST: Final = 200.0
+_MAX_DISTANCE: Final = 200.0
 """Distance of a camera from the centre spot in plan [m]."""
-_INSIDE: Final = 1.0
+_PITCH_MARGIN: Final = 1.0
 """Distance of a camera from the outer lines inside of the pitch [m]."""
-_FOUND: Final = 0.7
+_HIT_RATE: Final = 0.7
 """Probability that a visible marking is found at one place [1]: players, shadows and wear hide
 the rest."""
-_BY_CHANCE: Final = 0.05
+_CHANCE_RATE: Final = 0.05
 """Probability that paint is near a place without a marking [1]."""
 INDEPENDENT: Final = 1.0 / 32.0
 """Length of a marking that counts as one observation, in image widths [1]: what hides paint has
 this size."""
+_NEAR_SAMPLE: Final = 12.0
+"""Maximum distance of explained paint from a sample of a marking [px]; samples are up to tens of
+pixels apart."""
 _ITERATIONS: Final = 4
 """Steps of each stage [1]."""
 _ROLL_STD: Final = 0.015
 """Standard deviation of the roll while candidates are refined [rad]."""
-_BEND_STD: Final = (0.005, 0.02)
+_CORNER_STD: Final = (0.005, 0.02)
 """Standard deviation of the displacement of the image corner by k1 while candidates are refined,
 relative to the corner's distance from the middle [1], in images that look straight and in others:
 less than of an unknown lens, so that a wrong name does not bend the image."""
@@ -153,54 +156,57 @@ class _Triples:
 def name_triples(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: float) -> Candidates:
     """Return the cameras with a roll of all triples of segments under all names that fit them."""
     x_lines, y_lines = straight_lines(pitch)
-    found: list[Floats] = []
+    rows = [np.empty((0, 9))]
     for triples in _ground_triples(paint, focals, roll):
-        for axis, (pair, third) in enumerate(((x_lines, y_lines), (y_lines, x_lines))):
-            # The normal of a line along x points to y; that of a line along y, to -x.
-            sign = 1.0 if axis == 0 else -1.0
-            for first, second in permutations(pair, 2):
-                gap = triples.offsets[:, 0] - triples.offsets[:, 1]
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    height = sign * (first[0] - second[0]) / gap
-                tall = np.flatnonzero((height > _HEIGHTS[0]) & (height < _HEIGHTS[1]))
-                for other in third:
-                    kept = tall
-                    up = height[kept]
-                    beside = sign * first[0] - up * triples.offsets[kept, 0]
-                    ahead = other[0] - up * triples.offset[kept]
-                    place = (ahead, beside) if axis == 0 else (-beside, ahead)
-                    fits = are_plausible(pitch, up, place[0], place[1])
-                    for index, line in enumerate((first, second)):
-                        ends = triples.reach[kept, index] * up[:, None] + ahead[:, None]
-                        fits &= _within(ends, line[1:])
-                    ends = triples.across[kept] * up[:, None] + beside[:, None]
-                    fits &= _within(ends, other[1:] if axis == 0 else -other[:0:-1])
-                    kept, up = kept[fits], up[fits]
-                    if not len(kept):
-                        continue
-                    along = triples.along[kept]
-                    normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-                    axes = (along, normal) if axis == 0 else (-normal, along)
-                    found.append(
-                        np.column_stack(
-                            [
-                                triples.focals[kept],
-                                triples.tilts[kept],
-                                up,
-                                *axes,
-                                place[0][fits],
-                                place[1][fits],
-                            ]
-                        )
-                    )
-    level = level_cameras(np.concatenate([np.empty((0, 9)), *found]))
+        for axis, (lines, crossing) in enumerate(((x_lines, y_lines), (y_lines, x_lines))):
+            for pair in permutations(lines, 2):
+                rows.extend(_locate_cameras(pitch, triples, axis, pair, crossing))
+    level = level_cameras(np.concatenate(rows))
     return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
 
-def are_plausible(pitch: PitchTemplate, up: Floats, x: Floats, y: Floats) -> Flags:
+def _locate_cameras(
+    pitch: PitchTemplate, triples: _Triples, axis: int, pair: Sequence[Floats], crossing: Floats
+) -> Iterator[Floats]:
+    """Yield rows of `level_cameras` for triples with a and b on two lines, c on one line each time.
+
+    Args:
+        pitch: the template.
+        triples: k triples of segments.
+        axis: along which the two lines run: 0 = x, 1 = y.
+        pair: the two lines, see `straight_lines`.
+        crossing: (n, 3) lines along the other axis.
+    """
+    # The normal of a line along x points to y; that of a line along y, to -x.
+    sign = 1.0 if axis == 0 else -1.0
+    gap = triples.offsets[:, 0] - triples.offsets[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        heights = sign * (pair[0][0] - pair[1][0]) / gap
+    tall = np.flatnonzero((heights > _HEIGHTS[0]) & (heights < _HEIGHTS[1]))
+    height = heights[tall]
+    across = sign * pair[0][0] - height * triples.offsets[tall, 0]
+    for line in crossing:
+        ahead = line[0] - height * triples.offset[tall]
+        x, y = (ahead, across) if axis == 0 else (-across, ahead)
+        fits = are_plausible(pitch, height, x, y)
+        for index in (0, 1):
+            ends = triples.reach[tall, index] * height[:, None] + ahead[:, None]
+            fits &= _lies_on_line(ends, pair[index][1:])
+        ends = triples.across[tall] * height[:, None] + across[:, None]
+        fits &= _lies_on_line(ends, line[1:] if axis == 0 else -line[:0:-1])
+        kept = tall[fits]
+        along = triples.along[kept]
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+        axes = (along, normal) if axis == 0 else (-normal, along)
+        yield np.column_stack(
+            [triples.focals[kept], triples.tilts[kept], height[fits], *axes, x[fits], y[fits]]
+        )
+
+
+def are_plausible(pitch: PitchTemplate, height: Floats, x: Floats, y: Floats) -> Flags:
     """Return whether cameras (k,) at these heights and places [m] are outside of the pitch."""
-    half = 0.5 * np.array([pitch.length, pitch.width]) - _INSIDE
-    fits = (up > _HEIGHTS[0]) & (up < _HEIGHTS[1]) & (np.hypot(x, y) < _FARTHEST)
+    half = 0.5 * np.array([pitch.length, pitch.width]) - _PITCH_MARGIN
+    fits = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1]) & (np.hypot(x, y) < _MAX_DISTANCE)
     return np.asarray(fits & ((np.abs(x) > half[0]) | (np.abs(y) > half[1])))
 
 
@@ -210,9 +216,9 @@ def turn_about_axis(roll: float) -> Floats:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _within(ends: Floats, line: Floats) -> NDArray[np.bool_]:
+def _lies_on_line(ends: Floats, line: Floats) -> NDArray[np.bool_]:
     """Return whether segments with ends (k, 2) lie on a marking from line[0] to line[1]."""
-    beyond = _BEYOND[0] * (ends[:, 1] - ends[:, 0]) + _BEYOND[1]
+    beyond = _OVERSHOOT[0] * (ends[:, 1] - ends[:, 0]) + _OVERSHOOT[1]
     return np.asarray((ends[:, 0] > line[0] - beyond) & (ends[:, 1] < line[1] + beyond))
 
 
@@ -259,8 +265,8 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
     for reference in range(count):
         turned = angle - angle[:, reference : reference + 1]
         usable = below & below[:, reference : reference + 1]
-        parallel = usable & (np.abs((turned + 0.5 * np.pi) % np.pi - 0.5 * np.pi) < _LEVEL)
-        square = usable & (np.abs(turned % np.pi - 0.5 * np.pi) < _LEVEL)
+        parallel = usable & (np.abs((turned + 0.5 * np.pi) % np.pi - 0.5 * np.pi) < _MAX_ANGLE)
+        square = usable & (np.abs(turned % np.pi - 0.5 * np.pi) < _MAX_ANGLE)
         parallel[:, reference] = False
         # The reference is a, or it is c.
         g, b, c = np.nonzero(parallel[:, :, None] & square[:, None, :])
@@ -284,10 +290,6 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
             np.einsum("kei,ki->k", third, along) / 2.0,
             np.sort(np.einsum("kei,ki->ke", third, normal), axis=-1),
         )
-
-
-def _homogeneous(points: Floats) -> Floats:
-    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
 def _project(candidates: Candidates, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -347,7 +349,10 @@ def score_candidates(
         candidates: (k,) cameras.
         spread: standard deviation of a marking's distance from its paint [px].
     """
-    gain, loss = np.log(_FOUND / _BY_CHANCE), np.log((1.0 - _FOUND) / (1.0 - _BY_CHANCE))
+    gain, loss = (
+        np.log(_HIT_RATE / _CHANCE_RATE),
+        np.log((1.0 - _HIT_RATE) / (1.0 - _CHANCE_RATE)),
+    )
     scores = np.zeros(len(candidates))
     for first in range(0, len(candidates), 1000):
         part = slice(first, first + 1000)
@@ -441,12 +446,15 @@ def _step(
     focal = candidates.focals[:, None]
     stretch = 1.0 + radial * square
     # Derivative of the pixel, along the normal, by the flat place (x, y).
-    nx, ny = across[..., 0], across[..., 1]
-    inward = 2.0 * radial * (x * nx + y * ny)
-    by_x, by_y = focal * (stretch * nx + inward * x), focal * (stretch * ny + inward * y)
+    normal_x, normal_y = across[..., 0], across[..., 1]
+    inward = 2.0 * radial * (x * normal_x + y * normal_y)
+    by_x, by_y = (
+        focal * (stretch * normal_x + inward * x),
+        focal * (stretch * normal_y + inward * y),
+    )
     by_point = np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=-1) / depth[..., None]
     point = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
-    radially = focal * (x * nx + y * ny)
+    radially = focal * (x * normal_x + y * normal_y)
     rows = np.concatenate(
         [
             np.cross(point, by_point),
@@ -460,18 +468,18 @@ def _step(
     system = np.einsum("kni,knj->kij", weighted, rows)
     right = np.einsum("kni,kn->ki", weighted, residual)
     corner = (0.5 * np.hypot(width, height) / candidates.focals) ** 2
-    bend = _BEND_STD[int(bool(paint.lens.distortion.any()))]
-    radial_info = (corner / bend) ** 2 if free[1] else np.full(len(candidates), 1e12)
+    corner_std = _CORNER_STD[int(bool(paint.lens.distortion.any()))]
+    radial_info = (corner / corner_std) ** 2 if free[1] else np.full(len(candidates), 1e12)
     damping = np.tile([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 4.0 if free[0] else 1e12, 0.0], (len(x), 1))
     damping[:, 7] = radial_info
     system += damping[:, :, None] * np.eye(8)
     if free[1]:
         right[:, 7] -= radial_info * candidates.radial
     # The roll is the height of the camera's right axis; it turns by the rotation step.
-    roll, turning = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(x), 8))
-    turning[:, 1], turning[:, 2] = candidates.rotations[:, 2, 2], -candidates.rotations[:, 1, 2]
-    system += turning[:, :, None] * turning[:, None, :] / _ROLL_STD**2
-    right -= turning * roll[:, None] / _ROLL_STD**2
+    roll, by_roll = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(x), 8))
+    by_roll[:, 1], by_roll[:, 2] = candidates.rotations[:, 2, 2], -candidates.rotations[:, 1, 2]
+    system += by_roll[:, :, None] * by_roll[:, None, :] / _ROLL_STD**2
+    right -= by_roll * roll[:, None] / _ROLL_STD**2
     step = np.linalg.solve(system, right[..., None])[..., 0]
     usable = (np.count_nonzero(used, axis=1) >= 12) & np.isfinite(step).all(axis=1)
     usable &= candidates.centers[:, 2] + step[:, 5] > 1.0
@@ -489,14 +497,12 @@ def _move(candidates: Candidates, step: Floats) -> Candidates:
     )
 
 
-def explained_share(paint: PaintMap, seen: SeenMarkings, reach: float) -> float:
+def explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
     """Return the share of the segments' length that lies on a projected marking [1].
 
     Args:
         paint: paint of the image.
         seen: the markings in view of one candidate.
-        reach: largest distance from a sample of a marking [px]; samples are up to tens of pixels
-            apart.
     """
     width, height = paint.size
     canvas = np.ones((height, width), np.uint8)
@@ -509,6 +515,6 @@ def explained_share(paint: PaintMap, seen: SeenMarkings, reach: float) -> float:
         count = max(2, int(np.linalg.norm(end - start)))
         x, y = np.linspace(start, end, count).T
         row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-        on += float((away[row.astype(int), column.astype(int)] < reach).sum())
+        on += float((away[row.astype(int), column.astype(int)] < _NEAR_SAMPLE).sum())
         total += count
     return on / max(total, 1.0)

@@ -1,6 +1,6 @@
 """Candidate cameras from a segment of paint and the circle around it (C2).
 
-Where the centre circle, or the arc of a penalty area, is in view, one straight marking beside it
+Where the centre circle, or the arc of a penalty area, is in view, one straight marking next to it
 determines a camera without roll: midfield shows no three straight markings. On the ground the
 normal of a circle passes through its centre, so that every pixel of paint votes for one circle.
 """
@@ -40,7 +40,7 @@ _ARC_POINTS: Final = 1200
 """Pixels of paint that vote for circles, at least [1]."""
 _ARC_REACH: Final = 14.0
 """Reach of the neighbors that give the direction of a pixel's paint [px]."""
-_ARCS: Final = 400
+_MAX_CANDIDATES: Final = 400
 """Maximum candidates from circles, those with the most paint [1]."""
 
 
@@ -101,30 +101,30 @@ def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
     segment and its normal give radius and centre of the one circle for which it votes.
     """
     rows, counts = [np.empty((0, 9))], [np.zeros(0)]
-    for seen in _beside_segments(paint, focals, roll):
+    for seen in _ground_paint(paint, focals, roll):
         across = np.stack([seen.along[:, 1], -seen.along[:, 0]], axis=-1)
         for arc in _painted_arcs(pitch):
             for sign in (1.0, -1.0) if arc.side else (0.0,):
                 radius, center, count = _vote_circle(seen, arc, sign)
-                up = arc.radius / radius
+                height = arc.radius / radius
                 # Arcs lie on one side of their line: the frame may have to be turned.
                 turn = sign * arc.side if arc.side else 1.0
-                turn, way = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
-                beside = arc.line - way * turn * up * seen.offset
-                ahead = arc.center - turn * up * center
-                x, y = (beside, ahead) if arc.axis else (ahead, beside)
+                turn, normal_sign = (-turn, -1.0) if arc.axis == 0 else (turn, 1.0)
+                across_place = arc.line - normal_sign * turn * height * seen.offset
+                along_place = arc.center - turn * height * center
+                x, y = (across_place, along_place) if arc.axis else (along_place, across_place)
                 axes = (turn * across, turn * seen.along)
                 axes = axes if arc.axis else (turn * seen.along, -turn * across)
-                fits = (count >= _MIN_ARC) & are_plausible(pitch, up, x, y)
-                rows.append(np.column_stack([seen.focals, seen.tilts, up, *axes, x, y])[fits])
+                fits = (count >= _MIN_ARC) & are_plausible(pitch, height, x, y)
+                rows.append(np.column_stack([seen.focals, seen.tilts, height, *axes, x, y])[fits])
                 counts.append(count[fits])
-    best = np.argsort(-np.concatenate(counts), kind="stable")[:_ARCS]
+    best = np.argsort(-np.concatenate(counts), kind="stable")[:_MAX_CANDIDATES]
     level = level_cameras(np.concatenate(rows)[best])
     return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
 
-class _Beside(NamedTuple):
-    """Pixels of paint beside a segment, in the ground frame of level cameras.
+class _Paint(NamedTuple):
+    """Pixels of paint around a segment, in the ground frame of level cameras.
 
     Attributes:
         focals: (g,) [px].
@@ -132,7 +132,7 @@ class _Beside(NamedTuple):
         along: (g, 2) unit vector of the segment.
         offset: (g,) of the segment across it, to its right [1].
         places: (g, m, 2) of the pixels to the right of the segment and along it [1].
-        normals: (g, m, 2) unit normals of the paint, likewise.
+        normals: (g, m, 2) unit normals of the paint, in the same axes.
     """
 
     focals: Floats
@@ -143,8 +143,8 @@ class _Beside(NamedTuple):
     normals: Floats
 
 
-def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Beside]:
-    """Yield the paint beside each segment at all focal lengths and tilts."""
+def _ground_paint(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Paint]:
+    """Yield the paint around each segment at all focal lengths and tilts."""
     middle = 0.5 * np.array([paint.size[0] - 1, paint.size[1] - 1])
     points, ways = _paint_directions(paint.points)
     if not len(points):
@@ -168,8 +168,8 @@ def _beside_segments(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_
         kept = np.isfinite(along).all(axis=-1)
         axes = np.stack([along[:, ::-1] * [1.0, -1.0], along], axis=-1)[kept]
         offset = (lines[kept, index].mean(axis=1) * axes[..., 0]).sum(axis=-1)
-        beside = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
-        yield _Beside(focal[kept], tilt[kept], along[kept], offset, beside, normals[kept] @ axes)
+        relative = places[kept] @ axes - np.stack([offset, np.zeros_like(offset)], axis=-1)[:, None]
+        yield _Paint(focal[kept], tilt[kept], along[kept], offset, relative, normals[kept] @ axes)
 
 
 def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
@@ -196,31 +196,33 @@ def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
     return mean[clear], axes[clear][:, :, 1]
 
 
-def _vote_circle(seen: _Beside, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
-    """Return radius, centre along the segment and share of pixels (g,) of the circle most vote for.
+def _vote_circle(seen: _Paint, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
+    """Return radius, centre along the segment and share of votes (g,) of the best circle.
 
     Args:
         seen: paint.
         arc: the circle and its marking.
         sign: side of the paint, 0 = both.
     """
-    beside, ahead, turned, onward = np.moveaxis(
+    across, along, normal_across, normal_along = np.moveaxis(
         np.concatenate([seen.places, seen.normals], axis=-1), -1, 0
     )
     rows = int(np.log(_RADIUS_RANGE[1] / _RADIUS_RANGE[0]) / _ARC_BINS[0]) + 1
     cells = rows * _ARC_BINS[2]
-    counts = np.zeros(len(beside) * cells, np.int64)
+    counts = np.zeros(len(across) * cells, np.int64)
     for way in arc.ways:
-        steep = arc.depth + way * np.abs(turned)
+        steep = arc.depth + way * np.abs(normal_across)
         with np.errstate(divide="ignore", invalid="ignore"):
-            radius = np.abs(beside) / steep
+            radius = np.abs(across) / steep
             used = (steep > 0.2) & (radius > _RADIUS_RANGE[0]) & (radius < _RADIUS_RANGE[1])
             if sign:
-                used &= beside * sign > 0.0
+                used &= across * sign > 0.0
         g, m = np.nonzero(used)
         found = radius[g, m]
-        toward = way * np.sign(beside[g, m]) * np.sign(turned[g, m])
-        column = (ahead[g, m] / found - toward * onward[g, m]) / _ARC_BINS[1] + 0.5 * _ARC_BINS[2]
+        toward = way * np.sign(across[g, m]) * np.sign(normal_across[g, m])
+        column = (along[g, m] / found - toward * normal_along[g, m]) / _ARC_BINS[
+            1
+        ] + 0.5 * _ARC_BINS[2]
         row = np.log(found / _RADIUS_RANGE[0]) / _ARC_BINS[0]
         kept = (column >= 0.0) & (column < _ARC_BINS[2])
         cell = row[kept].astype(np.int64) * _ARC_BINS[2] + column[kept].astype(np.int64)
@@ -229,4 +231,4 @@ def _vote_circle(seen: _Beside, arc: _PaintedArc, sign: float) -> tuple[Floats, 
     best = votes.argmax(axis=1)
     size = _RADIUS_RANGE[0] * np.exp((best // _ARC_BINS[2] + 0.5) * _ARC_BINS[0])
     place = (best % _ARC_BINS[2] + 0.5 - 0.5 * _ARC_BINS[2]) * _ARC_BINS[1] * size
-    return size, place, votes.max(axis=1) / max(1, beside.shape[1])
+    return size, place, votes.max(axis=1) / max(1, across.shape[1])

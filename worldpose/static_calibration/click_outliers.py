@@ -13,24 +13,24 @@ from worldpose.errors import InputError
 from worldpose.static_calibration.adjustment import (
     Fits,
     Problem,
+    Residuals,
     adjust,
     camera_from_row,
     camera_row,
+    compute_residuals,
 )
 from worldpose.static_calibration.curvature_correction import add_curvature
 from worldpose.static_calibration.parameters import (
     PRIORS,
     SIZE,
     CameraEstimate,
-    drawn_residuals,
-    point_residuals,
     prior_residuals,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_ROBUST: Final = 3.0
+_ROBUST_LOSS: Final = 3.0
 """Cauchy scale of clicks [standard deviations] of the fit that starts the outlier search."""
-_SINGULAR: Final = 1e-14
+_MIN_EIGENVALUE: Final = 1e-14
 """Minimum eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
 and rounding decides."""
 _SIGNIFICANCE: Final = 0.002
@@ -40,7 +40,7 @@ _STATED_FREEDOM: Final = 4.0
 correct within a factor of 1.4."""
 _MAX_SCALE: Final = 5.0
 """Maximum factor on the stated noise [1]; beyond, names are wrong."""
-_NOISES: Final = (1.5, 2.0, 3.0, 4.0)
+_NOISE_FACTORS: Final = (1.5, 2.0, 3.0, 4.0)
 """Factors on the stated noise to try where it does not explain the clicks [1]; the last is the
 largest plausible one."""
 CLEAR_GAIN: Final = 6.0
@@ -48,32 +48,15 @@ CLEAR_GAIN: Final = 6.0
 one [1]: twenty."""
 _NOISE_SPREAD: Final = 0.5
 """Spread of this factor's logarithm [1]: true noise is half to twice the stated noise."""
-_TWO_PI: Final = float(np.log(2.0 * np.pi))
-_POINT_NUMBERS: Final = 2
-_LINE_NUMBERS: Final = 2
-_ARC_NUMBERS: Final = 4
+_LOG_TWO_PI: Final = float(np.log(2.0 * np.pi))
+_POINT_CONSTRAINTS: Final = 2
+_LINE_CONSTRAINTS: Final = 2
+_ARC_CONSTRAINTS: Final = 4
 """Constraints of a click, a straight marking and an arc, whatever their drawn length [1]."""
-_ALONE: Final = 1e-9
+_MIN_REDUNDANCY: Final = 1e-9
 """One minus leverage [1] below which a click or marking alone observes a parameter."""
-_ENOUGH_NUMBERS: Final = 8
+_MIN_CONSTRAINTS: Final = 8
 """Minimum constraints that must remain to reject a marking [1]: four clicks."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Residuals of a fit and their derivatives, in pixels.
-
-    Attributes:
-        click: (n, 2).
-        by_click: (n, 2, 12).
-        drawn: (d,) perpendicular.
-        by_drawn: (d, 12).
-    """
-
-    click: NDArray[np.float64]
-    by_click: NDArray[np.float64]
-    drawn: NDArray[np.float64]
-    by_drawn: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,27 +122,6 @@ class Explanation:
         return self.settings.click_noise_px / stated.click_noise_px
 
 
-def compute_residuals(problem: Problem, row: NDArray[np.float64]) -> Rows:
-    """Return all residuals at a camera (22,); derivatives by fixed parameters are zero."""
-    evidence = problem.evidence
-    n, d = len(evidence.points), len(evidence.drawn_image)
-    rows = Rows(np.empty((n, 2)), np.empty((n, 2, 12)), np.empty(d), np.empty((d, 12)))
-    point_residuals(row, evidence.points_world, evidence.points_image, rows.click, rows.by_click)
-    drawn_residuals(
-        row,
-        problem.half_diagonal,
-        evidence.samples_world,
-        evidence.bounds,
-        evidence.drawn_image,
-        evidence.drawn_marking,
-        rows.drawn,
-        rows.by_drawn,
-    )
-    return replace(
-        rows, by_click=rows.by_click * problem.free, by_drawn=rows.by_drawn * problem.free
-    )
-
-
 def fit_inliers(
     problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
 ) -> InlierFit:
@@ -182,11 +144,11 @@ def fit_inliers(
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
-    robust = adjust(problem, start[None], click_loss=_ROBUST)
+    robust = adjust(problem, start[None], click_loss=_ROBUST_LOSS)
     row = robust.rows[0]
     problem = problem.with_survey_error(row, settings)
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1) / problem.click_noise
-    inliers = (length < limit * max(1.0, _median_spread(length))) & _imageable(problem, row)
+    inliers = (length < limit * max(1.0, _median_spread(length))) & _can_image(problem, row)
     markings = _select_markings(problem, row, inliers, settings)
     seen = set()
     while True:
@@ -235,7 +197,7 @@ def fit_inliers_at_best_noise(
     if fit.inliers.all() and fit.noise_scale <= 1.0:
         return best
     lowest = negative_log_posterior(best, factor=1.0, with_prior=False)
-    for factor in _NOISES:
+    for factor in _NOISE_FACTORS:
         other, rough = scale_noise(problem, factor, settings)
         try:
             tried = fit_inliers(other, fit.row, rough)
@@ -280,22 +242,24 @@ def negative_log_posterior(found: Explanation, *, factor: float, with_prior: boo
     scale = fit.noise_scale
     squared = (_click_loss(kept, rows) + _drawn_loss(kept, rows)) / scale**2
     volume = 2.0 * float(np.log(scale)) * (2 * len(kept.click_noise) + len(kept.drawn_noise))
-    volume += 4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * _TWO_PI
-    volume += 2.0 * float(np.log(kept.drawn_noise).sum()) + len(kept.drawn_noise) * _TWO_PI
-    anywhere = 2.0 * np.log(float(np.prod(problem.image_size)))
-    honest = 2.0 * np.log((1.0 - settings.wrong_rate) / settings.wrong_rate)
-    wrong = float((~fit.inliers).sum()) * (anywhere + honest)
-    lost = float((~fit.markings[problem.evidence.drawn_marking]).sum())
-    wrong += lost * np.log(float(np.hypot(*problem.image_size)))
+    volume += (
+        4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * _LOG_TWO_PI
+    )
+    volume += 2.0 * float(np.log(kept.drawn_noise).sum()) + len(kept.drawn_noise) * _LOG_TWO_PI
+    image_volume = 2.0 * np.log(float(np.prod(problem.image_size)))
+    inlier_odds = 2.0 * np.log((1.0 - settings.wrong_rate) / settings.wrong_rate)
+    outliers = float((~fit.inliers).sum()) * (image_volume + inlier_odds)
+    outlying_pixels = float((~fit.markings[problem.evidence.drawn_marking]).sum())
+    outliers += outlying_pixels * np.log(float(np.hypot(*problem.image_size)))
     free = np.ix_(problem.free, problem.free)
-    told = -float(np.linalg.slogdet(fit.tangent_covariance[free])[1])
+    posterior_volume = -float(np.linalg.slogdet(fit.tangent_covariance[free])[1])
     if with_prior:
-        told += 4.0 * float(np.log(problem.prior[4]))  # of the principal point's prior
+        posterior_volume += 4.0 * float(np.log(problem.prior[4]))  # of the principal point's prior
         known = np.empty(PRIORS)
         prior_residuals(fit.row, problem.prior, known, np.empty((PRIORS, SIZE)))
         squared += float((known**2).sum())
-    far = float(np.log(scale * factor)) / _NOISE_SPREAD
-    return float(squared + volume + wrong + told + far**2)
+    noise_deviation = float(np.log(scale * factor)) / _NOISE_SPREAD
+    return float(squared + volume + outliers + posterior_volume + noise_deviation**2)
 
 
 def fit_given_inliers(
@@ -356,8 +320,8 @@ def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray
         estimate: camera that is independent of these clicks.
     """
     rows = compute_residuals(problem, camera_row(estimate.camera))
-    nobody = np.zeros(len(rows.click), dtype=np.bool_)
-    return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, nobody)
+    no_inliers = np.zeros(len(rows.click), dtype=np.bool_)
+    return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, no_inliers)
 
 
 def held_out_error(problem: Problem, fit: InlierFit) -> float:
@@ -386,7 +350,7 @@ def held_out_error(problem: Problem, fit: InlierFit) -> float:
         sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
         shared = by_step @ root / sigma[:, None]
         leverage, along = np.linalg.eigh(shared.T @ shared)
-        is_predicted = np.abs(1.0 - leverage) > _ALONE
+        is_predicted = np.abs(1.0 - leverage) > _MIN_REDUNDANCY
         # The rest does not predict directions that only this unit observes: no error counts there.
         gain = np.where(is_predicted, 1.0, -1.0) / np.where(is_predicted, 1.0 - leverage, leverage)
         whitened = residual / sigma
@@ -408,20 +372,22 @@ def _select_markings(
     constraints, and enough to determine the camera.
     """
     evidence = problem.evidence
-    off = np.abs(compute_residuals(problem, row).drawn)
-    on = evidence.drawn_marking
-    middle = np.array([np.median(off[on == index]) for index in range(len(evidence.markings))])
-    right = np.asarray(middle < settings.wrong_marking * settings.drawn_noise_px)
-    numbers = np.where(evidence.straight, _LINE_NUMBERS, _ARC_NUMBERS)
-    all_numbers = _POINT_NUMBERS * len(inliers) + int(numbers.sum())
-    left = _POINT_NUMBERS * int(inliers.sum()) + int(numbers[right].sum())
+    away = np.abs(compute_residuals(problem, row).drawn)
+    marking = evidence.drawn_marking
+    medians = np.array(
+        [np.median(away[marking == index]) for index in range(len(evidence.markings))]
+    )
+    accepted = np.asarray(medians < settings.wrong_marking * settings.drawn_noise_px)
+    constraints = np.where(evidence.straight, _LINE_CONSTRAINTS, _ARC_CONSTRAINTS)
+    all_constraints = _POINT_CONSTRAINTS * len(inliers) + int(constraints.sum())
+    remaining = _POINT_CONSTRAINTS * int(inliers.sum()) + int(constraints[accepted].sum())
     share = 1.0 - settings.max_wrong_share
-    few = right.sum() < share * len(right) and left < _ENOUGH_NUMBERS
-    enough = left >= share * all_numbers and not few
-    return right if enough else np.ones(len(right), dtype=np.bool_)
+    few = accepted.sum() < share * len(accepted) and remaining < _MIN_CONSTRAINTS
+    enough = remaining >= share * all_constraints and not few
+    return accepted if enough else np.ones(len(accepted), dtype=np.bool_)
 
 
-def _imageable(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _can_image(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask of the clicked points (n,) that a camera (22,) can image."""
     camera = camera_from_row(row, problem.image_size)
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
@@ -489,7 +455,7 @@ def _judge_clicks(
         # Drawn pixels that are more accurate than stated do not make clicks more accurate.
         scale = max(others.scale, 1.0)
         mahalanobis[index] = _gaussian_distance(own * noise.scale / scale, others.worth)
-    mahalanobis[~_imageable(problem, row)] = np.inf
+    mahalanobis[~_can_image(problem, row)] = np.inf
     return covariance, noise, mahalanobis
 
 
@@ -530,7 +496,7 @@ def _is_invertible(information: NDArray[np.float64]) -> bool:
     size = np.sqrt(np.abs(np.diag(information)))
     if not (np.isfinite(information).all() and size.all()):
         return False
-    return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > _SINGULAR)
+    return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > _MIN_EIGENVALUE)
 
 
 def _no_camera(problem: Problem, count: int) -> InputError:
@@ -542,17 +508,17 @@ def _no_camera(problem: Problem, count: int) -> InputError:
     )
 
 
-def _click_loss(problem: Problem, rows: Rows) -> float:
+def _click_loss(problem: Problem, rows: Residuals) -> float:
     return float(((rows.click / problem.click_noise[:, None]) ** 2).sum())
 
 
-def _drawn_loss(problem: Problem, rows: Rows) -> float:
+def _drawn_loss(problem: Problem, rows: Residuals) -> float:
     limit = problem.drawn_loss**2
     return float(limit * np.log1p((rows.drawn / problem.drawn_noise) ** 2 / limit).sum())
 
 
 def _leave_one_out_distances(
-    rows: Rows,
+    rows: Residuals,
     covariance: NDArray[np.float64],
     noise: NDArray[np.float64],
     inliers: NDArray[np.bool_],

@@ -22,6 +22,7 @@ from worldpose.static_calibration.adjustment import (
     Problem,
     camera_from_row,
     camera_row,
+    compute_residuals,
     step_row,
 )
 from worldpose.static_calibration.line_search import Bars
@@ -29,8 +30,6 @@ from worldpose.static_calibration.parameters import (
     PRIORS,
     SIZE,
     CameraOnPitch,
-    drawn_residuals,
-    point_residuals,
     prior_residuals,
     step_camera,
     step_jacobian,
@@ -148,48 +147,34 @@ def whiten_residuals(
     problem: Problem, row: Floats, step: Floats, scale: float
 ) -> tuple[Floats, Floats]:
     """Return residuals (m,) in standard deviations after a step, and derivatives (m, 12)."""
-    evidence = problem.evidence
-    n, d = len(evidence.points), len(evidence.drawn_image)
     moved = row.copy()
     step_row(row, step, moved)
-    click, by_click = np.empty((n, 2)), np.empty((n, 2, SIZE))
-    drawn, by_drawn = np.empty(d), np.empty((d, SIZE))
+    found = compute_residuals(problem, moved)
     known, by_known = np.empty(PRIORS), np.empty((PRIORS, SIZE))
-    point_residuals(moved, evidence.points_world, evidence.points_image, click, by_click)
-    drawn_residuals(
-        moved,
-        problem.half_diagonal,
-        evidence.samples_world,
-        evidence.bounds,
-        evidence.drawn_image,
-        evidence.drawn_marking,
-        drawn,
-        by_drawn,
-    )
     prior_residuals(moved, problem.prior, known, by_known)
     noise = scale * problem.click_noise
     drawn_noise = scale * problem.drawn_noise
-    residuals = [(click / noise[:, None]).ravel(), drawn / drawn_noise, known]
+    residuals = [(found.click / noise[:, None]).ravel(), found.drawn / drawn_noise, known]
     rows = [
-        (by_click / noise[:, None, None]).reshape(-1, SIZE),
-        by_drawn / drawn_noise[:, None],
-        by_known,
+        (found.by_click / noise[:, None, None]).reshape(-1, SIZE),
+        found.by_drawn / drawn_noise[:, None],
+        by_known * problem.free,
     ]
-    return np.concatenate(residuals), np.concatenate(rows) * problem.free
+    return np.concatenate(residuals), np.concatenate(rows)
 
 
 _NUDGE_M: Final = 0.01
 """Change of crown and end fall for finite differences [m]."""
 _MAX_STEPS: Final = 20
 """Gauss-Newton steps at most [1]."""
-_SETTLED: Final = 0.01
+_MIN_STEP: Final = 0.01
 """Step length at which the iteration stops [standard deviations]."""
 _MAX_HALVINGS: Final = 6
 """Maximum halvings of a step that does not lower the cost [1]."""
-_FIRST: Final = 8
+_TEST_DRAWS: Final = 8
 _DRAWS: Final = 64
 """Sampled cameras before the linearity test, and in total [1]."""
-_STRAIGHT: Final = 0.3
+_MAX_DEVIATION: Final = 0.3
 """Root mean square deviation of the first cameras from their tangents below which sampling stops
 [standard deviations]."""
 
@@ -248,7 +233,7 @@ class ClicksAndBars:
                 return camera, surface
             length = float(np.linalg.norm(rows @ free_step))
             camera, surface, residuals, rows = trial, higher, ahead, by_ahead
-            if length < _SETTLED:
+            if length < _MIN_STEP:
                 break
         return camera, surface
 
@@ -273,18 +258,20 @@ def fit_with_curvature(evidence: ClicksAndBars, camera: Camera) -> CameraOnPitch
     covariance = answer @ answer.T
     # A fixed seed: the same evidence gives bitwise equal results.
     rng = np.random.default_rng(0)
-    beside: list[Floats] = []
+    deviations: list[Floats] = []
     for _ in range(_DRAWS // 2):
         noise = rng.standard_normal(len(rows))
         for sign in (1.0, -1.0):
             tangent = -sign * size * (answer @ noise)
-            there = best.step_to(*evidence.fit(camera, surface, sign * noise))
-            beside.append((there[free] - tangent) / size)
-        if len(beside) == _FIRST:
-            off = np.array(beside)
-            if (off * np.linalg.solve(covariance, off.T).T).sum() < _FIRST * _STRAIGHT**2:
+            sampled = best.step_to(*evidence.fit(camera, surface, sign * noise))
+            deviations.append((sampled[free] - tangent) / size)
+        if len(deviations) == _TEST_DRAWS:
+            rest = np.array(deviations)
+            if (
+                rest * np.linalg.solve(covariance, rest.T).T
+            ).sum() < _TEST_DRAWS * _MAX_DEVIATION**2:
                 break
-    off = np.array(beside)
+    rest = np.array(deviations)
     whole = np.zeros((len(free), len(free)))
-    whole[np.ix_(free, free)] = (covariance + off.T @ off / len(off)) * np.outer(size, size)
+    whole[np.ix_(free, free)] = (covariance + rest.T @ rest / len(rest)) * np.outer(size, size)
     return replace(best, covariance=whole)

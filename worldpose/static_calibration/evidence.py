@@ -15,17 +15,17 @@ from worldpose.static_calibration.ground_error import points_off_line
 
 _MAX_DRAWN: Final = 200
 """Maximum drawn pixels per marking [1]: more cost time and add no information."""
-_OUTSIDE: Final = 1.0
+_MAX_OUTSIDE: Final = 1.0
 """Maximum distance of a click outside the image [px]: rounding at its border."""
-_POINTS: Final = 4
+_FEWEST: Final = 4
 """Minimum clicked points without a drawn marking [1]: those of a homography."""
-_CONSTRAINTS: Final = 6
+_MIN_CONSTRAINTS: Final = 6
 """Minimum constraints with a drawn marking [1]: pose; the prior holds the focal length."""
-_LINE: Final = 2
+_LINE_CONSTRAINTS: Final = 2
 """Constraints of a straight marking, whatever its drawn length [1]."""
-_ARC: Final = 4
+_ARC_CONSTRAINTS: Final = 4
 """Constraints of an arc [1]: five of its ellipse, less one for the rotation of the circle."""
-_OFF_LINE: Final = 1.0
+_MIN_SPREAD: Final = 1.0
 """Root mean square distance from a line below which points count as collinear [m]."""
 
 
@@ -185,7 +185,7 @@ def _thin(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def _check_inside(where: str, pixel: tuple[float, float], image_size: tuple[int, int]) -> None:
     width, height = image_size
-    inside = all(-_OUTSIDE <= v <= n for v, n in zip(pixel, (width, height), strict=True))
+    inside = all(-_MAX_OUTSIDE <= v <= n for v, n in zip(pixel, (width, height), strict=True))
     if not inside:
         raise InputError(
             where,
@@ -208,18 +208,18 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
     """Raise InputError when the clicks are too few, or on one line, for any camera."""
     points, found = len(evidence.points), describe_clicks(evidence)
     if not evidence.markings:
-        if points < _POINTS:
+        if points < _FEWEST:
             more = points_off_line(pitch, evidence.points_world)
             new = [name for name in more if name not in evidence.points]
             raise InputError(
                 where,
-                expected=f"{_POINTS} clicked points or more, better 8, or drawn markings as well",
+                expected=f"{_FEWEST} clicked points or more, better 8, or drawn markings as well",
                 found=found,
                 todo=f"Click further points, far from the others, for example {', '.join(new)}.",
             )
         plan = evidence.points_world[:, :2]
         spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
-        if spread < _OFF_LINE * np.sqrt(points):
+        if spread < _MIN_SPREAD * np.sqrt(points):
             more = points_off_line(pitch, evidence.points_world)
             raise InputError(
                 where,
@@ -231,8 +231,8 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
     numbers = 2 * points
     for index in range(len(evidence.markings)):
         pixels = int((evidence.drawn_marking == index).sum())
-        numbers += min(pixels, _LINE if evidence.straight[index] else _ARC)
-    if numbers < _CONSTRAINTS:
+        numbers += min(pixels, _LINE_CONSTRAINTS if evidence.straight[index] else _ARC_CONSTRAINTS)
+    if numbers < _MIN_CONSTRAINTS:
         places = np.concatenate([evidence.points_world, evidence.samples_world])
         more = points_off_line(pitch, places)
         raise InputError(
@@ -246,10 +246,10 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
 def has_enough_points(evidence: Evidence) -> bool:
     """Return whether the clicked points alone can determine the camera."""
     plan = evidence.points_world[:, :2]
-    if len(plan) < _POINTS:
+    if len(plan) < _FEWEST:
         return False
     spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
-    return bool(spread >= _OFF_LINE * np.sqrt(len(plan)))
+    return bool(spread >= _MIN_SPREAD * np.sqrt(len(plan)))
 
 
 def describe_clicks(evidence: Evidence) -> str:

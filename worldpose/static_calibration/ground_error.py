@@ -15,11 +15,11 @@ from worldpose.static_calibration.parameters import CameraEstimate, project_with
 
 _MARGIN = 2.0
 """Margin of the map beyond the outer lines [m]: people stand there."""
-_NUDGE = 0.01
+_SLOPE_STEP = 0.01
 """Step of the surface's slope [m]."""
-_GROUND = 0.5
+_MAX_GROUND_HEIGHT = 0.5
 """Height below which a named point is on the ground [m]."""
-_GRAZING = 1e-9
+_MIN_AREA = 1e-9
 """Minimum image area of a square metre of ground [px^2]: less is the horizon."""
 
 
@@ -112,24 +112,28 @@ def surface_motion(
     _, by_step = project_with_jacobian(camera, places)
     by_place = camera.project_with_jacobians(places).d_points
     slopes = [
-        (pitch.height(places[:, 0] + dx, places[:, 1] + dy) - places[:, 2]) / _NUDGE
-        for dx, dy in ((_NUDGE, 0.0), (0.0, _NUDGE))
+        (pitch.height(places[:, 0] + dx, places[:, 1] + dy) - places[:, 2]) / _SLOPE_STEP
+        for dx, dy in ((_SLOPE_STEP, 0.0), (0.0, _SLOPE_STEP))
     ]
     surface = by_place[:, :, :2] + by_place[:, :, 2:] * np.stack(slopes, axis=-1)[:, None, :]
     (a, b), (c, d) = np.moveaxis(surface, 0, -1)
     area = a * d - b * c
     with np.errstate(invalid="ignore", divide="ignore"):
-        area = np.where(np.abs(area) > _GRAZING, area, np.nan)
+        area = np.where(np.abs(area) > _MIN_AREA, area, np.nan)
     inverse = np.moveaxis(np.array([[d, -b], [-c, a]]) / area, -1, 0)
     return np.asarray(inverse @ by_step)
 
 
-_NEARBY = 45.0
+_MAX_POINT_DISTANCE = 45.0
 """Maximum distance of proposed points from the mean of the given ones [m]."""
-_PLACES = 5.0
+_GAIN_SPACING = 5.0
 """Grid spacing of the summed gain over the pitch [m]."""
-_DRAWN = 5
+_DRAWN_PIXELS = 5
 """Assumed number of drawn pixels per marking [1]."""
+_PROPOSED_CLICKS = 3
+"""Names to propose after a calibration [1]."""
+_NAMED_POINTS = 4
+"""Points to name in a message [1]: as many as a camera needs."""
 
 
 def propose_clicks(
@@ -137,7 +141,6 @@ def propose_clicks(
     pitch: PitchTemplate,
     clicked: tuple[str, ...],
     noise: float,
-    count: int = 3,
 ) -> tuple[str, ...]:
     """Return the points and markings whose clicks would lower the expected ground error most.
 
@@ -148,7 +151,6 @@ def propose_clicks(
         pitch: the template.
         clicked: names that already have clicks.
         noise: noise of a click [px].
-        count: maximum number of names.
     """
     motion = _visible_motion(estimate, pitch)
     if not len(motion):
@@ -161,7 +163,7 @@ def propose_clicks(
     }
     covariance = estimate.covariance
     chosen: list[str] = []
-    while candidates and len(chosen) < count:
+    while candidates and len(chosen) < _PROPOSED_CLICKS:
         best, gain, best_update = "", 0.0, np.zeros_like(covariance)
         for name, rows in candidates.items():
             through = covariance @ rows.T
@@ -179,24 +181,22 @@ def propose_clicks(
     return tuple(chosen)
 
 
-def points_off_line(
-    pitch: PitchTemplate, points_world: NDArray[np.float64], count: int = 4
-) -> tuple[str, ...]:
-    """Return points of the pitch near the given ones and farthest off the line through them."""
+def points_off_line(pitch: PitchTemplate, points_world: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return four points of the pitch near given ones and farthest off the line through them."""
     middle = points_world.mean(axis=0)
     _, _, axes = np.linalg.svd(points_world[:, :2] - middle[:2])
     offsets = {
         name: place[:2] - middle[:2] for name, place in pitch.points.items() if "post" not in name
     }
-    near = {name: off for name, off in offsets.items() if np.linalg.norm(off) < _NEARBY}
+    near = {name: off for name, off in offsets.items() if np.linalg.norm(off) < _MAX_POINT_DISTANCE}
     ranked = sorted(near, key=lambda name: -abs(float(near[name] @ axes[1])))
-    return tuple(ranked[:count])
+    return tuple(ranked[:_NAMED_POINTS])
 
 
 def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[np.float64]:
     """Return derivatives (n, 2, 12) of visible places on the pitch by the camera's step [m]."""
-    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, _PLACES)
-    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, _PLACES)
+    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, _GAIN_SPACING)
+    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, _GAIN_SPACING)
     along, across = (grid.ravel() for grid in np.meshgrid(x, y))
     places = np.stack([along, across, pitch.height(along, across)], axis=1)
     seen = _inside(estimate, estimate.camera.project(places))
@@ -217,9 +217,9 @@ def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, NDA
         pitch.marking_names, pairwise(np.cumsum([0, *map(len, samples)])), strict=True
     ):
         visible = first + np.flatnonzero(inside[first:stop])
-        if len(visible) < _DRAWN:
+        if len(visible) < _DRAWN_PIXELS:
             continue
-        chosen = visible[np.linspace(0, len(visible) - 1, _DRAWN).astype(np.int64)]
+        chosen = visible[np.linspace(0, len(visible) - 1, _DRAWN_PIXELS).astype(np.int64)]
         along = np.gradient(pixels[visible], axis=0)[np.searchsorted(visible, chosen)]
         normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -233,18 +233,15 @@ def _inside(estimate: CameraEstimate, pixels: NDArray[np.float64]) -> NDArray[np
     return np.asarray(within.all(axis=1))
 
 
-def points_in_view(
-    camera: Camera, pitch: PitchTemplate, lines: Collection[str], count: int = 4
-) -> tuple[str, ...]:
-    """Return named points on the ground that a camera sees, ends of some lines first, far apart.
+def points_in_view(camera: Camera, pitch: PitchTemplate, lines: Collection[str]) -> tuple[str, ...]:
+    """Return four points on the ground that a camera sees, ends of some lines first, far apart.
 
     Args:
         camera: a single camera.
         pitch: the template.
         lines: lines that the image shows.
-        count: maximum number of points.
     """
-    names = [name for name, place in pitch.points.items() if place[2] < _GROUND]
+    names = [name for name, place in pitch.points.items() if place[2] < _MAX_GROUND_HEIGHT]
     pixels = camera.project(pitch.positions(names))
     inside = np.all((pixels >= 0.0) & (pixels <= camera.image_size - 1.0), axis=1).tolist()
     left = {name: pixel for name, pixel, seen in zip(names, pixels, inside, strict=True) if seen}
@@ -252,7 +249,7 @@ def points_in_view(
     ends = {end for line in shown for end in (line.start, line.end)}
     away = dict.fromkeys(left, np.inf)
     chosen: list[str] = []
-    while left and len(chosen) < count:
+    while left and len(chosen) < _NAMED_POINTS:
         best = max(left, key=lambda name: (name in ends, away[name]))
         here = left.pop(best)
         chosen.append(best)

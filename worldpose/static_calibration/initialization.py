@@ -20,7 +20,7 @@ from worldpose.static_calibration.settings import CameraPrior, StaticCalibration
 
 _PLANE_SCALE = 50.0
 """Half a pitch [m]: coordinates of order one keep the DLT well conditioned."""
-_ON_SURFACE = 0.5
+_MAX_HEIGHT = 0.5
 """Maximum height of points for a homography [m]: includes the crown, excludes the goals' upper
 ends."""
 _MAX_SUBSETS = 300
@@ -149,7 +149,7 @@ def homographies(
     """
     middle = np.array([0.5 * (image_size[0] - 1), 0.5 * (image_size[1] - 1)])
     scale = 0.5 * float(np.hypot(image_size[0], image_size[1]))
-    low = np.abs(evidence.points_world[:, 2]) < _ON_SURFACE
+    low = np.abs(evidence.points_world[:, 2]) < _MAX_HEIGHT
     plane, pixels = evidence.points_world[low, :2], evidence.points_image[low]
     line_pixels, lines, marking = _surface_lines(evidence)
     consensus = _consensus(pixels, plane, middle, scale, tolerance)
@@ -225,24 +225,24 @@ def _homogeneous(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-_COARSE: Final = 60.0
+_COMPARISON_LOSS: Final = 60.0
 """Cauchy scale of all residuals while starts compete [standard deviations]: it bounds the influence
 of residuals of hundreds of pixels, but not of tens."""
-_CLOSE: Final = 4.0
+_MAX_MISFIT: Final = 4.0
 """Mean loss per observation [1] above which the search over plausible cameras replaces the camera
 of a homography."""
-_STEPS: Final = 12
+_TRIAL_ITERATIONS: Final = 12
 """Iterations per start before the best start is chosen [1]."""
-_AGREES: Final = 0.012
+_INLIER_DISTANCE: Final = 0.012
 """Maximum inlier distance of a homography, in image widths [1]: distortion of a few percent at the
 border and the crown's height."""
 _AZIMUTHS: Final = 16
 """Directions of the grid about the centre spot [1]: 22 degrees apart, so that the fit converges."""
-_FACTORS: Final = (-1.0, 0.3)
+_GRID_SPREADS: Final = (-1.0, 0.3)
 """Heights and distances of the grid, in spreads from the middle [1]."""
 _FOCALS: Final = (-1.0, 0.0, 1.0)
 """Focal lengths of the grid, in spreads from the middle [1]."""
-_FOCAL_REACH: Final = 2.5
+_MAX_FOCAL_SPREADS: Final = 2.5
 """Maximum deviation of a homography's focal length, in spreads about the middle [1]."""
 
 
@@ -257,14 +257,14 @@ def cameras_from_homographies(
         leave_out: also leave out each straight marking in turn: one name may be wrong.
     """
     evidence, width = problem.evidence, problem.image_size[0]
-    spread = np.exp(_FOCAL_REACH * prior.log_focal_std)
+    spread = np.exp(_MAX_FOCAL_SPREADS * prior.log_focal_std)
     focal_range = (prior.focal * width / spread, prior.focal * width * spread)
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
     seen = np.median(pixels, axis=0)
     found = [
         camera_from_homography(homography, problem.image_size, seen, focal_range)
         for homography in homographies(
-            evidence, problem.image_size, _AGREES * width, leave_out=leave_out
+            evidence, problem.image_size, _INLIER_DISTANCE * width, leave_out=leave_out
         )
     ]
     rows = [camera_row(camera) for camera in found if camera is not None]
@@ -283,8 +283,8 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float6
     """
     evidence = problem.evidence
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
-    height = prior.height_m * np.exp(np.array(_FACTORS) * prior.log_height_std)
-    distance = prior.distance_m * np.exp(np.array(_FACTORS) * prior.log_distance_std)
+    height = prior.height_m * np.exp(np.array(_GRID_SPREADS) * prior.log_height_std)
+    distance = prior.distance_m * np.exp(np.array(_GRID_SPREADS) * prior.log_distance_std)
     focal = problem.image_size[0] * prior.focal * np.exp(np.array(_FOCALS) * prior.log_focal_std)
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     grid = np.array(list(product(azimuth, distance, height, focal, range(len(_aims(problem))))))
@@ -322,15 +322,15 @@ def _aims(problem: Problem) -> NDArray[np.float64]:
 def _rotations_towards(
     centers: NDArray[np.float64],
     aims: NDArray[np.float64],
-    off: NDArray[np.float64],
+    offsets: NDArray[np.float64],
     focal: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return rotations (b, 3, 3) of level cameras with `aims` at `off` [px] from the center."""
+    """Return rotations (b, 3, 3) of level cameras with `aims` at `offsets` [px] from the center."""
     forward = aims - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     # Pan and tilt by the angles between the mean of the clicks and the image center.
-    tilt = np.arcsin(forward[:, 2]) + np.arctan(off[:, 1] / focal)
-    pan = np.arctan2(forward[:, 1], forward[:, 0]) + np.arctan(off[:, 0] / focal)
+    tilt = np.arcsin(forward[:, 2]) + np.arctan(offsets[:, 1] / focal)
+    pan = np.arctan2(forward[:, 1], forward[:, 0]) + np.arctan(offsets[:, 0] / focal)
     forward = np.stack(
         [np.cos(tilt) * np.cos(pan), np.cos(tilt) * np.sin(pan), np.sin(tilt)], axis=1
     )
@@ -344,11 +344,11 @@ def find_start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray
     rows = cameras_from_homographies(problem, settings.prior, leave_out=False)
     if len(rows):
         best, cost = fit_from_starts(problem, rows, settings.wrong_click)
-        if cost < 0.5 * _CLOSE * count:
+        if cost < 0.5 * _MAX_MISFIT * count:
             return best
-    coarse = replace(problem, drawn_loss=_COARSE)
+    coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
     everywhere = plausible_cameras(problem, settings.prior)
-    weighed = adjust(coarse, everywhere, click_loss=_COARSE, iterations=0)
+    weighed = adjust(coarse, everywhere, click_loss=_COMPARISON_LOSS, iterations=0)
     chosen = everywhere[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
     rows = cameras_from_homographies(problem, settings.prior, leave_out=True)
     return fit_from_starts(problem, np.concatenate([rows, chosen]), settings.wrong_click)[0]
@@ -362,10 +362,10 @@ def fit_from_starts(
     A wide loss first moves every start into its basin; then a sharper loss decides, which a marking
     under a wrong name cannot dominate.
     """
-    coarse = replace(problem, drawn_loss=_COARSE)
-    near = adjust(coarse, rows, click_loss=_COARSE, iterations=_STEPS)
-    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=_STEPS)
-    direct = adjust(problem, rows, click_loss=click_loss, iterations=_STEPS)
+    coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
+    near = adjust(coarse, rows, click_loss=_COMPARISON_LOSS, iterations=_TRIAL_ITERATIONS)
+    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=_TRIAL_ITERATIONS)
+    direct = adjust(problem, rows, click_loss=click_loss, iterations=_TRIAL_ITERATIONS)
     cost = np.concatenate([sharp.cost, direct.cost])
     best = int(np.argmin(cost))
     return np.concatenate([sharp.rows, direct.rows])[best], float(cost[best])

@@ -160,7 +160,7 @@ def refine_by_search(
     if found is None:
         return _keep_start(start, "too few painted lines were found")
     found = search.learn_noise(found)
-    inliers = found.adjusted.weights > _INLIER
+    inliers = found.adjusted.weights > _MIN_INLIER_WEIGHT
     inliers &= _have_inliers(found, inliers, settings.min_inlier_share)
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
     if count < max(settings.min_found, settings.min_inlier_share * visible):
@@ -191,12 +191,12 @@ def refine_by_search(
 
 _WORLD_SPACING: Final = 0.2
 """Spacing of samples before thinning [m]; the nearest paint has 40 px per metre."""
-_INLIER: Final = 0.25
+_MIN_INLIER_WEIGHT: Final = 0.25
 """Weight above which a sample is an inlier: within one scale of the loss [1]."""
 _MAX_CORRELATION: Final = 0.95
-_OWN_WORTH: Final = 20.0
+_PRIOR: Final = 20.0
 """Weight of the expected noise in the estimate of a marking's noise [residuals]."""
-_MIN_KEPT: Final = 0.5
+_MIN_FREEDOM_SHARE: Final = 0.5
 """Minimum share of the samples that remain as degrees of freedom [1]."""
 
 
@@ -237,13 +237,13 @@ def _residual_noise(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[Floats,
 
     # The fit's degrees of freedom are missing from its residuals.
     used = float(inliers.sum())
-    kept = max(1.0 - found.adjusted.spent / used, _MIN_KEPT)
+    kept = max(1.0 - found.adjusted.spent / used, _MIN_FREEDOM_SHARE)
     squares = total(scaled**2, marking) / kept
     products = total(np.where(pairs, scaled[1:] * scaled[:-1], 0.0), marking[1:])
     # For a few samples, the mean square of all samples is the better estimate.
     mean = squares.sum() / used + np.finfo(np.float64).tiny
-    correlation = products / np.maximum(squares, _OWN_WORTH * mean)
-    excess = (squares + _OWN_WORTH) / (total(inliers.astype(np.float64), marking) + _OWN_WORTH)
+    correlation = products / np.maximum(squares, _PRIOR * mean)
+    excess = (squares + _PRIOR) / (total(inliers.astype(np.float64), marking) + _PRIOR)
     return np.clip(correlation, 0.0, _MAX_CORRELATION)[marking], excess[marking]
 
 
@@ -264,10 +264,10 @@ def _keep_start(start: CameraOnPitch, reason: str) -> LineRefinement:
     return LineRefinement(start, False, reason, (), nan, nan, 0.0, None, None)
 
 
-_WIDER: Final = (2.0, 4.0)
+_NOISE_FACTORS: Final = (2.0, 4.0)
 """Factors on the click noise, tried in turn where the clicks do not lead to the lines [1]; the last
 is the largest plausible one."""
-_AS_STATED: Final = 1.5
+_MAX_STATED_RATIO: Final = 1.5
 """Noise ratio from the lines up to which the stated noise stands [1]: the median residual of a few
 clicks exceeds it by chance."""
 
@@ -296,14 +296,14 @@ def refine_and_judge(
 
     first = refine(problem, fit)
     tried = [(fit, first)]
-    for factor in _WIDER:
+    for factor in _NOISE_FACTORS:
         if tried[-1][1].refined:
             break
         wider, rough = scale_noise(problem, factor, settings)
         other = fit_inliers(wider, fit.row, rough)
         tried.append((other, refine(wider, other)))
     if not tried[-1][1].refined:
-        widest = scale_noise(problem, _WIDER[-1], settings)[0]
+        widest = scale_noise(problem, _NOISE_FACTORS[-1], settings)[0]
         tried += sorted(
             ((other, refine(widest, other)) for other in _leave_one_out_fits(widest, fit)),
             key=lambda one: -one[1].effective_samples,
@@ -345,7 +345,7 @@ def _judge(
     problem = _on_surface(found.problem, lines.estimate)
     row = camera_row(lines.estimate.camera)
     ratio = noise_ratio(problem, row)
-    factor = 1.0 if ratio <= _AS_STATED else min(ratio, _WIDER[-1])
+    factor = 1.0 if ratio <= _MAX_STATED_RATIO else min(ratio, _NOISE_FACTORS[-1])
     wider = scale_noise(problem, factor, settings)[0]
     mahalanobis = mahalanobis_distances(wider, lines.estimate.estimate)
     inliers = mahalanobis < settings.wrong_click
@@ -358,7 +358,7 @@ def _judge(
     if not len(inliers):
         # Without points the drawn pixels hold the camera while the lines are searched again.
         other[:] = True
-        wider = scale_noise(problem, _WIDER[-1], settings)[0]
+        wider = scale_noise(problem, _NOISE_FACTORS[-1], settings)[0]
     rest = wider.select(inliers, fit.markings & other)
     scale = fit.noise_scale
     known = linearize_at(rest, row, scale, prior)

@@ -57,9 +57,9 @@ class PaintNoise:
     shift_px: float
     reading: float
 
-    def differs_from(self, other: PaintNoise, share: float) -> bool:
-        """Return whether a standard deviation differs from another's by more than a share."""
-        return bool(np.abs(np.divide(astuple(self), astuple(other)) - 1.0).max() >= share)
+    def relative_difference(self, other: PaintNoise) -> float:
+        """Return the largest relative difference of a standard deviation from another's [1]."""
+        return float(np.abs(np.divide(astuple(self), astuple(other)) - 1.0).max())
 
     def update(self, least: PaintNoise, paint: PaintUnknowns, residuals: Floats) -> PaintNoise:
         """Return the noise after one step of the evidence maximization.

@@ -221,34 +221,34 @@ _MAX_PASSES: Final = 8
 """Maximum iterations of search and fit; one or two from ordinary clicks."""
 _COARSE_ERROR: Final = 1.0
 """Standard deviation of a detected bar before its subpixel fit [px]."""
-_FEW: Final = 500
+_COARSE: Final = 500
 """Approximate number of samples in coarse iterations [1]."""
 _MIN_REACH: Final = 1.5
 """Margin of the search beyond three standard deviations [px]."""
-_FINE: Final = 5.5
+_FINE_REACH: Final = 5.5
 """Search width up to which bars are fitted to subpixel accuracy [px]."""
-_BEST: Final = 1.0 / 3.0
+_SEARCHED_SHARE: Final = 1.0 / 3.0
 """Share of the samples to search where all have a large uncertainty [1]."""
-_MOSTLY: Final = 0.8
+_FINE_SHARE: Final = 0.8
 """Minimum share of the samples within this search width [1]."""
 _MAX_FITS: Final = 4
 """Maximum fits to subpixel bars, each relinearized at the last camera."""
-_SETTLED: Final = 0.02
+_MIN_MOTION: Final = 0.02
 """Maximum sample displacement at which these fits stop [px]."""
-_NO_WEIGHT: Final = 1e-3
+_MIN_WEIGHT: Final = 1e-3
 """Weight up to which a sample is excluded from the result [1]."""
-_READING: Final = 0.05
+_MIN_READING_STD: Final = 0.05
 """Minimum standard deviation of a fitted bar [px]."""
-_FAINT: Final = 0.5
+_MIN_STRENGTH: Final = 0.5
 """Strength of a bar below which it is no paint, relative to its marking's median [1]."""
-_SHARP: Final = 1.5
+_FULL_WIDTH: Final = 1.5
 """Width of paint from which its middle is as bright as the paint [px]."""
-_BEFORE: Final = PaintNoise(points_m=0.0, unevenness_m=0.02, shift_px=0.0, reading=2.5)
+_INITIAL_NOISE: Final = PaintNoise(points_m=0.0, unevenness_m=0.02, shift_px=0.0, reading=2.5)
 """Noise with which the search begins: that of a real pitch on artificial turf."""
-_LITTLE: Final = 1e-3
+_WEAK_TRUST: Final = 1e-3
 """Weight of the start while the noise is learned [1]."""
 _LEARN_PASSES: Final = 40
-_LEARNED: Final = 0.01
+_NOISE_TOLERANCE: Final = 0.01
 """Relative change of the noise at which learning stops [1]."""
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
 _FINE_SCALES: Final = (12.0, 6.0)
@@ -296,7 +296,7 @@ class LineSearch:
         self.start, self.grey, self.settings = start, grey, settings
         self.least = stated_noise(survey_error, settings.line_shift_px)
         self.noise = PaintNoise(
-            *(max(pair) for pair in zip(astuple(self.least), astuple(_BEFORE), strict=True))
+            *(max(pair) for pair in zip(astuple(self.least), astuple(_INITIAL_NOISE), strict=True))
         )
         self.whites = white_structures(pitch)
         spread = np.sqrt(np.diag(start.covariance))
@@ -328,7 +328,7 @@ class LineSearch:
         """
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         surface = begin.surface
-        few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _FEW))]
+        few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _COARSE))]
         found = None
         for left in reversed(range(_MAX_PASSES)):
             chosen = few
@@ -336,7 +336,7 @@ class LineSearch:
             if seen.visible.sum() < 0.5 * self.settings.min_found:
                 return None
             reach, sure = self._reach(seen, covariance)
-            fine = left == 0 or bool((sure <= _FINE)[seen.visible].mean() >= _MOSTLY)
+            fine = left == 0 or bool((sure <= _FINE_REACH)[seen.visible].mean() >= _FINE_SHARE)
             if fine:
                 seen = self.look(camera, samples)
                 alone = self.clear(camera, samples, seen)
@@ -385,11 +385,11 @@ class LineSearch:
                 seen=self.look(found.camera, found.samples),
                 measured=replace(found.measured, variances=variances),
             )
-            adjusted = self._adjust(now, (np.inf, 2.0 * scale, scale), trust=_LITTLE)
+            adjusted = self._adjust(now, (np.inf, 2.0 * scale, scale), trust=_WEAK_TRUST)
             known = np.isfinite(adjusted.residuals)
             scaled = (adjusted.residuals / np.sqrt(variances))[known]
             self.noise = before.update(self.least, adjusted.paint, scaled)
-            if not self.noise.differs_from(before, _LEARNED):
+            if self.noise.relative_difference(before) < _NOISE_TOLERANCE:
                 break
         measured = replace(found.measured, variances=own * self.noise.reading**2)
         seen = self.look(found.camera, found.samples)
@@ -409,7 +409,7 @@ class LineSearch:
     def collect_bars(self, found: LineFit) -> Bars:
         """Return the bars that contribute to a fit."""
         seen, weights = found.seen, found.adjusted.weights
-        used = weights > _NO_WEIGHT
+        used = weights > _MIN_WEIGHT
         pixels = seen.places + found.measured.offsets[:, None] * seen.normals
         variances = found.measured.variances[used] / weights[used]
         return Bars(
@@ -444,7 +444,7 @@ class LineSearch:
             seen = self.look(at.camera, at.samples)
             offsets = ((bars - seen.places) * seen.normals).sum(-1)
             at = replace(at, seen=seen, measured=replace(at.measured, offsets=offsets))
-            if moved.max(initial=0.0) < _SETTLED:
+            if moved.max(initial=0.0) < _MIN_MOTION:
                 break
         return LineFit(at.camera, at.surface, at.samples, at.seen, at.measured, adjusted)
 
@@ -482,7 +482,7 @@ class LineSearch:
         """
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
-        limit = max(s.search_px, float(np.quantile(reach[seen.visible], _BEST)))
+        limit = max(s.search_px, float(np.quantile(reach[seen.visible], _SEARCHED_SHARE)))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
         looked = np.where(usable, reach, -1.0)
@@ -498,7 +498,7 @@ class LineSearch:
             return MeasuredBars(best, np.full(count, _COARSE_ERROR**2))
         exact, variances = np.empty(count), np.empty(count)
         fit_bars(self.grey, seen.sections, best, s.contrast, exact, variances)
-        return MeasuredBars(exact, (variances + _READING**2) * self.noise.reading**2)
+        return MeasuredBars(exact, (variances + _MIN_READING_STD**2) * self.noise.reading**2)
 
     def _adjust(self, at: MeasuredLines, scales: tuple[float, ...], trust: float = 1.0) -> LineStep:
         """Return the step from a camera to the best one.
@@ -539,10 +539,10 @@ def _drop_faint(offsets: Floats, strengths: Floats, marking: Integers, widths: F
     Rough grass has bars as well; paint of one marking is about equally bright along it, and blurred
     where it is narrower than a pixel.
     """
-    bright = strengths / np.minimum(widths / _SHARP, 1.0)[:, None]
+    bright = strengths / np.minimum(widths / _FULL_WIDTH, 1.0)[:, None]
     for index in np.unique(marking):
         mine = marking == index
         strongest = bright[mine, 0]
         if (strongest > 0.0).any():
-            faint = bright[mine] < _FAINT * np.median(strongest[strongest > 0.0])
+            faint = bright[mine] < _MIN_STRENGTH * np.median(strongest[strongest > 0.0])
             offsets[mine] = np.where(faint, np.nan, offsets[mine])

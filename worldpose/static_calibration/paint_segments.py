@@ -25,7 +25,7 @@ stay one pixel wide."""
 _GREEN: Final = (22, 95)
 """Hues of grass in OpenCV's range of 180 [1]: yellow-green of dry grass to blue-green of flood
 light."""
-_RARE: Final = 0.1
+_MIN_HUE_SHARE: Final = 0.1
 """Hues of grass are as frequent as this share of the most frequent one [1]: mowing stripes and
 shadows differ by up to 25 hues."""
 _MIN_SATURATION: Final = 25
@@ -37,7 +37,7 @@ _CLOSING: Final = 31
 _DIRECTIONS: Final = 12
 """Directions of ridges to try [1]: 15 degrees apart."""
 _HALF_WIDTHS: Final = (3.0, 5.0, 8.0)
-"""Distances between a ridge's middle and the grass beside it [px]."""
+"""Distances between a ridge's middle and the grass on either side [px]."""
 _CONTRAST: Final = (4.0, 8.0)
 """Least and greatest minimum brightness of a ridge above both sides, CIE L in 0 to 255 [1]: faded
 paint has 10 to 20, thin far lines and fog 4 to 8."""
@@ -45,7 +45,7 @@ _ABOVE_NOISE: Final = 6.0
 """This minimum, in medians of all ridges [1]: nearly all are noise of the grass, of 0.5 to 4."""
 _MIN_EXTENT: Final = 20
 """Minimum extent of connected ridge pixels [px]; shorter ones are noise of the grass."""
-_CROWDED: Final = (41, 0.12)
+_CLUTTER: Final = (41, 0.12)
 """Size of a neighborhood [px], and share of ridges in it [1] from which they are no paint: trees,
 nets, letters and people have more than the crossing of two lines."""
 _ANGLES: Final = 360
@@ -70,9 +70,9 @@ _BEND_DOUBT: Final = 0.6
 _OTHER_BENDS: Final = (1.0, 0.8, 0.65)
 """Displacements to offer for a bent image, of the one that makes the most paint straight [1]: a
 single long line prefers one that is too large."""
-_COMPARED: Final = 8
+_COMPARED_SEGMENTS: Final = 8
 """Segments whose lengths are compared [1]."""
-_MIN_FLAT: Final = 0.35
+_MIN_STRAIGHT_FOCAL: Final = 0.35
 """Minimum focal length of the straight copy, of the image's [1]: rims of very wide lenses are
 cut."""
 _MAX_SEGMENTS: Final = 24
@@ -175,7 +175,7 @@ def thin_ridges(strength: NDArray[np.float32], normal: Floats) -> Ridges:
     large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= _MIN_EXTENT
     large[0] = False
     thin &= large[labels].astype(np.uint8)
-    around, share = _CROWDED
+    around, share = _CLUTTER
     crowded = cv2.boxFilter(thin, cv2.CV_32F, (around, around)) > share
     y, x = np.nonzero((thin > 0) & ~crowded)
     return Ridges(np.stack([x, y], axis=-1).astype(np.float64), normal[y, x])
@@ -259,15 +259,15 @@ def _flatten(
     reach = float(np.abs(lens.normalize(rim)[:, 0]).max())
     reduced = float(lens.focal[0]) * scale
     focal = 0.5 * width / reach if np.isfinite(reach) else 0.0
-    focal = float(np.clip(focal, _MIN_FLAT * reduced, reduced))
+    focal = float(np.clip(focal, _MIN_STRAIGHT_FOCAL * reduced, reduced))
     # A second place tells how the direction of a ridge turns.
     along = np.stack([-np.sin(ridges.normals), np.cos(ridges.normals)], axis=-1)
-    flat, beside = (
+    flat, stepped = (
         lens.normalize(places) * focal + middle for places in (origins, origins + along)
     )
-    kept = np.isfinite(flat).all(axis=1) & np.isfinite(beside).all(axis=1)
+    kept = np.isfinite(flat).all(axis=1) & np.isfinite(stepped).all(axis=1)
     kept &= (flat >= 0.0).all(axis=1) & (flat <= [width - 1, height - 1]).all(axis=1)
-    flat, step = flat[kept], (beside - flat)[kept]
+    flat, step = flat[kept], (stepped - flat)[kept]
     normals = (np.arctan2(step[:, 1], step[:, 0]) + 0.5 * np.pi) % np.pi
     return Ridges(flat, normals), origins[kept], focal
 
@@ -278,7 +278,7 @@ def _find_lenses(ridges: Ridges, image_size: tuple[int, int], scale: float) -> t
     straight = []
     for bend in _BENDS:
         flat = _flatten(ridges, guess_lens(bend, image_size), scale, size)[0]
-        segments = _find_segments(flat, float(np.hypot(size[0], size[1])), _COMPARED)
+        segments = _find_segments(flat, float(np.hypot(size[0], size[1])), _COMPARED_SEGMENTS)
         straight.append(sum(count for count, _ in segments))
     straightest = guess_lens(0.0, image_size)
     if straight[0] >= _BEND_GAIN * max(straight):
@@ -333,7 +333,7 @@ def _find_grass(picture: Image, where: str) -> NDArray[np.bool_]:
         )
     counts = np.bincount(hue[lower], minlength=180).astype(np.float64)
     counts = np.convolve(counts, np.ones(7), mode="same")
-    rare = np.flatnonzero(counts < _RARE * counts.max())
+    rare = np.flatnonzero(counts < _MIN_HUE_SHARE * counts.max())
     peak = int(counts.argmax())
     first = max(_GREEN[0], int(rare[rare < peak].max(initial=-1)) + 1)
     last = min(_GREEN[1], int(rare[rare > peak].min(initial=180)) - 1)
@@ -362,19 +362,20 @@ def _find_ridges(
     picture: Image, grass: NDArray[np.bool_], area: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], Floats]:
     """Return contrasts (height, width) of ridges one pixel wide, and angles of normals [rad]."""
-    light = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[..., 0], dtype=np.float32)
-    light = np.asarray(cv2.GaussianBlur(light, (0, 0), 0.8), dtype=np.float32)
-    beside = np.asarray(cv2.GaussianBlur(grass.astype(np.float32), (0, 0), 1.5), dtype=np.float32)
-    best = np.zeros(light.shape, np.float32)
-    angle = np.zeros(light.shape)
+    lightness = _smooth_lightness(picture)
+    green = np.asarray(cv2.GaussianBlur(grass.astype(np.float32), (0, 0), 1.5), dtype=np.float32)
+    best = np.zeros(lightness.shape, np.float32)
+    angle = np.zeros(lightness.shape)
     for theta in np.arange(_DIRECTIONS) * (np.pi / _DIRECTIONS):
         normal = np.array([np.cos(theta), np.sin(theta)])
         along = np.array([-normal[1], normal[0]])
         for half in _HALF_WIDTHS:
-            left, right = (_shift(light, way * half * normal) for way in (1.0, -1.0))
-            green, others = (_shift(beside, way * (half + 1.0) * normal) for way in (1.0, -1.0))
-            contrast: NDArray[np.float32] = np.asarray(light - np.maximum(left, right), np.float32)
-            contrast[np.minimum(green, others) < 0.5] = 0.0
+            left, right = (_shift(lightness, way * half * normal) for way in (1.0, -1.0))
+            one, other = (_shift(green, way * (half + 1.0) * normal) for way in (1.0, -1.0))
+            contrast: NDArray[np.float32] = np.asarray(
+                lightness - np.maximum(left, right), np.float32
+            )
+            contrast[np.minimum(one, other) < 0.5] = 0.0
             contrast += _shift(contrast, 3.0 * along) + _shift(contrast, -3.0 * along)
             contrast /= 3.0
             better = contrast > best
@@ -392,6 +393,12 @@ def _find_ridges(
         )
         highest &= smooth >= there
     return np.where(highest, best, np.float32(0.0)), angle
+
+
+def _smooth_lightness(picture: Image) -> NDArray[np.float32]:
+    """Return the blurred CIE L (height, width) of an RGB image, in 0 to 255."""
+    lightness = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[..., 0], dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(lightness, (0, 0), 0.8), dtype=np.float32)
 
 
 def _shift(values: NDArray[np.float32], by: Floats) -> NDArray[np.float32]:
@@ -433,10 +440,8 @@ def _find_segments(ridges: Ridges, diagonal: float, most: int) -> list[tuple[int
         row, column = np.unravel_index(int(votes.argmax()), votes.shape)
         if votes[row, column] < _MIN_LENGTH * _MIN_FILL:
             break
-        voted, middle = (
-            np.array([np.cos(thetas[row]), np.sin(thetas[row])]),
-            2.0 * column - diagonal,
-        )
+        voted = np.array([np.cos(thetas[row]), np.sin(thetas[row])])
+        middle = 2.0 * column - diagonal
         near, across, offset = _fit_line(points, angles, voted, middle)
         segments += _split(points[near], across, offset)
         # The voters go too where they form no line; else they would win again.
@@ -454,7 +459,12 @@ def _fit_line(
 ) -> tuple[NDArray[np.bool_], Floats, float]:
     """Return the mask of a line's pixels, its normal (2,) and its offset [px]."""
     near = np.zeros(len(points), np.bool_)
-    for tolerance in (3.0 * _TOLERANCE, 2.0 * _TOLERANCE, 1.5 * _TOLERANCE, _TOLERANCE):
+    for tolerance in (
+        3.0 * _TOLERANCE,
+        2.0 * _TOLERANCE,
+        1.5 * _TOLERANCE,
+        _TOLERANCE,
+    ):
         turned = _angle_between(angles, np.arctan2(across[1], across[0]))
         near = (np.abs(points @ across - offset) < tolerance) & (turned < 0.3)
         if np.count_nonzero(near) < 10:
@@ -469,17 +479,17 @@ def _fit_line(
 def _split(points: Floats, across: Floats, offset: float) -> list[tuple[int, Floats]]:
     """Return pixels of paint and ends (2, 2) of the line's segments that are long and filled."""
     along = np.array([-across[1], across[0]])
-    way = np.sort(points @ along)
-    if not len(way):
+    places = np.sort(points @ along)
+    if not len(places):
         return []
-    gaps = np.flatnonzero(np.diff(way) > _MAX_GAP)
-    starts, stops = np.append(0, gaps + 1), np.append(gaps, len(way) - 1)
+    gaps = np.flatnonzero(np.diff(places) > _MAX_GAP)
+    starts, stops = np.append(0, gaps + 1), np.append(gaps, len(places) - 1)
     segments = []
     for start, stop in zip(starts, stops, strict=True):
-        length = way[stop] - way[start]
+        length = places[stop] - places[start]
         count = int(stop - start + 1)
         if length > _MIN_LENGTH and count > _MIN_FILL * length:
-            segments.append((count, across * offset + np.outer(way[[start, stop]], along)))
+            segments.append((count, across * offset + np.outer(places[[start, stop]], along)))
     return segments
 
 
@@ -506,8 +516,8 @@ _TRACE_TRIALS: Final = 400
 def trace_marking(picture: Image, pixels: Floats) -> Floats:
     """Return pixels (n, 2) on thin paint along a projected marking; none if there is no clear one.
 
-    The paint of a far line is thinner than a pixel and a few pixels beside its projection. Beside
-    it are letters, boards and people. The ridge counts that follows one smooth curve.
+    The paint of a far line is thinner than a pixel and a few pixels away from its projection, among
+    letters, boards and people. The ridge that follows one smooth curve is the paint.
 
     Args:
         picture: (height, width, 3) RGB.
@@ -518,30 +528,17 @@ def trace_marking(picture: Image, pixels: Floats) -> Floats:
     pixels = pixels[inside]
     if len(pixels) < 2:
         return np.zeros((0, 2))
-    way = np.append(0.0, np.linalg.norm(np.diff(pixels, axis=0), axis=1).cumsum())
-    places = np.arange(0.0, way[-1], _TRACE_SPACING)
+    lengths = np.append(0.0, np.linalg.norm(np.diff(pixels, axis=0), axis=1).cumsum())
+    places = np.arange(0.0, lengths[-1], _TRACE_SPACING)
     if len(places) < _TRACE_MIN:
         return np.zeros((0, 2))
-    at = np.stack([np.interp(places, way, pixels[:, axis]) for axis in (0, 1)], axis=1)
+    at = np.stack([np.interp(places, lengths, pixels[:, axis]) for axis in (0, 1)], axis=1)
     along = np.gradient(at, axis=0)
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    reach = _TRACE_REACH * width
-    offsets = np.arange(-reach, reach + _TRACE_STEP, _TRACE_STEP)
-    cuts = (at[:, None] + offsets[:, None] * normals[:, None]).astype(np.float32)
-    light = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[..., 0], dtype=np.float32)
-    light = np.asarray(cv2.GaussianBlur(light, (0, 0), 0.8), dtype=np.float32)
-    profiles = cv2.remap(light, cuts[..., 0], cuts[..., 1], cv2.INTER_LINEAR)
-    side = round(2.0 / _TRACE_STEP)
-    middle = profiles[:, side:-side]
-    contrast = middle - np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
-    peak = contrast >= _TRACE_CONTRAST
-    peak[:, 1:] &= contrast[:, 1:] >= contrast[:, :-1]
-    peak[:, :-1] &= contrast[:, :-1] > contrast[:, 1:]
-    row, column = np.nonzero(peak)
+    row, ridge = _find_section_ridges(picture, at, normals)
     if len(np.unique(row)) < _TRACE_MIN:
         return np.zeros((0, 2))
-    ridge = offsets[side:-side][column]
     share = row / max(1, len(places) - 1)
     on = _follow_curve(row, share, ridge)
     if len(np.unique(row[on])) < max(_TRACE_MIN, _TRACE_SHARE * len(places)):
@@ -551,6 +548,30 @@ def trace_marking(picture: Image, pixels: Floats) -> Floats:
     if len(np.unique(row[others][rival])) > _TRACE_RIVAL * len(np.unique(row[on])):
         return np.zeros((0, 2))
     return np.asarray(at[row[on]] + ridge[on, None] * normals[row[on]])
+
+
+def _find_section_ridges(picture: Image, at: Floats, normals: Floats) -> tuple[Integers, Floats]:
+    """Return the cross sections (k,) of ridges, and the ridges' offsets (k,) in them [px].
+
+    Args:
+        picture: (height, width, 3) RGB.
+        at: (n, 2) middles of the cross sections [px].
+        normals: (n, 2) their directions.
+    """
+    reach = _TRACE_REACH * picture.shape[1]
+    offsets = np.arange(-reach, reach + _TRACE_STEP, _TRACE_STEP)
+    pixels = (at[:, None] + offsets[:, None] * normals[:, None]).astype(np.float32)
+    profiles = cv2.remap(
+        _smooth_lightness(picture), pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR
+    )
+    side = round(2.0 / _TRACE_STEP)
+    flanks = np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
+    contrast = profiles[:, side:-side] - flanks
+    peak = contrast >= _TRACE_CONTRAST
+    peak[:, 1:] &= contrast[:, 1:] >= contrast[:, :-1]
+    peak[:, :-1] &= contrast[:, :-1] > contrast[:, 1:]
+    row, column = np.nonzero(peak)
+    return row, offsets[side:-side][column]
 
 
 def _follow_curve(row: Integers, share: Floats, ridge: Floats) -> NDArray[np.bool_]:

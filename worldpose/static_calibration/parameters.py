@@ -177,11 +177,11 @@ SIZE: Final = 12
 PRIORS: Final = 9
 """Rows of the prior: focal, cx, cy, k1, k2, k3, height, distance, roll."""
 
-_LOST: Final = 1e3
+_LOST_RESIDUAL: Final = 1e3
 """Residual [px] of points that the camera cannot image: larger than any true residual."""
-_NEAR: Final = 0.5
+_MIN_DEPTH: Final = 0.5
 """Minimum depth of a drawn marking's sample [m]."""
-_REACH: Final = 1.5
+_MAX_RADIUS: Final = 1.5
 """Radius, in half image diagonals, up to which samples are distorted: beyond, polynomials may fold
 a marking back into the image."""
 
@@ -223,7 +223,7 @@ def point_residuals(
                 image[0, i], full[0, i], status[0, i] = pixel[0, 0], by_all[0, 0], code[0, 0]
         for k in range(2):
             if status[0, i] != 0:
-                residual[i, k] = _LOST
+                residual[i, k] = _LOST_RESIDUAL
                 jacobian[i, k] = 0.0
                 continue
             d = full[0, i, k]
@@ -265,12 +265,12 @@ def nearest_on_markings(
         place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.
         normal: (d, 2), written: from the marking to the pixel, either sign.
     """
-    cap = min((_REACH * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
+    cap = min((_MAX_RADIUS * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
     image = np.empty((len(samples), 2))
     for i in range(len(samples)):
         p = samples[i]
         z = c[15] * p[0] + c[16] * p[1] + c[17] * p[2] + c[20]
-        if z < _NEAR:
+        if z < _MIN_DEPTH:
             image[i] = np.nan
             continue
         x = (c[9] * p[0] + c[10] * p[1] + c[11] * p[2] + c[18]) / z
@@ -328,8 +328,8 @@ def drawn_residuals(
     by_step = np.empty((n, 2, SIZE))
     point_residuals(c, place, pixels, both, by_step)
     for i in range(n):
-        if np.isnan(place[i, 0]) or both[i, 0] == _LOST:
-            residual[i] = _LOST
+        if np.isnan(place[i, 0]) or both[i, 0] == _LOST_RESIDUAL:
+            residual[i] = _LOST_RESIDUAL
             jacobian[i] = 0.0
             continue
         residual[i] = normal[i, 0] * both[i, 0] + normal[i, 1] * both[i, 1]

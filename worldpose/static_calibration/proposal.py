@@ -57,17 +57,17 @@ MIN_FOUND: Final = 0.6
 MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
-_WELL: Final = (0.75, 0.6)
+_CLEAR_SHARES: Final = (0.75, 0.6)
 """Both shares; a clear camera that reaches neither of these does not end the search [1]."""
-_AGREES: Final = 0.01
+_MAX_DISPLACEMENT: Final = 0.01
 """Maximum median displacement of markings by the calibration, in image widths [1]."""
 _TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
 _COARSE: Final = (6.0, 8.0)
-_SAMPLED: Final = (2.5, 6.0)
+_MEDIUM: Final = (2.5, 6.0)
 _FINE: Final = (1.0, 2.0)
 """Spacing of samples [m], and standard deviation of their distance from paint [px]: for all
 candidates, for good ones, and for refined ones."""
-_GOOD: Final = 8000
+_MAX_SCORED: Final = 8000
 """Candidates to judge on closer samples [1]."""
 _REFINED: Final = 60
 """Candidates to refine [1]."""
@@ -76,11 +76,11 @@ _RADII: Final = (25.0, 12.0, 6.0, 5.0)
 _POLISHED: Final = (10, (15.0, 8.0, 5.0, 5.0))
 """Best different candidates to refine once more [1], with k1 free from the start, and distances of
 the stages [px]."""
-_SAME: Final = 8.0
+_SAME_CAMERA: Final = 8.0
 """Median displacement of the markings below which two cameras are the same proposal [px]."""
-_DRAWN: Final = 40
+_MAX_DRAWN: Final = 40
 """Maximum pixels to draw along a marking [1]."""
-_DRAWN_SHARE: Final = 0.4
+_MIN_DRAWN_SHARE: Final = 0.4
 """Minimum share on paint of a marking that the calibration uses [1]: thin far lines are found in
 pieces."""
 _ON_PAINT: Final = 4.0
@@ -268,15 +268,15 @@ def propose_from_paint(
     paint, ranked, scores = found
     samples, best = sample_markings(pitch, _FINE[0]), _stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)
-    markings, drawn = _support(paint, samples, seen)
+    markings, drawn = _measure_support(paint, samples, seen)
     return Proposal(
         _to_camera(best, paint),
         drawn,
         markings,
         float(scores[0]),
-        float(scores[0]) - _second(scores),
-        _on_paint(seen),
-        explained_share(paint, seen, 3.0 * _ON_PAINT),
+        float(scores[0]) - _runner_up(scores),
+        _share_on_paint(seen),
+        explained_share(paint, seen),
     )
 
 
@@ -356,14 +356,14 @@ def calibrate_proposal(
         kept = (each for each in proposal.drawn.drawn if each.name not in names)
         calibration = calibrate(ClickedMarkings(drawn=(*kept, *thin)))
     lines = calibration.report.lines  # each camera has its own ground
-    there = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
-    pixels, others = (
+    surfaced = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
+    pixels, calibrated_pixels = (
         camera.project(ground.sample_lines(_FINE[0]).points_world)
-        for camera, ground in ((proposal.camera, pitch), (calibration.estimate.camera, there))
+        for camera, ground in ((proposal.camera, pitch), (calibration.estimate.camera, surfaced))
     )
     inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
-    moved = float(np.median(np.linalg.norm(pixels - others, axis=1)[inside]))
-    if not moved < _AGREES * width:
+    moved = float(np.median(np.linalg.norm(pixels - calibrated_pixels, axis=1)[inside]))
+    if not moved < _MAX_DISPLACEMENT * width:
         raise InputError(
             where,
             expected="the calibration close to the proposal of the image",
@@ -413,18 +413,18 @@ def _rank_under_lenses(
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        if best is not None and best[2][0] - _second(best[2]) >= MIN_MARGIN:
+        if best is not None and best[2][0] - _runner_up(best[2]) >= MIN_MARGIN:
             break
     return best
 
 
-def _on_paint(seen: SeenMarkings) -> float:
+def _share_on_paint(seen: SeenMarkings) -> float:
     """Return the share of the first camera's markings that lies on paint [1]."""
     lengths, near = seen.lengths[0], seen.distances[0] < _ON_PAINT
     return float((lengths * near).sum() / max(lengths.sum(), 1e-9))
 
 
-def _second(scores: Floats) -> float:
+def _runner_up(scores: Floats) -> float:
     """Return the score of the best other camera, or that of none [1]."""
     return max(0.0, float(scores[1])) if len(scores) > 1 else 0.0
 
@@ -442,13 +442,13 @@ def rank_cameras(
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
     samples = sample_markings(pitch, _FINE[0])
-    if len(scores) and scores[0] - _second(scores) >= MIN_MARGIN:
+    if len(scores) and scores[0] - _runner_up(scores) >= MIN_MARGIN:
         seen = project_markings(paint, samples, best[:1])
-        shares = _on_paint(seen), explained_share(paint, seen, 3.0 * _ON_PAINT)
-        if np.greater_equal(shares, _WELL).any():
+        shares = _share_on_paint(seen), explained_share(paint, seen)
+        if np.greater_equal(shares, _CLEAR_SHARES).any():
             return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
-    return _order(paint, samples, join_candidates(best, rolled), np.append(scores, others))
+    return _rank(paint, samples, join_candidates(best, rolled), np.append(scores, others))
 
 
 def _rank_rolled(
@@ -463,20 +463,20 @@ def _rank_rolled(
     circles = join_candidates(*(name_circles(paint, pitch, focals, roll) for roll in rolls))
     if not len(found) + len(circles):
         return found, np.zeros(0)
-    if len(found) > _GOOD:
+    if len(found) > _MAX_SCORED:
         found = _keep_best(paint, sample_markings(pitch, _COARSE[0]), found, prior, _COARSE[1])
-    samples = sample_markings(pitch, _SAMPLED[0])
+    samples = sample_markings(pitch, _MEDIUM[0])
     # The vote for circles is coarse: bins of 8 to 15 %.
     near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
     # Apart: circles are refined already, and would crowd out better ones of three lines.
-    found, near = (_keep_best(paint, samples, each, prior, _SAMPLED[1]) for each in (found, near))
+    found, near = (_keep_best(paint, samples, each, prior, _MEDIUM[1]) for each in (found, near))
     found = join_candidates(_thin_out(found[: 10 * _REFINED]), _thin_out(near[: 10 * _REFINED]))
     samples = sample_markings(pitch, _FINE[0])
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
         found = refine_candidates(paint, samples, found[:count], radii, free)
         scores = score_with_prior(paint, samples, found, prior, _FINE[1])
-        found, scores = _order(paint, samples, found, scores)
+        found, scores = _rank(paint, samples, found, scores)
     return found, scores
 
 
@@ -485,17 +485,17 @@ def _keep_best(
 ) -> Candidates:
     """Return the good candidates, the best first."""
     scores = score_with_prior(paint, samples, found, prior, spread)
-    return found[np.argsort(-scores, kind="stable")[:_GOOD]]
+    return found[np.argsort(-scores, kind="stable")[:_MAX_SCORED]]
 
 
-def _order(
+def _rank(
     paint: PaintMap, samples: LineSamples, found: Candidates, scores: Floats
 ) -> tuple[Candidates, Floats]:
     """Return different cameras on the near side, the best first, and their scores (k,)."""
     order = np.argsort(-scores, kind="stable")
     # Behind a goal refinement moves cameras across the long axis: half a turn makes them equal.
     found, scores = _stand_on(found[order], "near"), scores[order]
-    different = _different(paint, samples, found)
+    different = _distinct(paint, samples, found)
     return found[different], scores[different]
 
 
@@ -520,7 +520,7 @@ def _thin_out(candidates: Candidates) -> Candidates:
     return candidates[np.array(kept, dtype=np.int64)]
 
 
-def _different(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
+def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
     """Return indices of the candidates whose markings lie elsewhere than those of all before."""
     seen = project_markings(paint, samples, candidates)
     visible = seen.lengths > 0.0
@@ -530,7 +530,7 @@ def _different(paint: PaintMap, samples: LineSamples, candidates: Candidates) ->
             either = visible[index] & visible[before]
             moved = np.linalg.norm(seen.pixels[index] - seen.pixels[before], axis=-1)[either]
             shared = np.count_nonzero(either) > 0.8 * np.count_nonzero(visible[before])
-            if shared and len(moved) and np.median(moved) < _SAME:
+            if shared and len(moved) and np.median(moved) < _SAME_CAMERA:
                 break
         else:
             kept.append(index)
@@ -549,7 +549,7 @@ def _stand_on(candidates: Candidates, side: Side) -> Candidates:
     )
 
 
-def _support(
+def _measure_support(
     paint: PaintMap, samples: LineSamples, seen: SeenMarkings
 ) -> tuple[tuple[MarkingSupport, ...], ClickedMarkings]:
     """Return each visible marking's support, and the pixels of those that were found."""
@@ -562,10 +562,10 @@ def _support(
         on = mine & (seen.distances[0] < _ON_PAINT)
         found = float(seen.lengths[0, on].sum()) / length
         support.append(MarkingSupport(name, length, found))
-        if found * length < INDEPENDENT * paint.size[0] or found < _DRAWN_SHARE:
+        if found * length < INDEPENDENT * paint.size[0] or found < _MIN_DRAWN_SHARE:
             continue
         nearest, place = np.unique(seen.nearest[0, on], return_index=True)
-        chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _DRAWN)).astype(np.int64)
+        chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _MAX_DRAWN)).astype(np.int64)
         chosen = chosen[np.argsort(place[chosen])]  # in order along the marking
         pixels = paint.origins[nearest[chosen]]
         drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))

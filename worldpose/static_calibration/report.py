@@ -12,8 +12,8 @@ from data_contracts.cameras import LensCalibration
 from worldpose.geometry import Camera, RayStatus
 from worldpose.geometry.cameras import camera_arrays
 from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration.adjustment import Problem, camera_row
-from worldpose.static_calibration.click_outliers import Explanation, compute_residuals
+from worldpose.static_calibration.adjustment import Problem, camera_row, compute_residuals
+from worldpose.static_calibration.click_outliers import Explanation, InlierFit
 from worldpose.static_calibration.ground_error import (
     GroundErrorMap,
     ground_error_map,
@@ -130,9 +130,9 @@ _CANNOT_IMAGE: Final = {
     RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
     RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
 }
-_SAME: Final = 0.01
+_MIN_SCALE_CHANGE: Final = 0.01
 """Difference from the stated noise too small to report [1]."""
-_TRUSTED: Final = 4.0
+_MAX_MISFIT: Final = 4.0
 """Maximum mean loss per observation [1] without a warning: twice the stated noise."""
 
 
@@ -157,69 +157,40 @@ def build_report(
         stated: stated click noise [px].
     """
     problem, fit, settings = found.problem, found.fit, found.settings
-    decisions = found.assumptions
-    scale = fit.noise_scale * settings.click_noise_px / stated
     evidence = problem.evidence
-    rows = compute_residuals(problem, camera_row(estimate.camera))
-    problems = image_problems(estimate.camera, evidence.points_world)
-    imaged = np.array([not problem for problem in problems], dtype=np.bool_)
-    mahalanobis = np.where(imaged, fit.mahalanobis, np.inf)
-    ranked = np.argsort(-mahalanobis, kind="stable")
-    points = tuple(
-        PointResidual(
-            evidence.points[i],
-            evidence.points_image[i],
-            np.where(imaged[i], rows.click[i], np.nan),
-            float(mahalanobis[i]),
-            bool(fit.inliers[i]),
-            "" if fit.inliers[i] else problems[i] or _distance(rows.click[i]),
-        )
-        for i in ranked
-    )
+    scale = fit.noise_scale * settings.click_noise_px / stated
+    residuals = compute_residuals(problem, camera_row(estimate.camera))
+    points = _point_residuals(estimate.camera, found, residuals.click)
     drawn = [
         _marking_residual(
-            name, rows.drawn[evidence.drawn_marking == index], bool(fit.markings[index])
+            name, residuals.drawn[evidence.drawn_marking == index], bool(fit.markings[index])
         )
         for index, name in enumerate(evidence.markings)
     ]
-    known = ground_error_map(estimate, pitch, settings.map_step_m)
-    reasons = []
-    if known.median > settings.weak_median_m:
-        reasons.append(
-            f"expected ground error {known.median:.2f} m (median over the seen pitch), "
-            f"over {settings.weak_median_m:g} m"
-        )
-    if known.p95 > settings.weak_p95_m:
-        reasons.append(
-            f"expected ground error {known.p95:.2f} m on the worst twentieth of the seen pitch, "
-            f"over {settings.weak_p95_m:g} m"
-        )
-    if fit.misfit > _TRUSTED * fit.noise_scale**2:
-        reasons.append(
-            f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
-        )
-    if abs(scale - 1.0) > _SAME:
-        decisions = (
-            *decisions,
+    ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
+    reasons = _accuracy_reasons(ground_error, fit, settings)
+    decisions = list(found.assumptions)
+    if abs(scale - 1.0) > _MIN_SCALE_CHANGE:
+        decisions.append(
             f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "
-            "calibration uses this noise",
+            "calibration uses this noise"
         )
-    if lines is not None and not lines.refined:
-        reasons.append(f"no painted lines to confirm it: {lines.reason}")
     if lines is not None:
         samples = f"{lines.effective_samples:.0f} independent samples" if lines.refined else "none"
-        decisions = (*decisions, f"painted lines: {lines.reason or samples}")
-    off = _lens_deviations(problem.lens, estimate.camera, problem.half_diagonal)
-    if off:
-        worst = max(off, key=lambda name: off[name])
-        said = f"the given lens: the {worst} is {off[worst]:.1f} standard deviations off it"
-        decisions = (*decisions, said)
-        if off[worst] > _LENS_CONTRADICTED:
+        decisions.append(f"painted lines: {lines.reason or samples}")
+        if not lines.refined:
+            reasons.append(f"no painted lines to confirm it: {lines.reason}")
+    deviations = _lens_deviations(problem.lens, estimate.camera, problem.half_diagonal)
+    if deviations:
+        worst = max(deviations, key=lambda name: deviations[name])
+        said = f"the given lens: the {worst} is {deviations[worst]:.1f} standard deviations off it"
+        decisions.append(said)
+        if deviations[worst] > _LENS_CONTRADICTED:
             reasons.append(
                 f"the clicks contradict {said}. Check that it is this camera's lens at this zoom "
                 "and image size, or state larger deviations"
             )
-    misnamed = [
+    decisions += [
         _true_name(int(index), estimate, problem, pitch, settings)
         for index in np.flatnonzero(~fit.markings)
     ]
@@ -227,7 +198,7 @@ def build_report(
     return CalibrationReport(
         stage="lines" if lines is not None and lines.refined else "points",
         free=tuple(name for name, free in zip(PARAMETERS, problem.free, strict=True) if free),
-        decisions=(*decisions, *misnamed),
+        decisions=tuple(decisions),
         points=points,
         drawn=tuple(sorted(drawn, key=lambda marking: -marking.rms)),
         wrong=(
@@ -238,12 +209,55 @@ def build_report(
         click_noise=fit.click_noise,
         click_freedom=fit.click_freedom,
         condition=_condition(fit.covariance, problem.free),
-        ground_error=known,
+        ground_error=ground_error,
         weak=bool(reasons),
         reasons=tuple(reasons),
         add_next=propose_clicks(estimate, pitch, clicked, settings.click_noise_px),
         lines=lines,
     )
+
+
+def _point_residuals(
+    camera: Camera, found: Explanation, residuals: NDArray[np.float64]
+) -> tuple[PointResidual, ...]:
+    """Return the residuals (n, 2) [px] of all clicks, by falling Mahalanobis distance."""
+    evidence, fit = found.problem.evidence, found.fit
+    problems = image_problems(camera, evidence.points_world)
+    imaged = np.array([not problem for problem in problems], dtype=np.bool_)
+    mahalanobis = np.where(imaged, fit.mahalanobis, np.inf)
+    return tuple(
+        PointResidual(
+            evidence.points[i],
+            evidence.points_image[i],
+            np.where(imaged[i], residuals[i], np.nan),
+            float(mahalanobis[i]),
+            bool(fit.inliers[i]),
+            "" if fit.inliers[i] else problems[i] or f"{np.linalg.norm(residuals[i]):.0f} px off",
+        )
+        for i in np.argsort(-mahalanobis, kind="stable")
+    )
+
+
+def _accuracy_reasons(
+    ground_error: GroundErrorMap, fit: InlierFit, settings: StaticCalibrationSettings
+) -> list[str]:
+    """Return why expected ground error and residuals require a review."""
+    reasons = []
+    if ground_error.median > settings.weak_median_m:
+        reasons.append(
+            f"expected ground error {ground_error.median:.2f} m (median over the seen pitch), "
+            f"over {settings.weak_median_m:g} m"
+        )
+    if ground_error.p95 > settings.weak_p95_m:
+        reasons.append(
+            f"expected ground error {ground_error.p95:.2f} m on the worst twentieth of the seen "
+            f"pitch, over {settings.weak_p95_m:g} m"
+        )
+    if fit.misfit > _MAX_MISFIT * fit.noise_scale**2:
+        reasons.append(
+            f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
+        )
+    return reasons
 
 
 def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ...]:
@@ -273,10 +287,6 @@ def _lens_deviations(
         "principal point": float(np.hypot(middle[0], middle[1])) / lens.principal_point_std_px,
         "distortion": float(np.abs(corner).max()) / lens.distortion_std,
     }
-
-
-def _distance(residual: NDArray[np.float64]) -> str:
-    return f"{float(np.linalg.norm(residual)):.0f} px off"
 
 
 def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:

@@ -26,12 +26,12 @@ _SHARES: Final = np.array([0.3, 0.6, 0.9])
 """Shares of one camera's people that the other may have found [1]; the likeliest counts."""
 _CALIBRATION_STD: Final = 0.5
 """Standard deviation of places by the error of a proposed camera and its clock, each axis [m]."""
-_OUTSIDE: Final = 0.5
+_MAX_OUTSIDE: Final = 0.5
 """Largest distance of people outside of the lines [m]: benches behind both touch lines are as
 alike as the lines."""
-_CELL: Final = 2.0
+_CELL_M: Final = 2.0
 """Cells in which the shared view is measured [m]."""
-_MARGIN: Final = 0.01
+_IMAGE_MARGIN: Final = 0.01
 """Border of the image in which people may be cut off, in image widths [1]."""
 _MIN_AREA: Final = 50.0
 """Minimum shared area for a comparison [m^2]."""
@@ -255,7 +255,7 @@ def _compare(
     weight = 0.5 * min(1.0, moments / frames)
     found = []
     for other in (second, second.turn()):
-        area = _CELL**2 * float(np.count_nonzero(first.cells & other.cells))
+        area = _CELL_M**2 * float(np.count_nonzero(first.cells & other.cells))
         found.append(
             weight
             * (
@@ -269,7 +269,7 @@ def _compare(
 def _seen_cells(camera: Camera | None, pitch: PitchTemplate) -> Flags:
     """Return which cells of the pitch a camera sees (cells,)."""
     limits = (0.5 * pitch.length, 0.5 * pitch.width)
-    counts = (max(1, round(2.0 * limit / _CELL)) for limit in limits)
+    counts = (max(1, round(2.0 * limit / _CELL_M)) for limit in limits)
     x, y = (
         np.linspace(-limit, limit, 2 * count + 1)[1::2]
         for limit, count in zip(limits, counts, strict=True)
@@ -310,7 +310,7 @@ def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate, area: f
 
 def _people_in_both(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
     """Return one camera's people on the pitch that the other should detect."""
-    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _OUTSIDE
+    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _MAX_OUTSIDE
     known = np.isfinite(own.xy[..., 0])
     frame, _ = np.nonzero(known)
     xy = own.xy[known]
@@ -324,7 +324,7 @@ def _sees(camera: Camera | None, xy: Floats, pitch: PitchTemplate) -> Flags:
         return np.ones(len(xy), np.bool_)
     ground = np.concatenate([xy, pitch.height(xy[:, 0], xy[:, 1])[:, None]], axis=1)
     pixels = camera.project(ground)
-    margin = _MARGIN * float(camera.image_size[0])
+    margin = _IMAGE_MARGIN * float(camera.image_size[0])
     with np.errstate(invalid="ignore"):
         inside = (pixels >= margin) & (pixels <= camera.image_size - 1.0 - margin)
     return np.asarray(inside.all(axis=1))

@@ -10,7 +10,7 @@ gives the pitch of the venue, and each camera on it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -76,7 +76,7 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
     """
     bars, free = evidence.bars, np.flatnonzero(evidence.problem.free)
     there = evidence.problem.evidence.on_surface(best.surface)
-    problem = evidence.problem.on_evidence(there)
+    problem = replace(evidence.problem, evidence=there)
     clicks, by_clicks = weight_residuals(
         problem, camera_row(best.camera), evidence.scale, evidence.surface
     )
@@ -88,42 +88,42 @@ def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> Venue
         paint, (rows, index.reshape(bars.unknowns.shape)), bars.by_paint / bars.noise[:, None]
     )
     shared = (numbers >= 0) | (numbers <= FIRST_KNOT)
-    std = np.where(numbers >= 0, bars.paint.points_m, bars.paint.unevenness_m)[shared]
+    shared_std = np.where(numbers >= 0, bars.paint.points_m, bars.paint.unevenness_m)[shared]
     # The last residuals of the clicks are the surface's prior, which all cameras share.
     clicks, by_clicks = clicks[:-2], by_clicks[:-2]
-    told = len(clicks)
+    click_rows = len(clicks)
     own = np.concatenate(
         [
-            np.concatenate([by_clicks[:, free], np.zeros((told, (~shared).sum()))], axis=1),
+            np.concatenate([by_clicks[:, free], np.zeros((click_rows, (~shared).sum()))], axis=1),
             np.concatenate([by_lines[:, free], paint[:, ~shared]], axis=1),
         ]
     )
     common = np.concatenate(
         [
-            np.concatenate([np.zeros((told, len(std))), by_clicks[:, SIZE:]], axis=1),
-            np.concatenate([paint[:, shared] / std, by_lines[:, SIZE:]], axis=1),
+            np.concatenate([np.zeros((click_rows, len(shared_std))), by_clicks[:, SIZE:]], axis=1),
+            np.concatenate([paint[:, shared] / shared_std, by_lines[:, SIZE:]], axis=1),
         ]
     )
     residuals = np.concatenate([clicks, lines])
-    kept = np.concatenate([np.zeros(len(free)), np.ones(int((~shared).sum()))])
-    inner = own.T @ own + np.diag(kept)
+    own_prior = np.concatenate([np.zeros(len(free)), np.ones(int((~shared).sum()))])
+    inner = own.T @ own + np.diag(own_prior)
     cross = own.T @ common
     answer = _solve(inner, np.column_stack([cross, own.T @ residuals]))
     information = common.T @ common - cross.T @ answer[:, :-1]
     prior = np.zeros_like(information)
-    prior[np.arange(len(std)), np.arange(len(std))] = std**-2.0
+    prior[np.arange(len(shared_std)), np.arange(len(shared_std))] = shared_std**-2.0
     prior[-2:, -2:] = np.linalg.inv(evidence.surface.covariance)
-    prior_mean = np.concatenate([np.zeros(len(std)), evidence.surface.shape])
-    begin = np.concatenate([np.zeros(len(std)), best.surface])
-    right = prior @ (prior_mean - begin)
+    prior_mean = np.concatenate([np.zeros(len(shared_std)), evidence.surface.shape])
+    start = np.concatenate([np.zeros(len(shared_std)), best.surface])
+    right = prior @ (prior_mean - start)
     right -= common.T @ residuals - cross.T @ answer[:, -1]
-    response = np.zeros((SIZE, len(begin)))
+    response = np.zeros((SIZE, len(start)))
     response[free] = -answer[: len(free), :-1]
     return VenueEvidence(
         number=np.concatenate([numbers[shared], SURFACE]).astype(np.int64),
         prior_mean=prior_mean,
         prior=prior,
-        mean=begin + _solve(information + prior, right),
+        mean=start + _solve(information + prior, right),
         information=0.5 * (information + information.T),
         response=response,
     )

@@ -14,7 +14,7 @@ from data_contracts.pin import Pin
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import InputError, StoreError
 from worldpose.store.blobs import Blobs, pass_commit_point
-from worldpose.store.documents import seal, unseal_repairable
+from worldpose.store.documents import R, seal, unseal_repairable
 from worldpose.store.paths import checked_name, is_name, pin_path, record_path, reservation_path
 
 
@@ -71,9 +71,13 @@ def unpin_run(blobs: Blobs, match_id: str, name: str) -> Pin:
 
 def read_pin(blobs: Blobs, match_id: str, name: str) -> Pin | None:
     """Return the pin of a name, None if no run has it."""
-    path = pin_path(match_id, name)
+    return _read(blobs, pin_path(match_id, name), Pin)
+
+
+def _read(blobs: Blobs, path: str, kind: type[R]) -> R | None:
+    """Return the record at a path; None if there is none."""
     data = blobs.read(path)
-    return None if data is None else unseal_repairable(Pin, data, f"{blobs.url}/{path}")
+    return None if data is None else unseal_repairable(kind, data, f"{blobs.url}/{path}")
 
 
 def list_pins(blobs: Blobs, match_id: str) -> tuple[Pin, ...]:
@@ -136,9 +140,7 @@ def reserve_run(blobs: Blobs, match_id: str) -> str:
 
 def read_reservation(blobs: Blobs, match_id: str, run_id: str) -> Reservation | None:
     """Return the reservation of a run; None if there is none, for example after its end."""
-    path = reservation_path(match_id, run_id)
-    data = blobs.read(path)
-    return None if data is None else unseal_repairable(Reservation, data, f"{blobs.url}/{path}")
+    return _read(blobs, reservation_path(match_id, run_id), Reservation)
 
 
 def read_record(blobs: Blobs, match_id: str, run_id: str = LATEST) -> RunRecord:

@@ -40,13 +40,13 @@ from worldpose.training.people_training import box_overlap
 
 SPREAD: Final = 2.0
 """Standard deviation of the target around a joint [px of the crop]."""
-HIDDEN: Final = 0.4
+HIDDEN_WEIGHT: Final = 0.4
 """Weight of an occluded joint [1]: only the rest of the body tells its position."""
-BOXES: Final = 2.0
+BOX_WEIGHT: Final = 2.0
 """Weight of the box loss, relative to that of the joints [1]."""
-MOST: Final = 24
+MAX_NEIGHBOURS: Final = 24
 """Most people per crop that its box is compared with, the nearest."""
-HALF: Final = 0.5 * (np.array(CROP) - 1.0)
+CROP_CENTER: Final = 0.5 * (np.array(CROP) - 1.0)
 """The centre of a crop [px of the crop]."""
 
 
@@ -147,26 +147,26 @@ def keypoint_batch(
     visible = np.empty((count, 17), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
     boxes = np.full((count, 4), np.nan, dtype=np.float32)
-    everybody = np.full((count, MOST, 4), np.nan, dtype=np.float32)
-    ignored = np.zeros((count, MOST), dtype=np.bool_)
+    all_boxes = np.full((count, MAX_NEIGHBOURS, 4), np.nan, dtype=np.float32)
+    ignored = np.zeros((count, MAX_NEIGHBOURS), dtype=np.bool_)
     for index in range(count):
         labelled, person = people[int(rng.integers(len(people)))]
         box = labelled.boxes[person]
         sides = box[2:] - box[:2]
-        beside = rng.random() < settings.elsewhere
+        elsewhere = rng.random() < settings.elsewhere
         far = 1.0 + 2.0 * (rng.random() < settings.astray)
         off = settings.shift * far * rng.uniform(-1, 1, 2) * sides
-        if beside:
+        if elsewhere:
             off = rng.uniform(0.3, 1.6, 2) * rng.choice([-1.0, 1.0], 2) * sides
         middle = 0.5 * (box[:2] + box[2:]) + off
         half = 0.5 * sides * np.exp(settings.scale * (0.5 + 0.5 * far) * rng.uniform(-1, 1))
         given = np.concatenate([middle - half, middle + half])
-        crop = crops_around(given[None], CROP)[0]
+        crop = crops_around(given[None])[0]
         mirrored = bool(rng.random() < 0.5)
         turned = bool(rng.random() < settings.turned)
         turn = settings.turn * rng.uniform(-1, 1) ** 3 if turned else 0.0
         mapping = frame_from_crop(crop, CROP, turn, mirrored)
-        others = _neighbour_boxes(labelled, -1 if beside else person, given, settings, rng)
+        others = _neighbour_boxes(labelled, -1 if elsewhere else person, given, settings, rng)
         around[index] = surroundings(given, others, mapping, CROP)
         tall = float(sides.max())
         farther = 1.0
@@ -178,21 +178,23 @@ def keypoint_batch(
             mapping[:, :2]
         ).T
         sight = labelled.visible[person][order].copy()
-        if beside:
+        if elsewhere:
             sight[:] = 0
         if not turned:
             there = boxes_in_crop(labelled.boxes, mapping)
-            near = np.argsort(np.abs(there.reshape(-1, 2, 2).mean(axis=1) - HALF).sum(axis=1))
-            near = near[:MOST]
-            everybody[index, : len(near)] = there[near]
+            near = np.argsort(
+                np.abs(there.reshape(-1, 2, 2).mean(axis=1) - CROP_CENTER).sum(axis=1)
+            )
+            near = near[:MAX_NEIGHBOURS]
+            all_boxes[index, : len(near)] = there[near]
             ignored[index, : len(near)] = labelled.ignored[near]
-            boxes[index] = np.nan if beside else there[person]
+            boxes[index] = np.nan if elsewhere else there[person]
         if index and rng.random() < settings.hidden:
             _cover(seen, crops[index - 1], pixels, sight, rng)
         crops[index] = augment(seen, settings.looks, rng)
         keypoints[index], visible[index] = pixels, sight
         tolerance[index] = MAX_ERROR_SHARE * tall / crop[2]
-    return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, everybody, ignored)
+    return KeypointBatch(crops, around, keypoints, visible, tolerance, boxes, all_boxes, ignored)
 
 
 def _neighbour_boxes(
@@ -286,7 +288,7 @@ def keypoint_loss(net: KeypointNet, batch: KeypointBatch) -> Tensor:
     inside = labelled & (mass > 4.0)
     entropy = torch.logsumexp(maps.flatten(2), -1)
     entropy = entropy - (bump * maps.flatten(2)).sum(-1) / mass.clamp(min=1e-6)
-    weight = torch.where(visible == 2, 1.0, HIDDEN) * inside
+    weight = torch.where(visible == 2, 1.0, HIDDEN_WEIGHT) * inside
     place: Tensor = (weight * entropy).sum() / weight.sum().clamp(min=1.0)
 
     with torch.no_grad():
@@ -322,4 +324,4 @@ def box_loss(batch: KeypointBatch, said: Tensor, fit: Tensor) -> Tensor:
         counted = there.any(dim=1) & ~ignored.gather(1, best)[:, 0]
         share = overlap.gather(1, best)[:, 0].clamp(0.0, 1.0)
     expected = functional.binary_cross_entropy_with_logits(fit, share, reduction="none")
-    return BOXES * off + (counted * expected).sum() / counted.sum().clamp(min=1)
+    return BOX_WEIGHT * off + (counted * expected).sum() / counted.sum().clamp(min=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -17,11 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17
-from worldpose.detection import DetectionSettings, Detector, People, PoseEstimator
+from worldpose.detection import DetectionSettings, People, load_detectors, load_pose
 from worldpose.detection.suppression import combine_boxes, fuse
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
+from worldpose.video import open_video
 
-SEEN: Final = 0.5
+VISIBLE_CONFIDENCE: Final = 0.5
 """Keypoints from this confidence on are proposed as visible, others as occluded [1]."""
 
 
@@ -273,41 +274,70 @@ class PictureCache:
 
 
 def propose_labels(
-    frames: Iterable[tuple[str, Image]],
-    detectors: list[Detector],
-    pose: PoseEstimator,
-    folder: Path,
-    settings: DetectionSettings | None = None,
-) -> list[LabelledPicture]:
-    """Write detections in frames as a COCO data set and return them.
+    videos: Sequence[Path], every: int, folder: Path, settings: DetectionSettings
+) -> int:
+    """Write frames of videos with their detections as a COCO data set; return the number of frames.
 
-    The folder then holds pictures/<name>.png and labels.json, for any editor of COCO keypoints and
-    for `read_labels`. The write is atomic: a failure leaves nothing that prevents a retry.
+    The folder then holds pictures/<video>_<frame>.png and labels.json, for any editor of COCO
+    keypoints and for `read_labels`. The write is atomic: a failure leaves nothing that prevents a
+    retry.
 
     Args:
-        frames: name and image of each, in the order of recording, all of one size.
-        detectors: an ensemble; its boxes of one person become one.
-        pose: estimator of the keypoints.
+        videos: video files or folders of images, all of one image size.
+        every: step between frames.
         folder: absent or empty.
-        settings: thresholds of proposals; the defaults if None.
+        settings: detectors and thresholds; several detectors' boxes of one person become one.
+
+    Raises:
+        UsageError: the folder is not empty.
+        InputError: two videos have the same name or different sizes, or one is damaged.
     """
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(
+            str(folder),
+            expected="an absent or empty folder",
+            found="files",
+            todo="Choose another folder: corrected labels are never overwritten.",
+        )
+    if len({video.stem for video in videos}) < len(videos):
+        raise InputError(
+            "videos",
+            expected="files of different names",
+            found=", ".join(video.name for video in videos),
+            todo="Rename one: the images of its frames are named after it.",
+        )
     place = folder.resolve()
     place.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as workshop:
         # One level down: a temporary folder is private, the labels have the usual rights.
         draft = Path(workshop) / place.name
-        proposed = _write(frames, detectors, pose, draft, settings or DetectionSettings())
+        count = _write_detections(_frames(videos, every), draft, settings)
         draft.rename(place)  # replaces an empty folder, fails on any other
-    return [replace(each, path=folder / each.path.relative_to(draft)) for each in proposed]
+    return count
 
 
-def _write(
-    frames: Iterable[tuple[str, Image]],
-    detectors: list[Detector],
-    pose: PoseEstimator,
-    folder: Path,
-    settings: DetectionSettings,
-) -> list[LabelledPicture]:
+def _frames(videos: Sequence[Path], every: int) -> Iterator[tuple[str, Image]]:
+    """Yield every n-th frame of each video, with a name; refuse another size than the first's."""
+    shape: tuple[int, ...] | None = None
+    for video in videos:
+        with open_video(video) as reader:
+            for number in range(0, len(reader), every):
+                picture = reader.frame(number)
+                if shape is not None and picture.shape != shape:
+                    raise InputError(
+                        str(video),
+                        expected=f"frames of {shape[1]} x {shape[0]}, as in the previous videos",
+                        found=f"{picture.shape[1]} x {picture.shape[0]}",
+                        todo="Label videos of another size in a separate folder.",
+                    )
+                shape = picture.shape
+                yield f"{video.stem}_{number:06d}", picture
+
+
+def _write_detections(
+    frames: Iterable[tuple[str, Image]], folder: Path, settings: DetectionSettings
+) -> int:
+    detectors, pose = load_detectors(settings), load_pose(settings)
     (folder / "pictures").mkdir(parents=True)
     proposed, size = [], (0, 0)
     for name, picture in frames:
@@ -318,7 +348,7 @@ def _write(
         found = poses.confidence >= settings.min_keypoint_confidence
         path = folder / "pictures" / f"{name}.png"
         cv2.imwrite(str(path), picture[..., ::-1])
-        visible = np.where(poses.confidence >= SEEN, 2, 1) * found
+        visible = np.where(poses.confidence >= VISIBLE_CONFIDENCE, 2, 1) * found
         proposed.append(
             LabelledPicture(
                 path=path,
@@ -330,4 +360,4 @@ def _write(
         )
         size = (picture.shape[1], picture.shape[0])
     write_labels(folder / "labels.json", proposed, size)
-    return proposed
+    return len(proposed)

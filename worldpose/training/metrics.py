@@ -63,13 +63,9 @@ def detect_labelled(
     ]
 
 
-def score_people(
-    found: Sequence[People],
-    pictures: Sequence[LabelledPicture],
-    heights: Sequence[tuple[float, float]] = HEIGHTS,
-) -> tuple[float, ...]:
+def score_people(found: Sequence[People], pictures: Sequence[LabelledPicture]) -> tuple[float, ...]:
     """Return AP50 of all detections, and in each class of heights [px]."""
-    classes = [(0.0, np.inf), *heights]
+    classes = [(0.0, np.inf), *HEIGHTS]
     return tuple(average_precision(found, pictures, each) for each in classes)
 
 
@@ -222,18 +218,17 @@ def torso_sizes(keypoints: Floats) -> Floats:
     return np.asarray(np.linalg.norm(diagonals, axis=-1).max(axis=-1))
 
 
-def correct_keypoints(found: AnyFloats, true: Floats, share: float = TORSO_SHARE) -> Floats:
-    """Return 1 for keypoints within a share of the torso, else 0 (people, 17); NaN without truth.
+def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
+    """Return 1 for keypoints within `TORSO_SHARE`, else 0 (people, 17); NaN without truth.
 
     Args:
         found: (people, 17, 2) [px]; a missing one is not correct.
         true: (people, 17, 2) [px]; NaN where unknown.
-        share: share of the torso [1].
     """
     error = np.linalg.norm(found - true, axis=-1)
     torso = torso_sizes(true)
     known = np.isfinite(true).all(axis=-1) & np.isfinite(torso)[:, None]
-    return np.where(known, error <= share * torso[:, None], np.nan)
+    return np.where(known, error <= TORSO_SHARE * torso[:, None], np.nan)
 
 
 def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:

@@ -20,9 +20,9 @@ from worldpose.training.labels import LabelledPicture, PictureCache
 
 SPREAD: Final = 0.12
 """Standard deviation of the target around a centre, as a share of the box's sides [1]."""
-NEAR: Final = 0.5
+MIN_TARGET: Final = 0.5
 """Cells with a target from this value on learn the box's sides [1]."""
-BOXES: Final = 4.0
+BOX_WEIGHT: Final = 4.0
 """Weight of the box loss, relative to that of the centres [1]: centres are learned sooner."""
 MIN_SEEN: Final = 0.3
 """Share of a box within a window from which on the person is a target [1]."""
@@ -178,12 +178,12 @@ def people_loss(net: PeopleNet, batch: PeopleBatch) -> Tensor:
     middle = target == 1.0
     people = middle.sum().clamp(min=1)
     focal = -(weight * torch.where(middle, found, empty)).sum() / people
-    near = torch.where(target >= NEAR, target, 0.0)
+    near = torch.where(target >= MIN_TARGET, target, 0.0)
     x = cell_centres(sides.shape[3], sides.device)[None, None, :]
     y = cell_centres(sides.shape[2], sides.device)[None, :, None]
     said = torch.stack([x - sides[:, 0], y - sides[:, 1], x + sides[:, 2], y + sides[:, 3]], dim=-1)
     _, overlap = box_overlap(said, boxes.movedim(1, -1))
-    return focal + BOXES * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
+    return focal + BOX_WEIGHT * (near * (1.0 - overlap)).sum() / near.sum().clamp(min=1.0)
 
 
 def box_overlap(said: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,8 +9,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from typing import Final, Self
 
 import av
 import numpy as np
@@ -185,15 +184,10 @@ class VideoReader:
         self._stream.thread_type = "AUTO"
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
 
-    def __enter__(self) -> VideoReader:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -344,7 +338,7 @@ def _stored_pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDA
     return np.ascontiguousarray(rows[:, : picture.width])
 
 
-def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | None = None) -> int:
+def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
     """Write a range of frames of a video without re-encoding.
 
     Decoding begins at key frames: the file also holds some frames before the first one wanted, and
@@ -355,7 +349,6 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
         start: number of the first frame.
         stop: one past the last.
         out: the file to write, of the same kind.
-        index: index of the video; if None, it is computed.
 
     Returns:
         The number of frame `start` in the new file.
@@ -363,7 +356,7 @@ def cut_video(path: Path, start: int, stop: int, out: Path, index: FrameIndex | 
     Raises:
         InputError: no video, or it has no such frames.
     """
-    index = index_frames(path) if index is None else index
+    index = index_frames(path)
     if not 0 <= start < stop <= len(index):
         raise InputError(
             str(path),

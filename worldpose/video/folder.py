@@ -10,8 +10,7 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,15 +88,10 @@ class ImageFolder:
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
 
-    def __enter__(self) -> ImageFolder:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -227,7 +221,7 @@ def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)
 
 
-WORTH: Final = 8
+MIN_SKIPPED_FRAMES: Final = 8
 """Frames that a jump to a key frame must save: a restart costs about as many."""
 
 
@@ -257,7 +251,7 @@ def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[
     keys = np.flatnonzero(key)
     begin = keys[np.maximum(np.searchsorted(keys, numbers, side="right") - 1, 0)]
     saved = begin[1:] - numbers[:-1] - 1
-    return np.split(numbers, np.flatnonzero(saved >= WORTH) + 1)
+    return np.split(numbers, np.flatnonzero(saved >= MIN_SKIPPED_FRAMES) + 1)
 
 
 _BAND: Final = 64

@@ -12,7 +12,7 @@ from worldpose.broadcast_calibration.evidence import (
     FlowEvidence,
     ObservedPoints,
     PointEvidence,
-    together,
+    join_evidence,
 )
 from worldpose.broadcast_calibration.normal_equations import point_row
 from worldpose.broadcast_calibration.priors import build_prior, correlation_time
@@ -188,7 +188,7 @@ def test_people_who_all_err_alike_widen_the_region():
             1.0,
             np.inf,
         )
-        problem = replace(problem, points=together([problem.points, people]))
+        problem = replace(problem, points=join_evidence([problem.points, people]))
         solution = solve(true, problem, 20)
         covariance = place_covariance(
             solution.camera, compute_uncertainty(solution, problem), place

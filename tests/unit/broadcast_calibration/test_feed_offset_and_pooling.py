@@ -158,7 +158,7 @@ def test_how_well_the_offset_is_known_follows_from_how_its_cost_bends(
     def cost(camera, people, offset, some):
         return 2.0 + bend * (offset - 1.25) ** 2, 600
 
-    monkeypatch.setattr("worldpose.broadcast_calibration.players._cost", cost)
+    monkeypatch.setattr("worldpose.broadcast_calibration.players._mean_loss", cost)
     found = estimate_feed_offset(camera, nobody, reach=6.0)
     # A cost that is one half of a unit higher is one standard deviation off in all of them:
     # one over the root of bend times people.

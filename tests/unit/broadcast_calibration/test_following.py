@@ -29,7 +29,7 @@ def test_a_shifted_picture_is_followed_by_its_shift():
     assert len(pair.start) > 60
     # Whole pixels: what is left is the tracker's tolerance.
     assert np.abs(pair.end - pair.start - SHIFT).max() < 0.05
-    assert pair.together > 0.9
+    assert pair.inlier_share > 0.9
 
 
 def test_people_are_not_followed():

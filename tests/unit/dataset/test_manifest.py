@@ -12,7 +12,6 @@ from worldpose.dataset.manifest import (
     changed_files,
     origins_of,
     read_manifest,
-    read_origins,
     released_files,
     write_manifest,
     write_origins,
@@ -105,4 +104,4 @@ def test_origins_tell_absent_automatic_filled_and_corrected_joints(tmp_path):
     assert names[1, 0, 3] == "absent"
     assert (names == "automatic").sum() == 2 * 17 - 3
     write_origins(tmp_path / "A_1.npz", tracks, origin)
-    np.testing.assert_array_equal(read_origins(tmp_path / "A_1.npz"), origin)
+    np.testing.assert_array_equal(np.load(tmp_path / "A_1.npz")["origin"], origin)

@@ -51,7 +51,7 @@ def test_a_crop_shows_its_box_and_goes_back_to_the_picture():
     picture[50:150, 100:140] = 255
     box = np.array([[99.5, 49.5, 139.5, 149.5]])
     for turn, mirrored in ((0.0, False), (0.3, True)):
-        mapping = frame_from_crop(crops_around(box, CROP)[0], CROP, turn, mirrored)
+        mapping = frame_from_crop(crops_around(box)[0], CROP, turn, mirrored)
         crop = cut_crop(picture, mapping, CROP, outside=0)
         rows, columns = np.nonzero(crop[..., 0] > 127)
         middle = np.array([columns.mean(), rows.mean()])

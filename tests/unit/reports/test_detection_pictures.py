@@ -15,7 +15,7 @@ from worldpose.reports.clips import (
 )
 from worldpose.reports.drawing import PALETTE, markings
 from worldpose.reports.static_cameras import (
-    NEAR,
+    NEAR_PAINT_PX,
     detect_paint,
     distance_to,
     marking_distances,
@@ -117,7 +117,7 @@ def test_paint_is_found_and_the_camera_puts_markings_on_it(camera):
         image_size=camera.image_size,
     )
     off = marking_distances(beside, PitchSpec(), distance_to(paint))
-    assert 1.5 < np.median(off) < NEAR
+    assert 1.5 < np.median(off) < NEAR_PAINT_PX
 
 
 def test_a_wide_bright_stripe_and_specks_are_no_paint():

@@ -5,7 +5,7 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera, Rigid
-from worldpose.reports.clips import REACH, plot_camera_view, plot_stadium, visible_ground
+from worldpose.reports.clips import VIEW_LENGTH_M, plot_camera_view, plot_stadium, visible_ground
 from worldpose.reports.drawing import PALETTE
 from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, plot_calibration
 
@@ -53,13 +53,13 @@ def test_over_the_horizon_the_ground_ends_at_the_reach():
     corners = visible_ground(looking(0.0))
     assert np.isfinite(corners).all()
     far = np.linalg.norm(corners - (0.0, -50.0), axis=-1)
-    assert far.max() == pytest.approx(REACH)
+    assert far.max() == pytest.approx(VIEW_LENGTH_M)
     # The lower edge looks down by atan(540 / 960): 20 m up that is 35.6 m away, straight ahead.
     assert far.min() == pytest.approx(20.0 * 960.0 / 540.0, rel=0.01)
 
 
 def test_from_above_people_are_where_they_are_and_near_is_below(people):
-    png = plot_stadium({"south": looking(0.3)}, "frame 0", people, 0, pitch=PitchSpec())
+    png = plot_stadium({"south": looking(0.3)}, "frame 0", people, pitch=PitchSpec())
     far, near = (pixels_of(decoded(png), color).mean(axis=0) for color in PALETTE[:2])
     assert far[0] < near[0] - 100  # rows run down
     assert far[1] < near[1] - 100
@@ -79,7 +79,7 @@ def test_a_camera_s_picture_has_its_still_beneath(people):
 
 def test_nobody_and_no_pitch_are_still_pictures():
     nobody = JointTracks(np.arange(1), np.arange(0), np.empty((1, 0, 17, 3)))
-    assert decoded(plot_stadium({"a": looking(0.3)}, "", nobody, 0)).shape[2] == 3
+    assert decoded(plot_stadium({"a": looking(0.3)}, "", nobody)).shape[2] == 3
     assert decoded(plot_camera_view(looking(0.3), "", nobody, 0)).shape[2] == 3
 
 

@@ -64,7 +64,9 @@ def test_too_few_boards_and_boards_that_face_the_camera_are_refused():
     rng = np.random.default_rng(6)
     with pytest.raises(InputError, match=r"cam: board images: expected 4 images or more .* 3 of 4"):
         calibrate_lens("cam", [*(view(rng) for _ in range(3)), None], SIZE)
-    with pytest.raises(InputError, match=r"tell the focal length .* tilted by 30 to 45 degrees"):
+    with pytest.raises(
+        InputError, match=r"determine the focal length .* tilted by 30 to 45 degrees"
+    ):
         calibrate_lens("cam", [view(rng, tilt=0.01, noise=0.5) for _ in range(6)], SIZE)
 
 

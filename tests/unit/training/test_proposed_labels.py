@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from flows.review import labelling
 from worldpose.detection import DetectionSettings, People
 from worldpose.errors import InputError
-from worldpose.training import read_labels
+from worldpose.training import labels, read_labels
 
 
 class Brightness:
@@ -26,8 +25,8 @@ class Brightness:
 
 @pytest.fixture(autouse=True)
 def detectors(monkeypatch):
-    monkeypatch.setattr(labelling, "load_detectors", lambda settings: [Brightness()])
-    monkeypatch.setattr(labelling, "load_pose", lambda settings: Brightness())
+    monkeypatch.setattr(labels, "load_detectors", lambda settings: [Brightness()])
+    monkeypatch.setattr(labels, "load_pose", lambda settings: Brightness())
 
 
 def images(folder, size=(20, 24)):
@@ -39,7 +38,7 @@ def images(folder, size=(20, 24)):
 
 def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
     videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01")]
-    assert labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings()) == 6
+    assert labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings()) == 6
     found = read_labels(tmp_path / "labels" / "labels.json")
     names = [f"{camera}_{number:06d}.png" for camera in ("cam00", "cam01") for number in (0, 2, 4)]
     assert [picture.path.name for picture in found] == names
@@ -49,12 +48,12 @@ def test_a_folder_of_images_is_labelled_as_a_video_is(tmp_path):
 def test_a_failed_labelling_leaves_nothing_that_blocks_its_repetition(tmp_path):
     videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
     with pytest.raises(InputError):
-        labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings())
+        labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cam00", "cam01"]
-    assert labelling.propose(videos[:1], 2, tmp_path / "labels", DetectionSettings()) == 3
+    assert labels.propose_labels(videos[:1], 2, tmp_path / "labels", DetectionSettings()) == 3
 
 
 def test_pictures_of_another_size_are_refused(tmp_path):
     videos = [images(tmp_path / "cam00"), images(tmp_path / "cam01", (30, 24))]
     with pytest.raises(InputError, match="24 x 30"):
-        labelling.propose(videos, 2, tmp_path / "labels", DetectionSettings())
+        labels.propose_labels(videos, 2, tmp_path / "labels", DetectionSettings())

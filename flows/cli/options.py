@@ -1,4 +1,4 @@
-"""Options of the commands that serve the pages: address and access."""
+"""Options that commands share: machines and time limits of runs, address and access of pages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,23 @@ from typing import Annotated
 import typer
 
 from worldpose.errors import UsageError
+
+DaskOption = Annotated[
+    str | None, typer.Option(metavar="ADDR", help="A running Dask scheduler, tcp://host:port.")
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Worker processes on this machine; one per core by default."),
+]
+TimeLimitOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--time-limit",
+        metavar="[STAGE=]MINUTES",
+        help="Time limit of a unit [min]: a slower unit is stopped, retried once, and then given "
+        "up. Repeatable; 360 in every stage by default.",
+    ),
+]
 
 PAGES_PORT = 8571
 
