@@ -8,7 +8,7 @@ order, so these are not counted a second time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,7 +20,14 @@ from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
-from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREADS, PosePrior
+from worldpose.body_fitting.pose_space import (
+    MAX_ANGLES,
+    MIN_ANGLES,
+    SIZE,
+    SPREADS,
+    PosePrior,
+    cross,
+)
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import compile_kernel
 
@@ -59,9 +66,9 @@ def body_axes(joints: Floats) -> Floats:
     left = joints[..., 5, :] + joints[..., 11, :] - joints[..., 6, :] - joints[..., 12, :]
     up = joints[..., 5, :] + joints[..., 6, :] - joints[..., 11, :] - joints[..., 12, :]
     left = left / np.linalg.norm(left, axis=-1, keepdims=True)
-    front = np.cross(left, up)
+    front = cross(left, up)
     front /= np.linalg.norm(front, axis=-1, keepdims=True)
-    axes: Floats = np.stack([front, left, np.cross(front, left)], axis=-1)
+    axes: Floats = np.stack([front, left, cross(front, left)], axis=-1)
     return axes
 
 
@@ -100,6 +107,14 @@ class Evidence:
         return Evidence(
             np.concatenate([self.joints, own.joints], axis=1),
             np.concatenate([self.information, own.information], axis=1),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Evidence]) -> Evidence:
+        """Return the evidence of intervals, one after the other."""
+        return cls(
+            np.concatenate([part.joints for part in parts]),
+            np.concatenate([part.information for part in parts]),
         )
 
     @property
@@ -179,7 +194,12 @@ class Contacts:
 
 
 def find_contacts(
-    joints: Floats, ankle_height: float, ground: Ground, fps: float, settings: BodyFittingSettings
+    joints: Floats,
+    ankle_height: float,
+    ground: Ground,
+    fps: float,
+    settings: BodyFittingSettings,
+    starts: Sequence[int] = (),
 ) -> Contacts:
     """Return contacts of ankles that are low and slow for at least two frames.
 
@@ -189,6 +209,7 @@ def find_contacts(
         ground: the surface.
         fps: [1/s].
         settings: limits of low and slow.
+        starts: first frames of the track's further intervals, as in `Track`.
     """
     ankles = joints[:, ANKLES]
     height = ground(ankles[..., 0], ankles[..., 1]) + ankle_height
@@ -197,6 +218,7 @@ def find_contacts(
     speed = np.linalg.norm(np.diff(ankles, axis=0), axis=-1) * fps
     low = ankles[..., 2] - height < settings.contact_height_m
     slipping = (speed < settings.contact_speed_m_s) & low[1:] & low[:-1]
+    slipping[np.array(starts, dtype=np.int64) - 1] = False
     standing = np.zeros(low.shape, dtype=bool)
     standing[1:] |= slipping
     standing[:-1] |= slipping
@@ -405,6 +427,8 @@ class Track:
     """Weight of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
     monocular_prior: MonocularPrior | None = None
+    starts: tuple[int, ...] = ()
+    """First frames of the intervals after the first; motion ties no interval to another."""
 
     def equations(self, pose: Pose, offsets: Floats, *, bordered: bool) -> NormalEquations:
         """Return the normal equations at a pose.
@@ -498,9 +522,13 @@ class Track:
             spread = self.acceleration * scale / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
             tail = 3.0 * settings.acceleration_loss_scale**2
+            for start in self.starts:
+                second[max(0, start - 2) : start] = 0.0
             deviation = (second**2).sum(-1) / spread**2 / tail
             cost = 0.5 * tail * float(np.log1p(deviation).sum())
             weight = 1.0 / (1.0 + deviation) / spread**2
+            for start in self.starts:
+                weight[max(0, start - 2) : start] = 0.0
             weighted = weight[..., None] * second
             for start, factor in ((0, 1.0), (1, -2.0), (2, 1.0)):
                 slope[start : frames - 2 + start] += factor * weighted

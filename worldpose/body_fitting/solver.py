@@ -122,7 +122,9 @@ class Solver:
         assert self.ground is not None
         joints = self.chained.differentiate(pose.parameters()).keypoints
         height = ankle_height(self.chained.model, pose.betas)
-        contacts = find_contacts(joints, height, self.ground, track.fps, self.settings)
+        contacts = find_contacts(
+            joints, height, self.ground, track.fps, self.settings, track.starts
+        )
         return replace(track, contacts=contacts)
 
     def plant_feet(self, pose: Pose, seen: NDArray[np.bool_] | None = None) -> BodyParameters:
@@ -233,7 +235,7 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """An interval of a person's track, with its current bodies."""
+    """Intervals of a person's track, with their current bodies."""
 
     person: int
     track: Track
@@ -252,10 +254,10 @@ def fit_shapes(
         fps: [1/s].
     """
 
-    def sample(person: int) -> list[Piece]:
-        return _sample_pieces(solver, person, *people[person], fps)
+    def sample(person: int) -> Piece | None:
+        return _sample_piece(solver, person, *people[person], fps)
 
-    pieces = [piece for some in map_in_threads(sample, people) for piece in some]
+    pieces = [piece for piece in map_in_threads(sample, people) if piece is not None]
     return solve_shapes(solver, people, pieces, known)
 
 
@@ -346,34 +348,43 @@ def solve_shapes(
     return Shapes(found, MIRRORED_OFFSETS @ unknowns, by_joint)
 
 
-def _sample_pieces(
+def _sample_piece(
     solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
-) -> list[Piece]:
-    """Return intervals of a person's track for shape estimation, with initial bodies."""
+) -> Piece | None:
+    """Return intervals of a person's track for shape estimation, with initial bodies.
+
+    All in one: the equations of ten short tracks take several times as long as those of one.
+    """
     settings, model = solver.settings, solver.chained.model
     stride = max(1, int(fps / settings.shape_rate_hz))
     rate = fps / stride
     scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
     bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
-    pieces = []
+    evidence, poses, starts, frames = [], [], [], 0
     for part in spread_intervals(len(joints), fps, settings):
         some, sure = joints[part][::stride], covariance[part][::stride]
         if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
             continue
         some = shorten_limbs(some, scale * sure)
-        track = Track(
-            solver.chained,
-            Evidence.of(some, sure, rate, settings),
-            solver.prior,
-            settings,
-            rate,
-            settings.shape_acceleration_m_s2,
-            settings.shape_pose_weight,
-        )
-        pose = Pose(*start_poses(model, betas, interpolate_gaps(some), solver.prior), betas)
-        pieces.append(Piece(person, track, pose))
-    return pieces
+        evidence.append(Evidence.of(some, sure, rate, settings))
+        poses.append(start_poses(model, betas, interpolate_gaps(some), solver.prior))
+        starts.append(frames)
+        frames += len(some)
+    if not evidence:
+        return None
+    track = Track(
+        solver.chained,
+        Evidence.concatenate(evidence),
+        solver.prior,
+        settings,
+        rate,
+        settings.shape_acceleration_m_s2,
+        settings.shape_pose_weight,
+        starts=tuple(starts[1:]),
+    )
+    transl, orient, angles = (np.concatenate(column) for column in zip(*poses, strict=True))
+    return Piece(person, track, Pose(transl, orient, angles, betas))
 
 
 def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:
