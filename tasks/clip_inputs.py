@@ -25,6 +25,8 @@ from worldpose.store import Store
 
 PAGE = 256
 """Frames per read."""
+VENUES = 4
+"""Venues that a process keeps: reading 16 cameras takes half a second, in most stages twice."""
 PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
 
@@ -370,9 +372,18 @@ def _align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[s
     return aligned, points
 
 
-def open_venue(store: Store, work: Work, camera_ids: Sequence[str]) -> Venue:
+def open_venue(work: Work, camera_ids: Sequence[str]) -> Venue:
     """Return calibrated or given static cameras on the pitch that they show together."""
-    each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
+    recipe = work.recipe
+    keys = tuple((camera, recipe.inputs[f"static_calibration/{camera}"]) for camera in camera_ids)
+    return _join_calibrated(work.project, recipe.match_id, keys)
+
+
+@lru_cache(VENUES)
+def _join_calibrated(project: str, match_id: str, keys: tuple[tuple[str, str], ...]) -> Venue:
+    """Return cameras by the keys of their calibration; a key names one content."""
+    store = Store.open(project)
+    each = [store.open_result(match_id, "static_calibration", *camera) for camera in keys]
     return join_cameras([camera.data_vars for camera in each])
 
 
@@ -390,7 +401,7 @@ def _load_cameras(
             stated if known else None,
             None if surface is None else np.array(surface),
         )
-    venue = open_venue(store, work, camera_ids)
+    venue = open_venue(work, camera_ids)
     known = bool(np.isfinite(venue.covariance).all())  # a given camera has no covariance
     shape = None if venue.surface is None else venue.surface.shape
     return venue.cameras, venue.covariance if known else None, shape

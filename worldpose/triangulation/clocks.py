@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -103,7 +102,14 @@ def estimate_clocks(
     seen = [shift_in_time(detections[part], late) for part in parts]
     for gate in GATES if parts else ():
         loose = settings.model_copy(update={"max_deviation": gate})
-        sum_up = partial(_sum_equations, rig, late=late, fps=fps, settings=loose)
+
+        def sum_up(
+            part: KeypointDetections,
+            late: Floats = late,
+            loose: TriangulationSettings = loose,
+        ) -> _Sums:
+            return _sum_equations(rig, part, late, fps, loose)
+
         sums = list(map_in_threads(sum_up, seen))
         information = np.concatenate([each.information for each in sums])
         score = np.concatenate([each.score for each in sums])
