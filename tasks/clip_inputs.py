@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,7 @@ class StoredArray:
         self._rejected = None if rejected is None else ChunkedRows(rejected)
         self._shift = None if shift is None else ChunkedRows(shift)
         self._page = lru_cache(PAGES)(self._read)
+        self._reading = Lock()
 
     def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
         """Return some frames as float64; NaN beyond a camera's number of detections."""
@@ -103,7 +105,9 @@ class StoredArray:
         out = np.empty((len(row), *self.shape[1:]))
         for number in np.unique(row // PAGE).tolist():
             here = row // PAGE == number
-            out[here] = self._page(number)[row[here] - number * PAGE]
+            with self._reading:  # else two threads that need one page would both read it
+                page = self._page(number)
+            out[here] = page[row[here] - number * PAGE]
         return out
 
     def _read(self, number: int) -> NDArray[np.float32]:
