@@ -317,7 +317,8 @@ def _accumulate(
 ) -> tuple[Floats, Floats]:
     """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
 
-    A point moves with few of the angles: products skip those that leave it in place.
+    Blocks on the diagonal have their lower triangle only, which is all that the factor reads. A
+    point moves with few of the angles: products skip those that leave it in place.
 
     Args:
         rows: (frames, points, 3, 36), derivatives of points.
@@ -339,20 +340,25 @@ def _accumulate(
                 for j in range(size):
                     scaled[a, j] = f0 * r[0, j] + f1 * r[1, j] + f2 * r[2, j]
                     slope[j] += pull * r[a, j]
-            _add_product(blocks[0, t], r, scaled, active)
+            _add_product(blocks[0, t], r, scaled, active, True)
             for ahead in (1, 2):
                 weight = next_frame[t, p] if ahead == 1 else second_frame[t, p]
                 if t + ahead < frames and weight != 0.0:
                     for a in range(3):
                         for j in range(size):
                             scaled[a, j] = weight * r[a, j]
-                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active)
+                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active, False)
     return blocks, gradient
 
 
 @compile_kernel
-def _add_product(target: Floats, left: Floats, right: Floats, active: NDArray[np.int64]) -> None:
-    """Add `left^T right` of two (3, n) matrices; `active` is room for n indices."""
+def _add_product(
+    target: Floats, left: Floats, right: Floats, active: NDArray[np.int64], below: bool
+) -> None:
+    """Add `left^T right` of two (3, n) matrices; only the lower triangle where `below`.
+
+    `active` is room for n indices.
+    """
     size, count = len(target), 0
     for i in range(size):
         if left[0, i] != 0.0 or left[1, i] != 0.0 or left[2, i] != 0.0:
@@ -361,7 +367,8 @@ def _add_product(target: Floats, left: Floats, right: Floats, active: NDArray[np
     for place in range(count):
         i = active[place]
         f0, f1, f2 = left[0, i], left[1, i], left[2, i]
-        for j in range(size):
+        end = i + 1 if below else size
+        for j in range(end):
             target[i, j] += f0 * right[0, j] + f1 * right[1, j] + f2 * right[2, j]
 
 
@@ -399,8 +406,10 @@ class Pose:
 class NormalEquations:
     """`[blocks border; border^T corner] step = -[gradient; border_gradient]` of one track."""
 
+    points: KeypointJacobian
+    """Points (frames, points) and their derivatives by the unknowns."""
     blocks: Floats
-    """(3, frames, 36, 36)"""
+    """(3, frames, 36, 36), those on the diagonal valid in the lower triangle."""
     gradient: Floats
     """(frames, 36)"""
     border: Floats
@@ -484,10 +493,10 @@ class Track:
             border = np.swapaxes(rows, 1, 2) @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
             shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 3 * points))
-        equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
+        equations = NormalEquations(body, blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
-        return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
+        return self._add_contacts(equations)
 
     def differentiate(self, pose: Pose) -> KeypointJacobian:
         """Return the points with derivatives by the unknowns (frames, points, 3, 36) in `pose`.
@@ -562,12 +571,12 @@ class Track:
         blocks[:, places, places] += stiff * (beyond != 0.0)
         return 0.5 * float(((away @ prior) * away).sum() + stiff * (beyond**2).sum())
 
-    def _add_contacts(
-        self, equations: NormalEquations, keypoints: Floats, by_frame: Floats, by_betas: Floats
-    ) -> NormalEquations:
+    def _add_contacts(self, equations: NormalEquations) -> NormalEquations:
         """Return the equations with terms for the height of standing ankles, and none below it."""
         contacts = self.contacts
         assert contacts is not None
+        body = equations.points
+        keypoints, by_frame, by_betas = body.keypoints, body.pose, body.betas
         blocks, gradient = equations.blocks, equations.gradient
         border, corner = equations.border, equations.corner
         shared, cost = equations.border_gradient, equations.cost
@@ -584,4 +593,4 @@ class Track:
             border[..., :shapes] += heavy[..., None] * column[:, None]
             corner[:shapes, :shapes] += (weight[:, None] * column).T @ column
             shared[:shapes] += (weight * above) @ column
-        return NormalEquations(blocks, gradient, border, corner, shared, cost)
+        return NormalEquations(body, blocks, gradient, border, corner, shared, cost)

@@ -112,9 +112,7 @@ class Solver:
         for step in range(self.settings.steps):
             if self.ground is not None and step == self.settings.steps // 2:
                 track = self.find_standing_ankles(track, pose)
-            equations = track.equations(pose, offsets, bordered=False)
-            solution = factor(equations.blocks).solve(equations.gradient[..., None])
-            pose = pose.apply_step(-solution[..., 0])
+            pose = _take_step(track, pose, offsets)
         return pose, track
 
     def find_standing_ankles(self, track: Track, pose: Pose) -> Track:
@@ -151,6 +149,13 @@ class Solver:
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
 
 
+def _take_step(track: Track, pose: Pose, offsets: Floats) -> Pose:
+    """Return the pose after one Gauss-Newton step; its equations are gone before the next ones."""
+    equations = track.equations(pose, offsets, bordered=False)
+    solution = factor(equations.blocks).solve(equations.gradient[..., None])
+    return pose.apply_step(-solution[..., 0])
+
+
 def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
     """Return a pose with the monocular poses of the frames where they count.
 
@@ -181,18 +186,21 @@ def damp_motion(track: Track) -> Track:
     )
 
 
-def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> Floats:
-    """Return the covariance of a solved track's points from its poses (frames, points, 3, 3) [m^2].
+def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> tuple[Floats, Floats]:
+    """Return a solved track's points (frames, points, 3) [m] and their covariance.
+
+    The covariance (frames, points, 3, 3) [m^2] is that of the poses.
 
     Args:
         track: the track, with its standing ankles.
         pose: its poses.
         offsets: (17, 3) [m], the detector's offsets.
     """
-    blocks = damp_motion(track).equations(pose, offsets, bordered=False).blocks
-    by_pose = track.differentiate(pose).pose
-    spread: Floats = by_pose @ factor(blocks).inverse_blocks()[:, None] @ by_pose.swapaxes(-1, -2)
-    return spread
+    equations = damp_motion(track).equations(pose, offsets, bordered=False)
+    by_pose = equations.points.pose
+    inverse = factor(equations.blocks).inverse_blocks()
+    spread: Floats = by_pose @ inverse[:, None] @ by_pose.swapaxes(-1, -2)
+    return equations.points.keypoints, spread
 
 
 def factor(blocks: Floats) -> BandedFactor:
