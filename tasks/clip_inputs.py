@@ -387,7 +387,7 @@ def open_venue(work: Work, camera_ids: Sequence[str]) -> Venue:
 def _join_calibrated(project: str, match_id: str, keys: tuple[tuple[str, str], ...]) -> Venue:
     """Return cameras by the keys of their calibration; a key names one content."""
     store = Store.open(project)
-    each = [store.open_result(match_id, "static_calibration", *camera) for camera in keys]
+    each = [store.open_result(match_id, "static_calibration", camera, key) for camera, key in keys]
     return join_cameras([camera.data_vars for camera in each])
 
 

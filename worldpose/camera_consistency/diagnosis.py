@@ -127,7 +127,7 @@ class Diagnosis:
         count = comparison.count
         self.agreement, self.deviation = np.zeros((count, count)), np.ones((count, count))
         pairs = list(itertools.combinations(range(count), 2))
-        agreements = map_in_threads(lambda pair: comparison.agreement(*pair), pairs)
+        agreements = map_in_threads(lambda pair: comparison.agreement(pair[0], pair[1]), pairs)
         for (a, b), (found, deviation) in zip(pairs, agreements, strict=True):
             self.agreement[a, b] = self.agreement[b, a] = found
             self.deviation[a, b] = self.deviation[b, a] = deviation
