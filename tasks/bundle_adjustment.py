@@ -116,7 +116,7 @@ def _open_clip(store: Store, work: Work, people: _People, opened: ClipInputs) ->
     template = None
     if pitch is not None:
         template = opened.raise_pitch(PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
-    covariance = open_venue(store, work, opened.camera_ids).covariance
+    covariance = open_venue(work, opened.camera_ids).covariance
     known = [
         open_input(store, work, f"static_calibration/{camera}") for camera in opened.camera_ids
     ]

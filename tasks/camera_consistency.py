@@ -30,7 +30,7 @@ def camera_consistency(work: Work) -> str:
         names = clip.camera_ids
         found = check_consistency(
             clip.cameras,
-            open_venue(store, work, names).covariance,
+            open_venue(work, names).covariance,
             clip.detections,
             clip.fps,
             settings,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ from worldpose.store import Store
 
 PAGE = 256
 """Frames per read."""
+VENUES = 4
+"""Venues that a process keeps: reading 16 cameras takes half a second, in most stages twice."""
 PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
 
@@ -94,6 +97,7 @@ class StoredArray:
         self._rejected = None if rejected is None else ChunkedRows(rejected)
         self._shift = None if shift is None else ChunkedRows(shift)
         self._page = lru_cache(PAGES)(self._read)
+        self._reading = Lock()
 
     def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
         """Return some frames as float64; NaN beyond a camera's number of detections."""
@@ -101,7 +105,9 @@ class StoredArray:
         out = np.empty((len(row), *self.shape[1:]))
         for number in np.unique(row // PAGE).tolist():
             here = row // PAGE == number
-            out[here] = self._page(number)[row[here] - number * PAGE]
+            with self._reading:  # else two threads that need one page would both read it
+                page = self._page(number)
+            out[here] = page[row[here] - number * PAGE]
         return out
 
     def _read(self, number: int) -> NDArray[np.float32]:
@@ -370,9 +376,18 @@ def _align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[s
     return aligned, points
 
 
-def open_venue(store: Store, work: Work, camera_ids: Sequence[str]) -> Venue:
+def open_venue(work: Work, camera_ids: Sequence[str]) -> Venue:
     """Return calibrated or given static cameras on the pitch that they show together."""
-    each = [open_input(store, work, f"static_calibration/{camera}") for camera in camera_ids]
+    recipe = work.recipe
+    keys = tuple((camera, recipe.inputs[f"static_calibration/{camera}"]) for camera in camera_ids)
+    return _join_calibrated(work.project, recipe.match_id, keys)
+
+
+@lru_cache(VENUES)
+def _join_calibrated(project: str, match_id: str, keys: tuple[tuple[str, str], ...]) -> Venue:
+    """Return cameras by the keys of their calibration; a key names one content."""
+    store = Store.open(project)
+    each = [store.open_result(match_id, "static_calibration", camera, key) for camera, key in keys]
     return join_cameras([camera.data_vars for camera in each])
 
 
@@ -390,7 +405,7 @@ def _load_cameras(
             stated if known else None,
             None if surface is None else np.array(surface),
         )
-    venue = open_venue(store, work, camera_ids)
+    venue = open_venue(work, camera_ids)
     known = bool(np.isfinite(venue.covariance).all())  # a given camera has no covariance
     shape = None if venue.surface is None else venue.surface.shape
     return venue.cameras, venue.covariance if known else None, shape

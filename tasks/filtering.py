@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.filtering import FILTERING
 from data_contracts.work import Work
-from tasks.clip_inputs import ClipInputs, load_dropped_boxes, open_clip
+from tasks.clip_inputs import ChunkedRows, ClipInputs, load_dropped_boxes, open_clip
 from tasks.spool import open_spool
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.body_fitting import perceived_joints
+from worldpose.compiled import map_in_threads
 from worldpose.filtering import (
     BodyMotion,
     BodyViews,
@@ -33,8 +37,12 @@ from worldpose.review.identities import select_triangulated
 from worldpose.store import Store
 from worldpose.triangulation import TriangulationSettings
 
-PART = 128
-"""Frames per chunk: 200 MB with 25 people and 16 cameras."""
+PART = 64
+"""Frames per part: 100 MB with 25 people and 16 cameras, for each of up to five at a time."""
+PLACED = ("offsets", "exchanged")
+"""Arrays of `retriangulation` that describe the detections."""
+_Frames = slice | NDArray[np.int64]
+_Part = tuple[slice, TriangulatedDetections]
 
 
 @unit_task
@@ -62,27 +70,32 @@ def filtering(work: Work) -> str:
         spread = learn_keypoint_spread(views, placed.subtract(systematic.shift(motion, views)))
         counts = np.zeros(5)
         rejected = np.zeros((2, len(case.clip.camera_ids)))
-        for first in range(0, len(case.clip.detections.frame), PART):
-            frames = np.arange(first, min(first + PART, len(case.clip.detections.frame)))
-            views, motion, suspects = case.at(frames)
+
+        def judge(part: _Part) -> tuple[dict[str, NDArray[Any]], list[float], list[Floats]]:
+            frames, suspects = part
+            views, motion = case.project(frames)
             shift = systematic.shift(motion, views)
             placed = suspects.subtract_clock_offsets(held, motion.image_motion)
             judged = judge_detections(views, placed.subtract(shift), spread, settings)
-            counts += _counts(judged, suspects)
-            rejected += [
+            arrays = {
+                "rejected": judged.rejected,
+                "surprise": judged.mahalanobis_distance,
+                "dropped": judged.dropped,
+                "fits": judged.fits,
+                "similarity": judged.similarity,
+                "shift": suspects.assign_to_detections(shift).astype(np.float32),
+            }
+            by_camera = [
                 judged.rejected.sum(axis=(0, 2, 3)),
                 np.isfinite(suspects.detections.confidence).sum(axis=(0, 2, 3)),
             ]
-            spool.add(
-                {
-                    "rejected": judged.rejected,
-                    "surprise": judged.mahalanobis_distance,
-                    "dropped": judged.dropped,
-                    "fits": judged.fits,
-                    "similarity": judged.similarity,
-                    "shift": suspects.assign_to_detections(shift).astype(np.float32),
-                }
-            )
+            return arrays, _counts(judged, suspects), by_camera
+
+        # Read here: two threads would both read the page in which their parts meet.
+        for arrays, some, by_camera in map_in_threads(judge, case.parts()):
+            spool.add(arrays)
+            counts += some
+            rejected += by_camera
         result.write(
             FILTERING,
             arrays=spool.arrays()
@@ -132,20 +145,36 @@ class _Case:
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
         """Project the bodies into all images; return views, motion, and the detections to test."""
-        motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
-        views = view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames])
-        detections = self.clip.detections[frames]
         placed = self.placed.isel(frame=frames)
+        return *self.project(frames), self.read(frames, *(placed[name].values for name in PLACED))
+
+    def parts(self) -> Iterator[_Part]:
+        """Yield all frames, `PART` at a time, with their detections."""
+        count = len(self.clip.detections.frame)
+        placed = [ChunkedRows(self.placed[name]) for name in PLACED]
+        for first in range(0, count, PART):
+            frames = slice(first, min(first + PART, count))
+            yield frames, self.read(frames, *(array[frames] for array in placed))
+
+    def project(self, frames: _Frames) -> tuple[BodyViews, BodyMotion]:
+        """Return the bodies, and their motion, in all images."""
+        motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
+        return view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames]), motion
+
+    def read(
+        self, frames: _Frames, offsets: NDArray[Any], exchanged: NDArray[Any]
+    ) -> TriangulatedDetections:
+        """Return the detections to test, with these results of their triangulation."""
+        detections = self.clip.detections[frames]
         boxes = detections.confidence.shape[:3]
         before = np.zeros(boxes, dtype=np.bool_) if self.dropped is None else self.dropped[frames]
-        suspects = TriangulatedDetections(
+        return TriangulatedDetections(
             detections,
-            placed["offsets"].values.astype(np.float64),
-            placed["exchanged"].values,
+            offsets.astype(np.float64),
+            exchanged,
             before,
             self.triangulation.noise,
         )
-        return views, motion, suspects
 
 
 def _open(store: Store, work: Work) -> _Case:

@@ -26,8 +26,10 @@ large machine do not hinder each other."""
 
 _PACKAGE = Path(__file__).resolve().parent
 _IMPORT = re.compile(
-    rb"^\s*(?:from|import) (worldpose\.\w+|data_contracts\.\w+)", flags=re.MULTILINE
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([\w.]+))",
+    re.MULTILINE,
 )
+_OWN = ("worldpose", "data_contracts")
 
 
 def compile_kernel(function: Function) -> Function:
@@ -38,7 +40,7 @@ def compile_kernel(function: Function) -> Function:
     """
     given = config.CACHE_DIR  # type: ignore[attr-defined]
     # Numba reads this setting while it decorates.
-    config.CACHE_DIR = given or str(_cache_folder(_part_of(function)))  # type: ignore[attr-defined]
+    config.CACHE_DIR = given or str(_cache_folder(_module_of(function)))  # type: ignore[attr-defined]
     try:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
     finally:
@@ -62,33 +64,59 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
             yield waiting.popleft().result()
 
 
-def _part_of(function: Function) -> str:
-    """Return the part of worldpose that defines a function, such as `worldpose.tracking`."""
+def _module_of(function: Function) -> str:
+    """Return the module that defines a function, such as `worldpose.tracking.person`."""
     source = Path(function.__code__.co_filename).resolve()
-    return f"worldpose.{source.relative_to(_PACKAGE).parts[0].removesuffix('.py')}"
+    return ".".join(("worldpose", *source.relative_to(_PACKAGE).with_suffix("").parts))
 
 
 @functools.cache
-def _cache_folder(part: str) -> Path:
-    """Return a cache folder that is unique to the sources on which kernels of `part` can depend.
+def _cache_folder(module: str) -> Path:
+    """Return a cache folder that is unique to the sources on which a module's kernels can depend.
 
     Numba recompiles a kernel when its own file changes, but not when a kernel or constant from
-    another file changes: it would then run machine code of the old source. A part, a folder of
-    worldpose or a module of data_contracts, depends on all parts that its sources import.
+    another file changes: it would then run machine code of the old source. Kernels of a module can
+    depend on all modules that it imports, and on those that these import.
     """
-    sources = {part: _sources(part)}
-    waiting = [part]
+    sources, waiting = dict[str, str](), [module]
     while waiting:
-        for name in {each.decode() for each in _IMPORT.findall(sources[waiting.pop()])}:
-            if name not in sources:
-                sources[name] = _sources(name)
-                waiting.append(name)
-    digest = hashlib.sha256(b"".join(content for _, content in sorted(sources.items())))
+        name = waiting.pop()
+        if name not in sources:
+            sources[name] = _source(name) or ""
+            waiting.extend(_imports(name))
+    digest = hashlib.sha256("\0".join(text for _, text in sorted(sources.items())).encode())
     root = _PACKAGE if os.access(_PACKAGE, os.W_OK) else Path.home() / ".cache" / "worldpose"
     return root / "__pycache__" / f"kernels-{digest.hexdigest()[:16]}"
 
 
-def _sources(part: str) -> bytes:
-    folder = _PACKAGE.parent.joinpath(*part.split("."))
-    files = [folder.with_suffix(".py"), *sorted(folder.rglob("*.py"))]
-    return b"".join(file.read_bytes() for file in files if file.is_file())
+@functools.cache
+def _imports(module: str) -> frozenset[str]:
+    """Return the modules of worldpose and data_contracts from which a module takes names."""
+    found = set()
+    for origin, names, whole in _IMPORT.findall(_source(module) or ""):
+        origin = origin or whole
+        if origin.split(".")[0] in _OWN:
+            found |= {_origin(origin, name) for name in re.findall(r"\w+", names)} or {origin}
+    return frozenset(found - {module})
+
+
+@functools.cache
+def _origin(package: str, name: str) -> str:
+    """Return the module that a name from a module or package comes from."""
+    if _source(f"{package}.{name}") is not None:
+        return f"{package}.{name}"
+    if (_PACKAGE.parent.joinpath(*package.split(".")) / "__init__.py").is_file():
+        for origin, names, _ in _IMPORT.findall(_source(package) or ""):
+            if origin.split(".")[0] in _OWN and name in re.findall(r"\w+", names):
+                return _origin(origin, name)
+    return package
+
+
+@functools.cache
+def _source(module: str) -> str | None:
+    """Return the source of a module or of a package's `__init__`; None if there is none."""
+    place = _PACKAGE.parent.joinpath(*module.split("."))
+    for file in (place.with_suffix(".py"), place / "__init__.py"):
+        if file.is_file():
+            return file.read_text(encoding="utf-8")
+    return None

@@ -14,7 +14,7 @@ DaskOption = Annotated[
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Worker processes on this machine; one per core by default."),
+    typer.Option(min=1, help="Worker processes on this machine; by default at most one per core."),
 ]
 TimeLimitOption = Annotated[
     list[str] | None,

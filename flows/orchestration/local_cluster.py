@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -15,6 +15,8 @@ from flows.run_plan import PlannedUnit
 if TYPE_CHECKING:
     from flows.orchestration.private_cluster import PrivateCluster
 
+START_WORK_SECONDS = 9.0
+"""Processor time that the start of a worker takes [s]."""
 KEEP_SECONDS = 5.0
 """Interval at which lost workers are restarted."""
 
@@ -23,7 +25,7 @@ def start_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateClust
     """Start workers on this machine, which at once import the modules that they will need.
 
     Args:
-        asked: number of workers; None = as many as can work in parallel.
+        asked: number of workers; None = as many as `workers_for`.
         missing: units to compute first.
     """
     import dask
@@ -47,9 +49,28 @@ def start_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateClust
 
 
 def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
-    """Return the requested number of workers, or else the number that can work in parallel."""
-    stages = Counter(unit.recipe.stage for unit in missing)
-    return asked or min(os.cpu_count() or 1, max(stages.values()))
+    """Return the requested number of workers, or else the number that can work in parallel.
+
+    Stages that one worker completes sooner than a second one starts ask for one.
+    """
+    stages: dict[str, list[float]] = {}
+    for unit in missing:
+        stages.setdefault(unit.recipe.stage, []).append(_short_seconds(unit))
+    wanted = [len(each) for each in stages.values() if sum(each) > START_WORK_SECONDS]
+    return asked or min(os.cpu_count() or 1, max(wanted, default=1))
+
+
+def _short_seconds(unit: PlannedUnit) -> float:
+    """Return the processor time of given 2D poses, or of a camera from clicks alone [s].
+
+    That of any other unit counts as infinite.
+    """
+    stage, sources = unit.recipe.stage, unit.recipe.sources
+    images = any(sources.get(name) for name in ("video", "still", "filmed"))
+    if images or stage not in ("ingest", "static_calibration"):
+        return math.inf
+    frames = sources.get("frame_count", 0)
+    return 0.2 + (frames / 20_000 if isinstance(frames, int) else math.inf)
 
 
 @contextmanager

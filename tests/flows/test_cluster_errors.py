@@ -1,6 +1,7 @@
 """A lost Prefect server or Dask scheduler is not a unit's failure."""
 
 import time
+from types import SimpleNamespace
 
 import dask
 import httpx
@@ -57,3 +58,25 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
         client.wait_for_workers(2, 60)
         time.sleep(0.3)  # the next looks after them keep both
         assert len(cluster.worker_spec) == 2
+
+
+@pytest.mark.parametrize(
+    ("units", "workers"),
+    [
+        (17 * [("ingest", {"frame_count": 3000})] + 16 * [("static_calibration", {})], 1),
+        (16 * [("static_calibration", {"still": "stills/cam00.png"})], 3),
+        (2 * [("ingest", {"frame_count": 3000, "video": {"path": "videos/cam00.mp4"}})], 2),
+        (16 * [("ingest", {"frame_count": 270_000})], 3),
+        (17 * [("ingest", {"frame_count": 3000})] + 2 * [("tracking", {})], 2),
+        ([("tracking", {})], 1),
+        ([], 1),
+    ],
+)
+def test_a_second_worker_is_for_work_that_takes_longer_than_its_start(monkeypatch, units, workers):
+    monkeypatch.setattr(local_cluster.os, "cpu_count", lambda: 3)
+    missing = [
+        SimpleNamespace(recipe=SimpleNamespace(stage=stage, sources=sources))
+        for stage, sources in units
+    ]
+    assert local_cluster.workers_for(None, missing) == workers
+    assert local_cluster.workers_for(2, missing) == 2

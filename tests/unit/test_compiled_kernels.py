@@ -1,14 +1,18 @@
 """Kernels kept on disk are those of the source as it is now."""
 
+import importlib
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import worldpose.compiled
 
+ROOT = Path(worldpose.compiled.__file__).parents[1]
+
 CALLER = """
 from worldpose.compiled import compile_kernel
-from worldpose.callees.callee import callee
+from worldpose.callees import callee
 
 @compile_kernel
 def caller():
@@ -33,6 +37,9 @@ def test_an_edit_in_another_file_reaches_the_kernels_that_can_depend_on_it(tmp_p
         (package / folder / "__init__.py").touch()
     shutil.copy(worldpose.compiled.__file__, package / "compiled.py")
     (package / "__init__.py").touch()
+    (package / "callees" / "__init__.py").write_text(
+        "from worldpose.callees.callee import (\n    callee,\n)\n"
+    )
     (package / "callers" / "caller.py").write_text(CALLER)
 
     def result(value):
@@ -50,6 +57,31 @@ def test_an_edit_in_another_file_reaches_the_kernels_that_can_depend_on_it(tmp_p
     assert result(20) == 21
     assert kept.items() < kernels().items()
     kept = kernels()
-    (package / "others" / "other.py").write_text(CALLEE.format(value=30))
+    for folder in ("others", "callers", "callees"):
+        (package / folder / "other.py").write_text(CALLEE.format(value=30))
     assert result(10) == 11
     assert kernels() == kept, "compiled again, although nothing that they import has changed"
+
+
+def test_the_modules_whose_change_compiles_a_kernel_again_include_all_that_it_uses():
+    kernels = 0
+    for path in sorted((ROOT / "worldpose").rglob("*.py")):
+        if "\n@compile_kernel\n" not in path.read_text():
+            continue
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        reached, waiting = set(), [name]
+        while waiting:
+            if (module := waiting.pop()) not in reached:
+                reached.add(module)
+                waiting += worldpose.compiled._imports(module)
+        for kernel in vars(importlib.import_module(name)).values():
+            if getattr(kernel, "py_func", None) is None or kernel.py_func.__module__ != name:
+                continue
+            kernels += 1
+            for used in kernel.py_func.__code__.co_names:
+                value = kernel.py_func.__globals__.get(used)
+                value = getattr(value, "py_func", value)
+                origin = getattr(value, "__module__", None) or getattr(value, "__name__", "")
+                if str(origin).startswith(("worldpose.", "data_contracts.")):
+                    assert origin in reached, f"{name} uses {used} of {origin}"
+    assert kernels > 100

@@ -191,10 +191,11 @@ def fit_bodies(
     def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
         own, span = by_person[person], spans[person]
         pose, track = solver.solve_poses(own, shapes.people[person], shapes.offsets, fps, prior)
-        random = pose_covariance(track, pose, shapes.offsets)
+        points, random = pose_covariance(track, pose, shapes.offsets)
         spread = random[:, :17] + bias[:, None, None] ** 2 * np.eye(3)
         determined = None if extra is None else extra.determined[person]
-        bodies = result.put(solver, person, span, pose, spread, shapes, determined)
+        own_joints = points[:, :17], spread
+        bodies = result.put(solver, person, span, pose, own_joints, shapes, determined)
         if extra is not None:
             extra.put(person, span, bodies, random[:, 17:])
 
@@ -346,19 +347,19 @@ class FittedArrays:
         person: int,
         span: slice,
         pose: Pose,
-        covariance: Floats,
+        joints: tuple[Floats, Floats],
         shapes: Shapes,
         determined: NDArray[np.bool_] | None = None,
     ) -> BodyParameters:
         """Write the result of one person, and return the bodies with their feet.
 
-        Covariance (frames, 17, 3, 3) [m^2] is that of the keypoints; `determined` is as `seen` of
-        `Solver.plant_feet`.
+        `joints` are the keypoints (frames, 17, 3) [m] and their covariance (frames, 17, 3, 3)
+        [m^2]; `determined` is as `seen` of `Solver.plant_feet`.
 
         The covariance of the detector's offsets and of the person's own is added.
         """
         shape = shapes.people[person]
-        keypoints = solver.chained.differentiate(pose.parameters()).keypoints[:, :17]
+        keypoints, covariance = joints
         bodies = solver.plant_feet(pose, determined)
         self.betas[person] = shape.betas
         self.betas_covariance[person] = shape.covariance

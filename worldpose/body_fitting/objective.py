@@ -8,7 +8,7 @@ order, so these are not counted a second time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,7 +20,14 @@ from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
-from worldpose.body_fitting.pose_space import MAX_ANGLES, MIN_ANGLES, SIZE, SPREADS, PosePrior
+from worldpose.body_fitting.pose_space import (
+    MAX_ANGLES,
+    MIN_ANGLES,
+    SIZE,
+    SPREADS,
+    PosePrior,
+    cross,
+)
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import compile_kernel
 
@@ -59,9 +66,9 @@ def body_axes(joints: Floats) -> Floats:
     left = joints[..., 5, :] + joints[..., 11, :] - joints[..., 6, :] - joints[..., 12, :]
     up = joints[..., 5, :] + joints[..., 6, :] - joints[..., 11, :] - joints[..., 12, :]
     left = left / np.linalg.norm(left, axis=-1, keepdims=True)
-    front = np.cross(left, up)
+    front = cross(left, up)
     front /= np.linalg.norm(front, axis=-1, keepdims=True)
-    axes: Floats = np.stack([front, left, np.cross(front, left)], axis=-1)
+    axes: Floats = np.stack([front, left, cross(front, left)], axis=-1)
     return axes
 
 
@@ -100,6 +107,14 @@ class Evidence:
         return Evidence(
             np.concatenate([self.joints, own.joints], axis=1),
             np.concatenate([self.information, own.information], axis=1),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Evidence]) -> Evidence:
+        """Return the evidence of intervals, one after the other."""
+        return cls(
+            np.concatenate([part.joints for part in parts]),
+            np.concatenate([part.information for part in parts]),
         )
 
     @property
@@ -179,7 +194,12 @@ class Contacts:
 
 
 def find_contacts(
-    joints: Floats, ankle_height: float, ground: Ground, fps: float, settings: BodyFittingSettings
+    joints: Floats,
+    ankle_height: float,
+    ground: Ground,
+    fps: float,
+    settings: BodyFittingSettings,
+    starts: Sequence[int] = (),
 ) -> Contacts:
     """Return contacts of ankles that are low and slow for at least two frames.
 
@@ -189,6 +209,7 @@ def find_contacts(
         ground: the surface.
         fps: [1/s].
         settings: limits of low and slow.
+        starts: first frames of the track's further intervals, as in `Track`.
     """
     ankles = joints[:, ANKLES]
     height = ground(ankles[..., 0], ankles[..., 1]) + ankle_height
@@ -197,6 +218,7 @@ def find_contacts(
     speed = np.linalg.norm(np.diff(ankles, axis=0), axis=-1) * fps
     low = ankles[..., 2] - height < settings.contact_height_m
     slipping = (speed < settings.contact_speed_m_s) & low[1:] & low[:-1]
+    slipping[np.array(starts, dtype=np.int64) - 1] = False
     standing = np.zeros(low.shape, dtype=bool)
     standing[1:] |= slipping
     standing[:-1] |= slipping
@@ -295,7 +317,8 @@ def _accumulate(
 ) -> tuple[Floats, Floats]:
     """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
 
-    A point moves with few of the angles: products skip those that leave it in place.
+    Blocks on the diagonal have their lower triangle only, which is all that the factor reads. A
+    point moves with few of the angles: products skip those that leave it in place.
 
     Args:
         rows: (frames, points, 3, 36), derivatives of points.
@@ -317,20 +340,25 @@ def _accumulate(
                 for j in range(size):
                     scaled[a, j] = f0 * r[0, j] + f1 * r[1, j] + f2 * r[2, j]
                     slope[j] += pull * r[a, j]
-            _add_product(blocks[0, t], r, scaled, active)
+            _add_product(blocks[0, t], r, scaled, active, True)
             for ahead in (1, 2):
                 weight = next_frame[t, p] if ahead == 1 else second_frame[t, p]
                 if t + ahead < frames and weight != 0.0:
                     for a in range(3):
                         for j in range(size):
                             scaled[a, j] = weight * r[a, j]
-                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active)
+                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active, False)
     return blocks, gradient
 
 
 @compile_kernel
-def _add_product(target: Floats, left: Floats, right: Floats, active: NDArray[np.int64]) -> None:
-    """Add `left^T right` of two (3, n) matrices; `active` is room for n indices."""
+def _add_product(
+    target: Floats, left: Floats, right: Floats, active: NDArray[np.int64], below: bool
+) -> None:
+    """Add `left^T right` of two (3, n) matrices; only the lower triangle where `below`.
+
+    `active` is room for n indices.
+    """
     size, count = len(target), 0
     for i in range(size):
         if left[0, i] != 0.0 or left[1, i] != 0.0 or left[2, i] != 0.0:
@@ -339,7 +367,8 @@ def _add_product(target: Floats, left: Floats, right: Floats, active: NDArray[np
     for place in range(count):
         i = active[place]
         f0, f1, f2 = left[0, i], left[1, i], left[2, i]
-        for j in range(size):
+        end = i + 1 if below else size
+        for j in range(end):
             target[i, j] += f0 * right[0, j] + f1 * right[1, j] + f2 * right[2, j]
 
 
@@ -377,8 +406,10 @@ class Pose:
 class NormalEquations:
     """`[blocks border; border^T corner] step = -[gradient; border_gradient]` of one track."""
 
+    points: KeypointJacobian
+    """Points (frames, points) and their derivatives by the unknowns."""
     blocks: Floats
-    """(3, frames, 36, 36)"""
+    """(3, frames, 36, 36), those on the diagonal valid in the lower triangle."""
     gradient: Floats
     """(frames, 36)"""
     border: Floats
@@ -405,6 +436,8 @@ class Track:
     """Weight of the pose prior in each frame [1]."""
     contacts: Contacts | None = None
     monocular_prior: MonocularPrior | None = None
+    starts: tuple[int, ...] = ()
+    """First frames of the intervals after the first; motion ties no interval to another."""
 
     def equations(self, pose: Pose, offsets: Floats, *, bordered: bool) -> NormalEquations:
         """Return the normal equations at a pose.
@@ -460,10 +493,10 @@ class Track:
             border = np.swapaxes(rows, 1, 2) @ held
             corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
             shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 3 * points))
-        equations = NormalEquations(blocks, gradient, border, corner, shared, cost)
+        equations = NormalEquations(body, blocks, gradient, border, corner, shared, cost)
         if self.contacts is None:
             return equations
-        return self._add_contacts(equations, body.keypoints, by_frame, body.betas)
+        return self._add_contacts(equations)
 
     def differentiate(self, pose: Pose) -> KeypointJacobian:
         """Return the points with derivatives by the unknowns (frames, points, 3, 36) in `pose`.
@@ -498,9 +531,13 @@ class Track:
             spread = self.acceleration * scale / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
             tail = 3.0 * settings.acceleration_loss_scale**2
+            for start in self.starts:
+                second[max(0, start - 2) : start] = 0.0
             deviation = (second**2).sum(-1) / spread**2 / tail
             cost = 0.5 * tail * float(np.log1p(deviation).sum())
             weight = 1.0 / (1.0 + deviation) / spread**2
+            for start in self.starts:
+                weight[max(0, start - 2) : start] = 0.0
             weighted = weight[..., None] * second
             for start, factor in ((0, 1.0), (1, -2.0), (2, 1.0)):
                 slope[start : frames - 2 + start] += factor * weighted
@@ -534,12 +571,12 @@ class Track:
         blocks[:, places, places] += stiff * (beyond != 0.0)
         return 0.5 * float(((away @ prior) * away).sum() + stiff * (beyond**2).sum())
 
-    def _add_contacts(
-        self, equations: NormalEquations, keypoints: Floats, by_frame: Floats, by_betas: Floats
-    ) -> NormalEquations:
+    def _add_contacts(self, equations: NormalEquations) -> NormalEquations:
         """Return the equations with terms for the height of standing ankles, and none below it."""
         contacts = self.contacts
         assert contacts is not None
+        body = equations.points
+        keypoints, by_frame, by_betas = body.keypoints, body.pose, body.betas
         blocks, gradient = equations.blocks, equations.gradient
         border, corner = equations.border, equations.corner
         shared, cost = equations.border_gradient, equations.cost
@@ -556,4 +593,4 @@ class Track:
             border[..., :shapes] += heavy[..., None] * column[:, None]
             corner[:shapes, :shapes] += (weight[:, None] * column).T @ column
             shared[:shapes] += (weight * above) @ column
-        return NormalEquations(blocks, gradient, border, corner, shared, cost)
+        return NormalEquations(body, blocks, gradient, border, corner, shared, cost)

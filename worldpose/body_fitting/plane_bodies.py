@@ -230,9 +230,9 @@ def fit_bodies_on_plane(
         rows = np.arange(span.start, span.stop)
         track = clip.track(person, rows, evidence.fps, for_shape=False)
         pose, solved = solver.search(track, start, shapes.offsets)
-        spread = pose_covariance(solved, pose, shapes.offsets)
+        joints, spread = pose_covariance(solved, pose, shapes.offsets)
         bias = np.full(17, DEFINITION_STD_M**2)[:, None, None] * np.eye(3)
-        result.put(solver, person, span, pose, spread + bias, shapes)
+        result.put(solver, person, span, pose, (joints, spread + bias), shapes)
         result.covariance[span, person] += clip.depth_covariance(
             person, own, result.joints[span, person]
         )

@@ -112,9 +112,7 @@ class Solver:
         for step in range(self.settings.steps):
             if self.ground is not None and step == self.settings.steps // 2:
                 track = self.find_standing_ankles(track, pose)
-            equations = track.equations(pose, offsets, bordered=False)
-            solution = factor(equations.blocks).solve(equations.gradient[..., None])
-            pose = pose.apply_step(-solution[..., 0])
+            pose = _take_step(track, pose, offsets)
         return pose, track
 
     def find_standing_ankles(self, track: Track, pose: Pose) -> Track:
@@ -122,7 +120,9 @@ class Solver:
         assert self.ground is not None
         joints = self.chained.differentiate(pose.parameters()).keypoints
         height = ankle_height(self.chained.model, pose.betas)
-        contacts = find_contacts(joints, height, self.ground, track.fps, self.settings)
+        contacts = find_contacts(
+            joints, height, self.ground, track.fps, self.settings, track.starts
+        )
         return replace(track, contacts=contacts)
 
     def plant_feet(self, pose: Pose, seen: NDArray[np.bool_] | None = None) -> BodyParameters:
@@ -147,6 +147,13 @@ class Solver:
             level = slice(None) if seen is None else ~seen[:, foot - 7]
             angles[level, foot - 1] = Rigid(turned[level], np.zeros(3)).rotvec
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
+
+
+def _take_step(track: Track, pose: Pose, offsets: Floats) -> Pose:
+    """Return the pose after one Gauss-Newton step; its equations are gone before the next ones."""
+    equations = track.equations(pose, offsets, bordered=False)
+    solution = factor(equations.blocks).solve(equations.gradient[..., None])
+    return pose.apply_step(-solution[..., 0])
 
 
 def start_from_monocular(pose: Pose, monocular_prior: MonocularPrior) -> Pose:
@@ -179,18 +186,21 @@ def damp_motion(track: Track) -> Track:
     )
 
 
-def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> Floats:
-    """Return the covariance of a solved track's points from its poses (frames, points, 3, 3) [m^2].
+def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> tuple[Floats, Floats]:
+    """Return a solved track's points (frames, points, 3) [m] and their covariance.
+
+    The covariance (frames, points, 3, 3) [m^2] is that of the poses.
 
     Args:
         track: the track, with its standing ankles.
         pose: its poses.
         offsets: (17, 3) [m], the detector's offsets.
     """
-    blocks = damp_motion(track).equations(pose, offsets, bordered=False).blocks
-    by_pose = track.differentiate(pose).pose
-    spread: Floats = by_pose @ factor(blocks).inverse_blocks()[:, None] @ by_pose.swapaxes(-1, -2)
-    return spread
+    equations = damp_motion(track).equations(pose, offsets, bordered=False)
+    by_pose = equations.points.pose
+    inverse = factor(equations.blocks).inverse_blocks()
+    spread: Floats = by_pose @ inverse[:, None] @ by_pose.swapaxes(-1, -2)
+    return equations.points.keypoints, spread
 
 
 def factor(blocks: Floats) -> BandedFactor:
@@ -233,7 +243,7 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """An interval of a person's track, with its current bodies."""
+    """Intervals of a person's track, with their current bodies."""
 
     person: int
     track: Track
@@ -252,10 +262,10 @@ def fit_shapes(
         fps: [1/s].
     """
 
-    def sample(person: int) -> list[Piece]:
-        return _sample_pieces(solver, person, *people[person], fps)
+    def sample(person: int) -> Piece | None:
+        return _sample_piece(solver, person, *people[person], fps)
 
-    pieces = [piece for some in map_in_threads(sample, people) for piece in some]
+    pieces = [piece for piece in map_in_threads(sample, people) if piece is not None]
     return solve_shapes(solver, people, pieces, known)
 
 
@@ -369,34 +379,43 @@ def _eliminate_poses(
     return solutions, matrices, gradients
 
 
-def _sample_pieces(
+def _sample_piece(
     solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
-) -> list[Piece]:
-    """Return intervals of a person's track for shape estimation, with initial bodies."""
+) -> Piece | None:
+    """Return intervals of a person's track for shape estimation, with initial bodies.
+
+    All in one: the equations of ten short tracks take several times as long as those of one.
+    """
     settings, model = solver.settings, solver.chained.model
     stride = max(1, int(fps / settings.shape_rate_hz))
     rate = fps / stride
     scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
     bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
-    pieces = []
+    evidence, poses, starts, frames = [], [], [], 0
     for part in spread_intervals(len(joints), fps, settings):
         some, sure = joints[part][::stride], covariance[part][::stride]
         if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
             continue
         some = shorten_limbs(some, scale * sure)
-        track = Track(
-            solver.chained,
-            Evidence.of(some, sure, rate, settings),
-            solver.prior,
-            settings,
-            rate,
-            settings.shape_acceleration_m_s2,
-            settings.shape_pose_weight,
-        )
-        pose = Pose(*start_poses(model, betas, interpolate_gaps(some), solver.prior), betas)
-        pieces.append(Piece(person, track, pose))
-    return pieces
+        evidence.append(Evidence.of(some, sure, rate, settings))
+        poses.append(start_poses(model, betas, interpolate_gaps(some), solver.prior))
+        starts.append(frames)
+        frames += len(some)
+    if not evidence:
+        return None
+    track = Track(
+        solver.chained,
+        Evidence.concatenate(evidence),
+        solver.prior,
+        settings,
+        rate,
+        settings.shape_acceleration_m_s2,
+        settings.shape_pose_weight,
+        starts=tuple(starts[1:]),
+    )
+    transl, orient, angles = (np.concatenate(column) for column in zip(*poses, strict=True))
+    return Piece(person, track, Pose(transl, orient, angles, betas))
 
 
 def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> list[slice]:

@@ -42,6 +42,7 @@ from worldpose.bundle_adjustment.uncertainty import (
     relative_covariance,
     survey_response,
 )
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
 
@@ -385,8 +386,9 @@ class _Adjuster:
             cameras = self.clip.cameras if fixed is None else self.adjust(fixed).cameras
             return held_out_errors(self.clip, cameras, self.judged, groups >= 0, robust)
         loss = error = joints = np.full((1, 1, 1, 1), np.nan)
-        for group in np.unique(groups):
-            cameras = self.adjust(fixed, without=group).cameras
+        names = np.unique(groups).tolist()
+        solved = map_in_threads(lambda group: self.adjust(fixed, without=group), names)
+        for group, cameras in zip(names, [each.cameras for each in solved], strict=True):
             held = held_out_errors(self.clip, cameras, self.judged, groups == group, robust)
             loss = np.where(np.isnan(loss), held.loss, loss)
             error = np.where(np.isnan(error), held.error, error)

@@ -14,6 +14,7 @@ from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledg
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution, solve
 from worldpose.bundle_adjustment.uncertainty import Similarity, align_points
+from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS
@@ -65,15 +66,18 @@ def held_out_errors(
     judges = np.flatnonzero(people.any(axis=0))
     judged = detections.assign_people(index[:, :, judges])
     image, weight = keypoints_by_person(judged)
-    for c in range(len(cameras.focal)):
+
+    def measure(c: int) -> tuple[Floats, Floats]:
         joints = _triangulate(clip, cameras, c, judged)
         predicted, noise = project_joints(
             cameras[c : c + 1], joints, weight[:, c : c + 1], clip.triangulation
         )
         length = np.linalg.norm(predicted[:, 0] - image[:, c], axis=-1)
         squared = (length / noise[:, 0]) ** 2
-        error[:, c, judges] = length
-        loss[:, c, judges] = robust_scale**2 * np.log1p(squared / robust_scale**2)
+        return length, robust_scale**2 * np.log1p(squared / robust_scale**2)
+
+    for c, measured in enumerate(map_in_threads(measure, range(len(cameras.focal)))):
+        error[:, c, judges], loss[:, c, judges] = measured
     loss[~np.isfinite(error)] = np.nan
     joints = np.full((len(frames), index.shape[2], *loss.shape[3:], 3), np.nan)
     joints[:, judges] = _triangulate(clip, cameras, None, judged)

@@ -14,6 +14,7 @@ from worldpose.bundle_adjustment.clip import Clicks, Clip, keypoints_by_person, 
 from worldpose.bundle_adjustment.problems import KeypointNoise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.uncertainty import weak_direction
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_arrays
 from worldpose.static_calibration import image_problems, project_with_jacobian
@@ -165,16 +166,13 @@ def keypoint_outliers(
         limit: Mahalanobis distance from which a keypoint is listed [1].
         longest: maximum number of entries.
     """
-    parts = [
-        _find_outliers(
-            clip,
-            cameras,
-            noise,
-            limit,
-            np.arange(first, min(first + _BLOCK, len(clip.detections.frame))),
-        )
-        for first in range(0, len(clip.detections.frame), _BLOCK)
-    ]
+    last = len(clip.detections.frame)
+
+    def find(first: int) -> Floats:
+        frames = np.arange(first, min(first + _BLOCK, last))
+        return _find_outliers(clip, cameras, noise, limit, frames)
+
+    parts = list(map_in_threads(find, range(0, last, _BLOCK)))
     rows = np.concatenate([np.empty((0, 5)), *parts])
     order = np.lexsort((*rows[:, 3::-1].T, -rows[:, 4]))[:longest]
     frame, camera, person, joint = rows[order, :4].astype(np.int64).T

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
 from worldpose.camera_consistency.settings import ConsistencySettings
-from worldpose.compiled import compile_kernel
+from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.geometry import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
@@ -244,18 +244,21 @@ class Comparison:
         it differs between detectors and with people's size in the image.
         """
         pairs = [(a, b) for a in range(self.count) for b in range(a)]
-        totals = []
-        for noise in JOINT_NOISES:
-            self._joint_noise = noise
-            above = 0.0
-            for a, b in pairs:
-                found = self.scores(self.views[a], self.views[b], self.search, self.search).mean()
-                chance = [
-                    self.scores(moved, self.views[b], self.search, self.search).mean()
-                    for moved in _orbit(self.views[a], self.views[b], ORBITS_DEG[:2])
-                ]
-                above += max(0.0, float(found - np.mean(chance)))
-            totals.append(above)
+
+        def above_chance(pair: tuple[int, int]) -> list[float]:
+            view, partner = (self.views[c] for c in pair)
+            moved = list(_orbit(view, partner, ORBITS_DEG[:2]))
+            above = []
+            for noise in JOINT_NOISES:
+                found, *chance = (
+                    pair_scores(each, self.search, partner, self.search, self._heights, noise)
+                    for each in (view, *moved)
+                )
+                usual = np.mean([each.mean() for each in chance])
+                above.append(max(0.0, float(found.mean() - usual)))
+            return above
+
+        totals = [sum(each) for each in zip(*map_in_threads(above_chance, pairs), strict=True)]
         enough = np.array(totals) >= KEPT * max(totals)
         self._joint_noise = JOINT_NOISES[int(np.argmax(enough))]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from worldpose.camera_consistency.hypotheses import (
     rotate_camera,
     scale_focal_length,
 )
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 
 PARTNERS: Final = 4
@@ -124,11 +126,11 @@ class Diagnosis:
         self.given, self.tilt, self.focal_error = given, tilt, focal_error
         count = comparison.count
         self.agreement, self.deviation = np.zeros((count, count)), np.ones((count, count))
-        for a in range(count):
-            for b in range(a + 1, count):
-                found, deviation = comparison.agreement(a, b)
-                self.agreement[a, b] = self.agreement[b, a] = found
-                self.deviation[a, b] = self.deviation[b, a] = deviation
+        pairs = list(itertools.combinations(range(count), 2))
+        agreements = map_in_threads(lambda pair: comparison.agreement(pair[0], pair[1]), pairs)
+        for (a, b), (found, deviation) in zip(pairs, agreements, strict=True):
+            self.agreement[a, b] = self.agreement[b, a] = found
+            self.deviation[a, b] = self.deviation[b, a] = deviation
         self.faults: list[Fault] = []
 
     def run(self) -> Consistency:
@@ -180,20 +182,21 @@ class Diagnosis:
         seen = self.comparison.people_seen
         share = self.agreement / np.maximum(1.0, np.minimum(seen[:, None], seen))
         suspects = list(core)
+
+        def examine(c: int) -> tuple[float, int, Trial] | None:
+            partners = [p for p in core if p != c and p not in self.faulty]
+            gross = bool(share[c].max() < CLEAR)
+            if gross:  # partners that agree with it by chance would not test it
+                support = {p: sum(share[p, q] for q in partners) for p in partners}
+                partners.sort(key=lambda p: -support[p])
+            else:
+                partners.sort(key=lambda p: -self.agreement[c, p])
+            most = PARTNERS_OF_GROSS if gross else PARTNERS
+            trials = self.explain(c, partners[:most], gross)
+            return trials and (trials[0].matches - trials[1].matches, c, trials[0])
+
         while suspects:
-            found = []
-            for c in suspects:
-                partners = [p for p in core if p != c and p not in self.faulty]
-                gross = bool(share[c].max() < CLEAR)
-                if gross:  # partners that agree with it by chance would not test it
-                    support = {p: sum(share[p, q] for q in partners) for p in partners}
-                    partners.sort(key=lambda p: -support[p])
-                else:
-                    partners.sort(key=lambda p: -self.agreement[c, p])
-                most = PARTNERS_OF_GROSS if gross else PARTNERS
-                trials = self.explain(c, partners[:most], gross)
-                if trials is not None:
-                    found.append((trials[0].matches - trials[1].matches, c, trials[0]))
+            found = [each for each in map_in_threads(examine, suspects) if each is not None]
             if not found:
                 return
             _, worst, trial = max(found, key=lambda each: each[0])

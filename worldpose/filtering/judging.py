@@ -13,6 +13,7 @@ from data_contracts.arrays import AnyFloats, Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
+from worldpose.compiled import map_in_threads
 from worldpose.filtering.settings import FilteringSettings
 from worldpose.geometry import Camera
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
@@ -147,8 +148,10 @@ def measure_held_out(
     if count - max(1, count // FOLDS) < settings.min_views:
         return None
     fold = np.arange(count) % FOLDS
-    total, keypoints, used = 0.0, 0, used.with_points(())
-    for left_out in range(min(FOLDS, count)):
+    used = used.with_points(())
+
+    def measure(left_out: int) -> tuple[float, int]:
+        total, keypoints = 0.0, 0
         index = np.where((fold == left_out)[:, None], np.int16(-1), used.detection_index)
         others = replace(used, detection_index=index.astype(np.int16))
         placed = triangulate_joints(cameras, others, settings)
@@ -157,6 +160,10 @@ def measure_held_out(
             away = _distances(cameras[int(camera)], seen, placed.joints)
             total += float(away.sum())
             keypoints += int(np.isfinite(seen[..., 0]).sum())
+        return total, keypoints
+
+    found = list(map_in_threads(measure, range(min(FOLDS, count))))
+    total, keypoints = sum(each for each, _ in found), sum(each for _, each in found)
     return HeldOut(total / keypoints, keypoints) if keypoints else None
 
 

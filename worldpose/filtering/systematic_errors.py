@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.body_fitting.objective import body_axes
+from worldpose.compiled import map_in_threads
 from worldpose.filtering.judging import (
     BodyViews,
     Places,
@@ -291,8 +292,8 @@ class ClockEquations:
         normal = np.tile(MIN_INFORMATION * np.eye(3), (len(points), 1, 1))
         mixed = np.zeros((len(points), 3, count, width))
         matrix = np.zeros((count, width, count, width))
-        seen = []
-        for camera in range(count):
+
+        def observe(camera: int) -> tuple[_CameraEquations, Floats, Floats, Floats]:
             row, joint = np.nonzero((weight > 0.0) & (residuals.camera == camera)[:, None])
             place = (residuals.frame[row] * persons + residuals.person[row]) * joint_count + joint
             by_points = cameras[camera].project_with_jacobians(points[place])
@@ -300,11 +301,22 @@ class ClockEquations:
             by_all = np.concatenate([image_motion[row, joint][..., None], by_camera], axis=-1)
             held = weight[row, joint, None, None] * by_all
             held_points = weight[row, joint, None, None] * by_points.d_points
-            matrix[camera, :, camera] = np.einsum("nak,nal->kl", held, by_all)
+            return (
+                _CameraEquations(row, joint, place, held, held_points),
+                np.einsum("nak,nal->kl", held, by_all),
+                np.einsum("nai,naj->nij", held_points, by_points.d_points),
+                np.einsum("nai,nak->nik", held_points, by_all),
+            )
+
+        seen = []
+        for camera, (own, block, by_point, both) in enumerate(
+            map_in_threads(observe, range(count))
+        ):
+            matrix[camera, :, camera] = block
             # A camera sees a joint of a person at most once per frame.
-            normal[place] += np.einsum("nai,naj->nij", held_points, by_points.d_points)
-            mixed[place, :, camera] = np.einsum("nai,nak->nik", held_points, by_all)
-            seen.append(_CameraEquations(row, joint, place, held, held_points))
+            normal[own.place] += by_point
+            mixed[own.place, :, camera] = both
+            seen.append(own)
         used = normal[:, 0, 0] > MIN_INFORMATION
         flat = mixed[used].reshape(-1, 3, count * width)
         follow = np.asarray(np.linalg.solve(normal[used], flat), np.float64)

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Singles
+from data_contracts.arrays import ClipArray, Floats, Singles
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
+from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.tracking.frame_tracker import FrameTracker
@@ -129,7 +130,9 @@ def track_people(
         )
     tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
-    for start in range(0, frames, BLOCK):
+
+    def read(start: int) -> tuple[int, Floats, Floats]:
+        """Return the first frame of a block, and its rays and their weights."""
         image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)
         weights = np.array(confidence[start : start + BLOCK], dtype=np.float64, order="C")
         directions = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
@@ -138,9 +141,12 @@ def track_people(
         # The accuracy of an angle is a pixel over the focal length.
         weights *= (cameras.focal**2).mean(axis=-1)[:, None, None]
         weights[~seen] = 0.0
-        directions = np.where(seen[..., None], directions, np.nan)
-        is_empty = ~np.asarray(seen.any(axis=(1, 2, 3)))
-        for offset in range(len(image)):
+        return start, np.where(seen[..., None], directions, np.nan), weights
+
+    # The next blocks are read while the frames of one are tracked.
+    for start, directions, weights in map_in_threads(read, range(0, frames, BLOCK)):
+        is_empty = ~np.asarray((weights > 0.0).any(axis=(1, 2, 3)))
+        for offset in range(len(weights)):
             if not (is_empty[offset] and tracker.is_idle):
                 tracker.step(start + offset, directions[offset], weights[offset])
             if progress is not None:

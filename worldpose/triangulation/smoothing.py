@@ -333,23 +333,36 @@ def learn_motion(
     lag = max(1, round(REPEAT * fps))
     correlation, energy = np.zeros(lag + 1), 0.0
     odd = np.arange(len(rig.cameras)) % 2 == 1
-    for track in tracks:
+
+    def predict(track: PersonTrack) -> list[tuple[int, list[Floats], Floats]]:
+        """Return each joint with its costs (candidates,) of both halves, and its errors."""
         pixels, weights, points = track.pixels, track.precision, track.joints
+        found = []
         for joint in range(joints):
             given = np.ascontiguousarray(points[:, joint])
             if not np.isfinite(given).all():
                 continue
+            costs = []
             for left_out in (odd, ~odd):
                 seen = np.where(left_out[:, None], 0.0, weights[joint])
                 hidden = np.where(left_out[:, None], weights[joint], 0.0)
                 if ((seen > 0.0).sum(axis=0) < settings.min_views).any():
                     continue
                 tiles = prepare_tiles(pixels[joint], hidden, rig)
+                own = np.empty(len(ACCELERATIONS))
                 for n, acceleration in enumerate(ACCELERATIONS):
-                    costs = TrackCosts(noise, limit, (fps**2 / acceleration) ** 2)
-                    x, _ = solve_segment(pixels[joint], seen, given, rig, costs)
-                    cost[n, joint] += held_out_cost(tiles, rig.depths, noise, limit, x)
+                    weighed = TrackCosts(noise, limit, (fps**2 / acceleration) ** 2)
+                    x, _ = solve_segment(pixels[joint], seen, given, rig, weighed)
+                    own[n] = held_out_cost(tiles, rig.depths, noise, limit, x)
+                costs.append(own)
             error = _whiten_errors(pixels[joint], weights[joint], given, rig, noise, limit)
+            found.append((joint, costs, error))
+        return found
+
+    for found in map_in_threads(predict, tracks):
+        for joint, costs, error in found:
+            for own in costs:
+                cost[:, joint] += own
             energy += float(np.nansum(error * error))
             for k in range(1, lag + 1):
                 correlation[k] += float(np.nansum(error[:, k:] * error[:, :-k]))

@@ -172,43 +172,44 @@ def _invert_band(lower: Floats) -> Floats:
 def _substitute(lower: Floats, right: Floats) -> None:
     """Substitute forward and backward in place."""
     frames, size = lower.shape[1], lower.shape[2]
-    columns = right.shape[2]
+    turned = np.empty((size, size))
     for t in range(frames):
         for back in (1, 2):
             if t >= back:
-                block = lower[back, t - back]
+                block, known = lower[back, t - back], right[t - back]
                 for i in range(size):
-                    for k in range(size):
-                        factor = block[i, k]
-                        for c in range(columns):
-                            right[t, i, c] -= factor * right[t - back, k, c]
+                    _subtract_rows(right[t, i], block[i], known, 0, size)
         block = lower[0, t]
         for i in range(size):
-            for k in range(i):
-                factor = block[i, k]
-                for c in range(columns):
-                    right[t, i, c] -= factor * right[t, k, c]
-            factor = 1.0 / block[i, i]
-            for c in range(columns):
-                right[t, i, c] *= factor
+            _subtract_rows(right[t, i], block[i], right[t], 0, i)
+            right[t, i] *= 1.0 / block[i, i]
     for t in range(frames - 1, -1, -1):
         for ahead in (1, 2):
             if t + ahead < frames:
-                block = lower[ahead, t]
-                for i in range(size):
-                    for k in range(size):
-                        factor = block[i, k]
-                        for c in range(columns):
-                            right[t, k, c] -= factor * right[t + ahead, i, c]
-        block = lower[0, t]
+                turned[:] = lower[ahead, t].T
+                for k in range(size):
+                    _subtract_rows(right[t, k], turned[k], right[t + ahead], 0, size)
+        turned[:] = lower[0, t].T
         for i in range(size - 1, -1, -1):
-            for k in range(i + 1, size):
-                factor = block[k, i]
-                for c in range(columns):
-                    right[t, i, c] -= factor * right[t, k, c]
-            factor = 1.0 / block[i, i]
-            for c in range(columns):
-                right[t, i, c] *= factor
+            _subtract_rows(right[t, i], turned[i], right[t], i + 1, size)
+            right[t, i] *= 1.0 / turned[i, i]
+
+
+@compile_kernel
+def _subtract_rows(target: Floats, factors: Floats, rows: Floats, first: int, last: int) -> None:
+    """Subtract the sum of some rows (n, columns), each times its factor (n,), four at once."""
+    columns = len(target)
+    whole = first + (last - first) // 4 * 4
+    for k in range(first, whole, 4):
+        f0, f1, f2, f3 = factors[k], factors[k + 1], factors[k + 2], factors[k + 3]
+        for c in range(columns):
+            target[c] -= (f0 * rows[k, c] + f1 * rows[k + 1, c]) + (
+                f2 * rows[k + 2, c] + f3 * rows[k + 3, c]
+            )
+    for k in range(whole, last):
+        factor = factors[k]
+        for c in range(columns):
+            target[c] -= factor * rows[k, c]
 
 
 @compile_kernel
