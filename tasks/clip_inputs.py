@@ -27,7 +27,7 @@ from worldpose.store import Store
 PAGE = 256
 """Frames per read."""
 VENUES = 4
-"""Venues that a process keeps: reading 16 cameras takes half a second, in most stages twice."""
+"""Venues that a process keeps: reading 16 cameras takes 0.5 s, in most stages twice."""
 PAGES = 4
 """Cached pages: a chunk with its margins fits into four."""
 
