@@ -83,7 +83,7 @@ def test_the_gradient_by_frames_is_exact_without_offsets(track):
 
 def test_a_track_of_two_intervals_has_the_equations_of_both(track):
     made, pose = track
-    # Contacts of the joined intervals, found once more, do not tie them either: the second is 5 cm off.
+    # Contacts found in the joined intervals do not tie them either: the second is 5 cm off.
     joints = made.chained.differentiate(pose.parameters()).keypoints
     ground, height = (lambda x, _: np.zeros_like(x)), float(joints[:, 15:17, 2].max())
 
