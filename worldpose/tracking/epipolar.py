@@ -154,6 +154,7 @@ def associate(
     weights: Floats,
     ground: bool,
     settings: TrackingSettings,
+    gate: float | None = None,
 ) -> list[Sighting]:
     """Return the people in agreeing detections of at least `birth_views` cameras.
 
@@ -166,12 +167,15 @@ def associate(
         weights: (cameras, detections, 17), of the squared angle; 0 where not seen or matched.
         ground: whether people stand on z = 0.
         settings: gates and least views.
+        gate: largest mean distance between the rays of two detections of one person [m]; None =
+            `epipolar_gate_m`.
 
     Note:
         T2. Each detection joins one group at most.
     """
     cameras = len(centers)
     needed = settings.birth_views
+    gate = settings.epipolar_gate_m if gate is None else gate
     usable = np.count_nonzero(weights > 0.0, axis=-1) >= settings.min_joints
     if np.count_nonzero(usable.any(axis=1)) < needed:
         return []
@@ -186,7 +190,7 @@ def associate(
         footprints(origins, rays, (0.5 * (low + high), extent)),
         settings.min_joints,
         math.sin(settings.min_angle_rad),
-        settings.epipolar_gate_m,
+        gate,
     )
     first, second = np.nonzero(distances < np.inf)
     order = np.argsort(distances[first, second], kind="stable")
@@ -197,7 +201,7 @@ def associate(
             continue
         seed = np.full(cameras, -1)
         seed[camera[[a, b]]] = detection[[a, b]]
-        group = _grow_group(seed, centers, directions, free, settings)
+        group = _grow_group(seed, centers, directions, free, settings, gate)
         views = np.count_nonzero(group.index >= 0)
         if views >= needed and is_person(group.joints, ground, settings):
             groups.append(group)
@@ -222,6 +226,7 @@ def _grow_group(
     directions: Floats,
     weights: Floats,
     settings: TrackingSettings,
+    last_gate: float,
 ) -> Sighting:
     """Return the group around a seed of two detections (cameras,).
 
@@ -229,7 +234,7 @@ def _grow_group(
     """
     unknown = np.full((1, directions.shape[2], 3), np.nan)
     sine = math.sin(settings.min_angle_rad)
-    for gate in (settings.gate_m, settings.epipolar_gate_m):
+    for gate in (settings.gate_m, last_gate):
         joints = intersect_people(
             centers, directions, weights, index[:, None], unknown, settings.gate_m, sine
         )

@@ -39,6 +39,9 @@ MIN_AREA = 25.0
 """Least ground area on which strangers may appear [m^2]: a room."""
 MAX_DEVIATION = 3.0
 """Largest distance of the rays of two views of one person, in standard deviations."""
+CLEAR_GATE = 0.15
+"""Mean distance of rays within which three views of a new person agree without doubt, at least [m]:
+three standard deviations of `RAY_NOISE` while unknown."""
 LEARN_EVERY = 5
 """Interval between frames in which visibility statistics use known people."""
 
@@ -98,9 +101,8 @@ class FrameTracker:
             person.advance(frame, self.fps, self.settings)
         index, distance, joints = self._match(frame, directions, weights)
         left = _drop_matched(weights, index)
-        groups: list[Sighting] = []
-        if (usable & (left > 0.0).any(axis=-1)).any():
-            groups = associate(self.centers, directions, left, self.ground, self.settings)
+        gate = self._clear_gate()
+        groups = associate(self.centers, directions, left, self.ground, self.settings, gate)
         views = np.count_nonzero(index >= 0, axis=0)
         known = views >= self.settings.birth_views
         known |= np.array([self._is_confirmed(person) for person in self.active], dtype=np.bool_)
@@ -119,7 +121,12 @@ class FrameTracker:
                 self.settings,
                 everything=weights,
             )
-            groups += group_pairs(pairs, left, self.settings)
+            # A clear pair explains its detections better than three views far from each other.
+            clear = group_pairs(pairs, left, self.settings, self.settings.pair_odds)
+            left = _drop_matched(left, _stack_matches(clear, len(self.centers)))
+            wide = associate(self.centers, directions, left, self.ground, self.settings)
+            left = _drop_matched(left, _stack_matches(wide, len(self.centers)))
+            groups += clear + wide + group_pairs(pairs, left, self.settings)
         for n in np.flatnonzero(views).tolist():
             sighting = Sighting(index[:, n], distance[:, n], joints[n])
             evidence = self._evidence(sighting, None if known[n] else pairs)
@@ -127,6 +134,13 @@ class FrameTracker:
         self._add(frame, groups, pairs)
         self._merge(frame)
         self._end(frame)
+
+    def _clear_gate(self) -> float:
+        """Return the distance of rays within which three views agree without doubt [m]."""
+        widest = self.settings.epipolar_gate_m
+        usual = self.gates.usual[np.isfinite(self.gates.usual)]
+        gate = self.settings.gate_factor * float(np.median(usual)) if len(usual) else 0.0
+        return min(max(gate, CLEAR_GATE), widest)
 
     def _learn(
         self,

@@ -324,13 +324,16 @@ def judge_pairs(
     )
 
 
-def group_pairs(pairs: Pairs, weights: Floats, settings: TrackingSettings) -> list[Sighting]:
+def group_pairs(
+    pairs: Pairs, weights: Floats, settings: TrackingSettings, least_odds: float = 0.0
+) -> list[Sighting]:
     """Return the pairs that are likelier than their rivals, the likeliest first.
 
     Args:
         pairs: pairs of one frame.
         weights: (cameras, detections, 17); 0 for matched detections.
         settings: least number of joints.
+        least_odds: odds from which a pair counts [1].
 
     Note:
         Each detection joins one pair at most.
@@ -339,7 +342,7 @@ def group_pairs(pairs: Pairs, weights: Floats, settings: TrackingSettings) -> li
     groups = []
     for n in np.argsort(-pairs.odds, kind="stable").tolist():
         camera, detection = pairs.cameras[n], pairs.detections[n]
-        if not pairs.unique[n] or not free[camera, detection].all():
+        if not pairs.unique[n] or pairs.odds[n] < least_odds or not free[camera, detection].all():
             continue
         free[camera, detection] = False
         index = np.full(len(weights), -1)
