@@ -42,6 +42,8 @@ MAX_DEVIATION = 3.0
 CLEAR_GATE = 0.15
 """Mean distance of rays within which three views of a new person agree without doubt, at least [m]:
 three standard deviations of `RAY_NOISE` while unknown."""
+CLEAR_ODDS = 10.0
+"""Odds of two views of a new person that rule out three views far from each other [1]."""
 LEARN_EVERY = 5
 """Interval between frames in which visibility statistics use known people."""
 
@@ -122,7 +124,7 @@ class FrameTracker:
                 everything=weights,
             )
             # A clear pair explains its detections better than three views far from each other.
-            clear = group_pairs(pairs, left, self.settings, self.settings.pair_odds)
+            clear = group_pairs(pairs, left, self.settings, CLEAR_ODDS)
             left = _drop_matched(left, _stack_matches(clear, len(self.centers)))
             wide = associate(self.centers, directions, left, self.ground, self.settings)
             left = _drop_matched(left, _stack_matches(wide, len(self.centers)))
