@@ -9,13 +9,20 @@ person counts as seen by a camera when one of its detections is within 0.25 m of
 upper-body joints on average, measured at their depth, each detection used once. A person is found
 if a result is within 0.5 m, by the mean over shoulders, hips, elbows and wrists. Annotated hips are
 some 17 cm from COCO's. Published errors are of mv3dreg, which selects people differently.
+
+Not all people are annotated in 3D. Boxes in the images tell about the others: annotators drew one
+around every person that they saw, with an identity over all views where they recognised the person.
+A result beyond the people in 3D is a person if two of its detections have one identity, or if one
+has it and the other lies in a box without identity, in a view where this person has no other box.
+It cannot be judged if all its boxes lack an identity. All others are false: detections of two
+people, of none, or of a person that another result shows.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +42,11 @@ COCO = [5, 6, 11, 12, 7, 8, 9, 10]
 MVOR = [2, 3, 4, 5, 6, 7, 8, 9]
 """Left and right shoulder, hip, elbow, wrist."""
 SEEN_M, FOUND_M = 0.25, 0.5
+NO_BOX, NO_IDENTITY = -2, -1
+"""Identities of detections outside of all boxes, and in a box whose person was not recognised."""
+VERDICTS = ("real", "false", "unknown")
+INSIDE, BORDER = 0.6, 0.1
+"""Share of a detection's joints in its box, and border that is added, of the box's size [1]."""
 
 
 def load_cameras(info: dict[str, Any]) -> Camera:
@@ -59,12 +71,19 @@ def load_cameras(info: dict[str, Any]) -> Camera:
 
 
 def load_moments(folder: Path) -> tuple[Camera, list[dict[str, Any]]]:
-    """Return cameras, and for each annotated moment truth (people, 8, 3) [m] and detections."""
+    """Return cameras, and for each annotated moment truth, detections and boxes.
+
+    `truth` (people, 8, 3) [m], `image` (1, 3, most, 17, 3) [px], and `boxes` by view: (boxes, 5)
+    left, top, width, height [px] and identity.
+    """
     said = json.loads((folder / "camma_mvor_2018.json").read_text())
     room = np.array(said["cameras_info"]["camParams"]["firstCamToRoomRef"]).reshape(4, 4)
     detections: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     for each in json.loads((folder / "openpose_kps.json").read_text()):
         detections[each["image_id"]].append(np.array(each["coco_keypoints"]).reshape(17, 3))
+    boxes: dict[int, list[list[float]]] = defaultdict(list)
+    for each in said.get("annotations", []):
+        boxes[each["image_id"]].append([*each["bbox"], each["person_id"]])
     truth: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     for person in said["annotations3D"]:
         points = np.array(person["keypoints3D"]).reshape(-1, 4)[MVOR]
@@ -78,7 +97,8 @@ def load_moments(folder: Path) -> tuple[Camera, list[dict[str, Any]]]:
         for camera, found in enumerate(views):
             image[0, camera, : len(found)] = np.array(found).reshape(-1, 17, 3)
         image[~(image[..., 2] > 0.0)] = np.nan
-        moments.append({"truth": np.array(people), "image": image})
+        shown = [np.array(boxes[int(name)]).reshape(-1, 5) for name in ids.split("_")]
+        moments.append({"truth": np.array(people), "image": image, "boxes": shown})
     return load_cameras(said["cameras_info"]), moments
 
 
@@ -102,18 +122,66 @@ def count_views(
     return views
 
 
+def name_detections(boxes: NDArray[np.float64], image: NDArray[np.float64]) -> list[int]:
+    """Return the identity of each detection (detections, 17, 3) of a view from boxes (n, 5)."""
+    names = []
+    for joints in image:
+        points = joints[np.isfinite(joints[:, 0]), :2]
+        if not (len(points) and len(boxes)):
+            names.append(NO_BOX)
+            continue
+        corner, size = boxes[:, None, :2], boxes[:, None, 2:4]
+        near = (points > corner - BORDER * size) & (points < corner + (1.0 + BORDER) * size)
+        inside = near.all(axis=-1).mean(axis=1)
+        low, high = points.min(axis=0), points.max(axis=0)
+        common = np.minimum(high, boxes[:, :2] + boxes[:, 2:4]) - np.maximum(low, boxes[:, :2])
+        both = np.clip(common, 0.0, None).prod(axis=1)
+        union = (high - low).prod() + boxes[:, 2:4].prod(axis=1) - both
+        fit = np.where(inside >= INSIDE, inside + both / np.maximum(union, 1e-9), 0.0)
+        best = int(fit.argmax())
+        names.append(int(boxes[best, 4]) if fit[best] > 0.0 else NO_BOX)
+    return names
+
+
+def judge_result(
+    names: list[int], elsewhere: list[set[int]], taken: set[int]
+) -> tuple[str, int | None]:
+    """Return whether a result is "real", "false" or "unknown", and the identity of its person.
+
+    Args:
+        names: identities of its detections.
+        elsewhere: the identities of all boxes in these detections' views.
+        taken: identities of people that other results show.
+    """
+    known = Counter(name for name in names if name >= 0)
+    if not known:
+        return ("unknown" if names.count(NO_IDENTITY) >= 2 else "false"), None
+    person, count = known.most_common(1)[0]
+    if count == 1:
+        alone = len(known) == 1
+        agrees = [
+            name == NO_IDENTITY and person not in seen
+            for name, seen in zip(names, elsewhere, strict=True)
+        ]
+        if not (alone and any(agrees)):
+            return "false", None
+    return ("false" if person in taken else "real"), person
+
+
 def measure(
     cameras: Camera, moments: list[dict[str, Any]], settings: TrackingSettings
 ) -> dict[str, Any]:
     """Return errors (people, 8) [cm] of found people by views, and counts.
 
     `people` counts annotated people by the cameras that see them, `results` all placed people and
-    `extra` those beyond the annotated ones, both by the cameras whose detections place them.
+    `extra` those beyond the annotated ones, both by the cameras whose detections place them. Of
+    `extra`, `false` are no person and `unknown` cannot be judged.
     """
     errors: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     people: dict[int, int] = defaultdict(int)
     results: dict[int, int] = defaultdict(int)
     extra: dict[int, int] = defaultdict(int)
+    judged: dict[str, dict[int, int]] = {name: defaultdict(int) for name in VERDICTS}
     for moment in moments:
         truth, image = moment["truth"], moment["image"]
         views = count_views(cameras, truth, image)
@@ -137,13 +205,27 @@ def measure(
             errors[int(views[row])].append(100.0 * off[row, column])
         for count in used.tolist():
             results[count] += 1
-        for row in set(range(len(found))) - set(columns[good].tolist()):
-            extra[int(used[row])] += 1
+        named = [name_detections(*view) for view in zip(moment["boxes"], image[0], strict=True)]
+        identities = [set(boxes[:, 4].astype(int).tolist()) for boxes in moment["boxes"]]
+        taken: set[int] = set()
+        matched = columns[good].tolist()
+        others = set(range(len(found))) - set(matched)
+        for row in [*matched, *sorted(others, key=lambda row: -int(used[row]))]:
+            views_of = np.flatnonzero(tracks.detection_index[0, :, row] >= 0).tolist()
+            names = [named[c][tracks.detection_index[0, c, row]] for c in views_of]
+            verdict, person = judge_result(names, [identities[c] for c in views_of], taken)
+            if person is not None:
+                taken.add(person)
+            if row in others:
+                extra[int(used[row])] += 1
+                judged[verdict][int(used[row])] += 1
     return {
         "errors": errors,
         "people": people,
         "results": results,
         "extra": extra,
+        "false": judged["false"],
+        "unknown": judged["unknown"],
         "moments": len(moments),
     }
 
@@ -175,10 +257,12 @@ def main() -> None:
             f"{views} views: found {len(errors)} of {result['people'][views]}, mean error "
             f"{groups.mean():.1f} cm ({parts}); published {published} cm"
         )
-    print(
-        f"in {result['moments']} moments {sum(result['extra'].values())} people beyond the "
-        "annotated ones, which are not all who are there"
-    )
+    for views in PUBLISHED:
+        counts = [result[name][views] for name in ("results", "extra", "false", "unknown")]
+        print(
+            f"{views} views: {counts[0]} results, {counts[1]} beyond the people annotated in 3D, "
+            f"of whom {counts[2]} are false and {counts[3]} cannot be judged"
+        )
 
 
 if __name__ == "__main__":

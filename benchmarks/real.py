@@ -372,7 +372,10 @@ def score_mvor(folder: Path, frames: int | None) -> Metrics:
         metrics[name] = {
             "error_cm": float(mvor.mean_error(errors).mean()),
             "matched_percent": 100.0 * len(errors) / people if people else math.nan,
-            "false_percent": 100.0 * result["extra"][views] / placed if placed else math.nan,
+            **{
+                f"{title}_percent": 100.0 * result[name][views] / placed if placed else math.nan
+                for title, name in (("false", "false"), ("unknown", "unknown"), ("beyond", "extra"))
+            },
         }
     return metrics
 
