@@ -57,12 +57,12 @@ def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
     """
     stages: dict[str, list[float]] = {}
     for unit in missing:
-        stages.setdefault(unit.recipe.stage, []).append(_short_seconds(unit))
+        stages.setdefault(unit.recipe.stage, []).append(short_seconds(unit))
     wanted = [len(each) for each in stages.values() if sum(each) > START_WORK_SECONDS]
     return asked or min(os.cpu_count() or 1, max(wanted, default=1))
 
 
-def _short_seconds(unit: PlannedUnit) -> float:
+def short_seconds(unit: PlannedUnit) -> float:
     """Return the processor time of given 2D poses, or of a camera from clicks and a still [s].
 
     That of any other unit counts as infinite.
