@@ -488,8 +488,8 @@ class Track:
             gradient[:, 3:UNKNOWNS] += slope
             cost += prior_cost
         if not bordered:
-            none = np.zeros((frames, body.pose.shape[-1], 0)), np.zeros((0, 0)), np.zeros(0)
-            return NormalEquations(body, blocks, gradient, *none, cost)
+            border, corner = np.zeros((*gradient.shape, 0)), np.zeros((0, 0))
+            return NormalEquations(body, blocks, gradient, border, corner, np.zeros(0), cost)
 
         shapes = body.betas.shape[-1]
         width = shapes + MIRRORED_OFFSETS.shape[-1]
