@@ -18,6 +18,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from body_fitting import NOISE as JOINT_NOISE
@@ -84,8 +85,10 @@ def triangulation() -> Kernel:
     for tile, state in zip(tiles, states, strict=True):
         start(tile, state)
 
+    take: Any = njit(_take_steps)
+
     def run() -> None:
-        _take_steps(tiles, rig.depths, (1.5, 0.0), states)
+        take(tiles, rig.depths, (1.5, 0.0), states)
 
     # Depth and two errors 18, their division 3, size 2, weight 5, squared error 4, loss 3, weight
     # by it 3, derivatives 12 and 6, matrix 24, right side 12. Per joint: inverse 33, solution 15,
@@ -96,7 +99,6 @@ def triangulation() -> Kernel:
     return Kernel(run, "joint and step", STEPS * count, operations, 0.0)
 
 
-@njit
 def _take_steps(tiles: Floats, depths: Floats, noise: tuple[float, float], states: Floats) -> None:
     """Take the steps of each tile, one after the other, as the robust solver does."""
     for part in range(len(tiles)):
@@ -234,11 +236,11 @@ def limits() -> tuple[Callable[[], object], Callable[[], object]]:
     first, second, product = rng.random((3, SIZE, SIZE))
     one, two, total = np.ones((3, LENGTH))
 
-    def multiply() -> Floats:
-        return np.matmul(first, second, out=product)
+    def multiply() -> None:
+        np.matmul(first, second, out=product)
 
-    def add() -> Floats:
-        return np.add(one, two, out=total)
+    def add() -> None:
+        np.add(one, two, out=total)
 
     return multiply, add
 
