@@ -23,6 +23,7 @@ from pydantic import JsonValue
 from data_contracts.run import GatePolicy, RunRecord
 from data_contracts.work import Work
 from flows.orchestration.cluster_errors import require_workers
+from flows.orchestration.local_cluster import short_seconds
 from flows.orchestration.time_limits import TimeLimits, seconds_of
 from flows.progress import reporter
 from flows.registering import open_for_review, open_match
@@ -38,7 +39,9 @@ WITHOUT_CAMERAS: Final = ("ingest", "detection")
 MOST_TASKS: Final = 200
 """Tasks per stage; more units share tasks. Prefect needs 0.05 s of CPU time per task."""
 TASKS_EACH: Final = 20
-"""Tasks per worker if units share tasks, so that no worker waits long for the last task [1]."""
+"""Tasks per worker if many units share tasks, so that no worker waits long for the last one [1]."""
+TASK_SECONDS: Final = 3.0
+"""Processor time of a task whose units would take less than a second each [s]."""
 
 
 class SharedSettings(SettingsContext):
@@ -149,15 +152,25 @@ def compute(
         LostWorkersError: the Prefect server or Dask scheduler is gone.
     """
     with _place_tasks(stage) if units else nullcontext():
-        if len(units) <= MOST_TASKS:
-            yield from _each_alone(stage, units, work)
+        tasks = task_count([short_seconds(unit) for unit in units], len(_workers(_client())))
+        if tasks < len(units):
+            yield from _in_batches(stage, units, work, tasks)
         else:
-            yield from _in_batches(units, work, task_count(len(_workers(_client()))))
+            yield from _each_alone(stage, units, work)
 
 
-def task_count(workers: int) -> int:
-    """Return the number of tasks for a stage with more than MOST_TASKS units."""
-    return min(max(1, workers) * TASKS_EACH, MOST_TASKS)
+def task_count(seconds: list[float], workers: int) -> int:
+    """Return the number of tasks of a stage.
+
+    Args:
+        seconds: processor time of each unit, infinite unless it is short [s].
+        workers: number of workers.
+    """
+    units, workers = len(seconds), max(1, workers)
+    if sum(seconds) < math.inf:
+        few = max(workers, math.ceil(sum(seconds) / TASK_SECONDS))
+        return min(units, few, MOST_TASKS)
+    return units if units <= MOST_TASKS else min(workers * TASKS_EACH, MOST_TASKS)
 
 
 def _each_alone(
@@ -176,24 +189,26 @@ def _each_alone(
 
 
 def _in_batches(
-    units: list[PlannedUnit], work: list[Work], count: int
+    stage: Stage, units: list[PlannedUnit], work: list[Work], count: int
 ) -> Iterator[tuple[PlannedUnit, BaseException | None]]:
+    """Compute units in tasks of several; the units of a task that failed as a whole, alone."""
     from tasks.batch import batch  # imported here, as all tasks are
 
     size = math.ceil(len(units) / count)
     submitted = {}
     for first in range(0, len(units), size):
-        some = units[first : first + size]
+        some, theirs = units[first : first + size], work[first : first + size]
         name = f"{some[0].name} and {len(some) - 1} more"
-        texts = [each.model_dump_json() for each in work[first : first + size]]
-        submitted[batch.submit(name, texts)] = some
+        submitted[batch.submit(name, [each.model_dump_json() for each in theirs])] = some, theirs
     for future in as_completed(list(submitted)):
-        some = submitted[future]
+        some, theirs = submitted[future]
         failures: list[Exception | None]
         try:
             failures = future.result()
         except Exception as failure:
-            failures = [failure] * len(some)
+            require_workers(failure)
+            yield from _each_alone(stage, some, theirs)
+            continue
         for unit, each in zip(some, failures, strict=True):
             if each is not None:
                 require_workers(each)

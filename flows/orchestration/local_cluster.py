@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 START_WORK_SECONDS = 9.0
 """Processor time that the start of a worker takes [s]."""
+STILL_SECONDS = 0.8
+"""Processor time of a camera from clicks and its still [s]."""
 KEEP_SECONDS = 5.0
 """Interval at which lost workers are restarted."""
 
@@ -55,20 +57,22 @@ def workers_for(asked: int | None, missing: list[PlannedUnit]) -> int:
     """
     stages: dict[str, list[float]] = {}
     for unit in missing:
-        stages.setdefault(unit.recipe.stage, []).append(_short_seconds(unit))
+        stages.setdefault(unit.recipe.stage, []).append(short_seconds(unit))
     wanted = [len(each) for each in stages.values() if sum(each) > START_WORK_SECONDS]
     return asked or min(os.cpu_count() or 1, max(wanted, default=1))
 
 
-def _short_seconds(unit: PlannedUnit) -> float:
-    """Return the processor time of given 2D poses, or of a camera from clicks alone [s].
+def short_seconds(unit: PlannedUnit) -> float:
+    """Return the processor time of given 2D poses, or of a camera from clicks and a still [s].
 
     That of any other unit counts as infinite.
     """
     stage, sources = unit.recipe.stage, unit.recipe.sources
-    images = any(sources.get(name) for name in ("video", "still", "filmed"))
-    if images or stage not in ("ingest", "static_calibration"):
+    films = any(sources.get(name) for name in ("video", "filmed"))
+    if films or stage not in ("ingest", "static_calibration"):
         return math.inf
+    if sources.get("still"):
+        return STILL_SECONDS
     frames = sources.get("frame_count", 0)
     return 0.2 + (frames / 20_000 if isinstance(frames, int) else math.inf)
 

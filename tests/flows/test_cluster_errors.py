@@ -65,6 +65,7 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
     [
         (17 * [("ingest", {"frame_count": 3000})] + 16 * [("static_calibration", {})], 1),
         (16 * [("static_calibration", {"still": "stills/cam00.png"})], 3),
+        (6 * [("static_calibration", {"still": "stills/cam00.png"})], 1),
         (2 * [("ingest", {"frame_count": 3000, "video": {"path": "videos/cam00.mp4"}})], 2),
         (16 * [("ingest", {"frame_count": 270_000})], 3),
         (17 * [("ingest", {"frame_count": 3000})] + 2 * [("tracking", {})], 2),

@@ -1,5 +1,7 @@
 """Units on workers: those with a tag first, and many small ones together."""
 
+import math
+
 import pytest
 from distributed import Client, LocalCluster, Worker, get_worker
 
@@ -38,4 +40,20 @@ def test_work_goes_to_workers_with_the_tag_where_there_are_any(tag, places, clus
 
 @pytest.mark.parametrize(("workers", "tasks"), [(0, 20), (1, 20), (2, 40), (64, 200)])
 def test_many_units_share_as_many_tasks_as_keep_all_workers_busy(workers, tasks):
-    assert task_count(workers) == tasks
+    assert task_count(500 * [math.inf], workers) == tasks
+
+
+@pytest.mark.parametrize(
+    ("seconds", "workers", "tasks"),
+    [
+        (17 * [0.35], 1, 2),
+        (17 * [0.35], 4, 4),
+        (3 * [0.35], 4, 3),
+        (17 * [14.0], 1, 17),
+        (16 * [0.35] + [math.inf], 1, 17),
+        (9000 * [0.35], 1, 200),
+        ([], 1, 0),
+    ],
+)
+def test_units_of_less_than_a_second_share_tasks(seconds, workers, tasks):
+    assert task_count(seconds, workers) == tasks

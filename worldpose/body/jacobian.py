@@ -27,7 +27,7 @@ class KeypointJacobian:
     keypoints: Floats
     """(..., keypoints, 3) [m], world."""
     betas: Floats
-    """(..., keypoints, 3, shapes) [m]."""
+    """(..., keypoints, 3, shapes) [m]; without shapes where they were not asked for."""
     pose: Floats
     """(..., keypoints, 3, 72) [m/rad], of `global_orient` and then `body_pose`."""
 
@@ -86,7 +86,9 @@ class ChainedKeypoints:
         vectors[first + np.arange(len(joints)), joints, :, 0] += by
         return ChainedKeypoints(self.model, self.pelvis, vectors)
 
-    def differentiate(self, parameters: BodyParameters) -> KeypointJacobian:
+    def differentiate(
+        self, parameters: BodyParameters, *, by_betas: bool = True
+    ) -> KeypointJacobian:
         """Return the keypoints and their Jacobian; NaN where a parameter is."""
         flat, batch, count = parameters.flat(), parameters.batch_shape, len(self.vectors)
         angles = np.concatenate([flat.global_orient, flat.body_pose], axis=-1)
@@ -107,8 +109,10 @@ class ChainedKeypoints:
         keypoints += (feature[:, :linear] @ self.pelvis.T + flat.transl)[:, None]
 
         rows = turns.transpose(0, 2, 1, 3).reshape(len(angles), 3, 3 * JOINTS)
-        by_betas = (rows @ self._shaping).reshape(len(angles), 3, count, linear - 1)
-        by_betas = by_betas.transpose(0, 2, 1, 3) + self.pelvis[:, 1:]
+        shaped = np.empty((len(angles), count, 3, 0))
+        if by_betas:
+            shaped = (rows @ self._shaping).reshape(len(angles), 3, count, linear - 1)
+            shaped = shaped.transpose(0, 2, 1, 3) + self.pelvis[:, 1:]
         if corrected:
             by_feature = np.einsum("nac,cf->naf", rows, self._correctives, optimize=True)
             by_feature = by_feature.reshape(len(angles), 3, count, JOINTS - 1, 9)
@@ -118,7 +122,7 @@ class ChainedKeypoints:
             ).reshape(by_pose[..., 3:].shape)
         return KeypointJacobian(
             keypoints.reshape((*batch, count, 3)),
-            by_betas.reshape((*batch, count, 3, linear - 1)),
+            shaped.reshape((*batch, count, 3, shaped.shape[-1])),
             by_pose.reshape((*batch, count, 3, 3 * JOINTS)),
         )
 

@@ -27,6 +27,7 @@ from worldpose.body_fitting.pose_space import (
     SPREADS,
     PosePrior,
     cross,
+    differentiate_points,
 )
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import compile_kernel
@@ -269,48 +270,6 @@ _MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
-def _spread_terms(spread: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-    angle, coordinate = np.nonzero(spread)
-    return angle, coordinate, spread[angle, coordinate]
-
-
-SPREAD_TERMS: Final = {size: _spread_terms(spread) for size, spread in SPREADS.items()}
-"""Angle, coordinate and factor of every nonzero entry of `SPREADS`."""
-
-
-def differentiate_points(pose: Floats, size: int) -> Floats:
-    """Return derivatives of points by the unknowns (frames, points, 3, 6 + size).
-
-    Args:
-        pose: (frames, points, 3, 72), by the angles of all joints.
-        size: number of coordinates of the pose.
-    """
-    angle, coordinate, factor = SPREAD_TERMS[size]
-    return _gather_angles(pose, 3 + angle, 6 + coordinate, factor, 6 + size)
-
-
-@compile_kernel
-def _gather_angles(
-    pose: Floats,
-    angle: NDArray[np.int64],
-    unknown: NDArray[np.int64],
-    factor: Floats,
-    unknowns: int,
-) -> Floats:
-    """Return derivatives by the unknowns: sums of those by angles, with factors, (terms,) each."""
-    frames, points = pose.shape[:2]
-    rows = np.zeros((frames, points, 3, unknowns))
-    for t in range(frames):
-        for p in range(points):
-            for a in range(3):
-                rows[t, p, a, a] = 1.0
-                for c in range(3):
-                    rows[t, p, a, 3 + c] = pose[t, p, a, c]
-                for i in range(len(angle)):
-                    rows[t, p, a, unknown[i]] += factor[i] * pose[t, p, a, angle[i]]
-    return rows
-
-
 @compile_kernel
 def _accumulate(
     rows: Floats, own: Floats, next_frame: Floats, second_frame: Floats, force: Floats
@@ -352,6 +311,57 @@ def _accumulate(
 
 
 @compile_kernel
+def propagate(rows: Floats, covariance: Floats) -> Floats:
+    """Return the covariance of points (frames, points, 3, 3) [m^2].
+
+    Args:
+        rows: (frames, points, 3, n), derivatives of points by n unknowns, most of them zero.
+        covariance: (frames, n, n), of the unknowns.
+    """
+    frames, points, _, size = rows.shape
+    spread = np.empty((frames, points, 3, 3))
+    held, active = np.empty((3, size)), np.empty(size, dtype=np.int64)
+    for t in range(frames):
+        for p in range(points):
+            r, count = rows[t, p], _list_active(rows[t, p], active)
+            held[:] = 0.0
+            for place in range(count):
+                i = active[place]
+                f0, f1, f2 = r[0, i], r[1, i], r[2, i]
+                for j in range(size):
+                    c = covariance[t, i, j]
+                    held[0, j] += f0 * c
+                    held[1, j] += f1 * c
+                    held[2, j] += f2 * c
+            xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for place in range(count):
+                i = active[place]
+                xx += held[0, i] * r[0, i]
+                xy += held[0, i] * r[1, i]
+                xz += held[0, i] * r[2, i]
+                yy += held[1, i] * r[1, i]
+                yz += held[1, i] * r[2, i]
+                zz += held[2, i] * r[2, i]
+            target = spread[t, p]
+            target[0, 0], target[1, 1], target[2, 2] = xx, yy, zz
+            target[0, 1] = target[1, 0] = xy
+            target[0, 2] = target[2, 0] = xz
+            target[1, 2] = target[2, 1] = yz
+    return spread
+
+
+@compile_kernel
+def _list_active(rows: Floats, active: NDArray[np.int64]) -> int:
+    """List the nonzero columns of a (3, n) matrix in `active`; return their number."""
+    count = 0
+    for i in range(rows.shape[1]):
+        if rows[0, i] != 0.0 or rows[1, i] != 0.0 or rows[2, i] != 0.0:
+            active[count] = i
+            count += 1
+    return count
+
+
+@compile_kernel
 def _add_product(
     target: Floats, left: Floats, right: Floats, active: NDArray[np.int64], below: bool
 ) -> None:
@@ -359,12 +369,8 @@ def _add_product(
 
     `active` is room for n indices.
     """
-    size, count = len(target), 0
-    for i in range(size):
-        if left[0, i] != 0.0 or left[1, i] != 0.0 or left[2, i] != 0.0:
-            active[count] = i
-            count += 1
-    for place in range(count):
+    size = len(target)
+    for place in range(_list_active(left, active)):
         i = active[place]
         f0, f1, f2 = left[0, i], left[1, i], left[2, i]
         end = i + 1 if below else size
@@ -448,10 +454,8 @@ class Track:
             bordered: whether the equations have a border for betas and offsets.
         """
         frames, settings = len(pose.transl), self.settings
-        body = self.differentiate(pose)
-        by_frame, shapes = body.pose, body.betas.shape[-1]
-        points = by_frame.shape[1]
-        rows = by_frame.reshape(frames, 3 * points, -1)
+        body = self.differentiate(pose, by_betas=bordered)
+        points = body.pose.shape[1]
         # The points besides COCO-17 already lie where the detector has them.
         offsets = np.concatenate([offsets, np.zeros((points - len(offsets), 3))])
 
@@ -466,13 +470,16 @@ class Track:
         information = weight[..., None, None] * self.evidence.information
         weighted = weight[..., None] * weighted
 
-        bands, smooth_gradient, smooth_cost = self._smoothness(body.keypoints)
+        bands, force, smooth_cost = self._smoothness(body.keypoints)
+        force += weighted
         stiff = information.copy()
         stiff[..., np.arange(3), np.arange(3)] += bands[0][..., None]
-        blocks, gradient = _accumulate(
-            by_frame, stiff, bands[1], bands[2], weighted + smooth_gradient
-        )
-        cost += smooth_cost + self._add_angles(pose.angles, blocks[0], gradient)
+        held, above = self._weigh_heights(body.keypoints)
+        stiff[:, ANKLES, 2, 2] += held
+        force[:, ANKLES, 2] += held * above
+        blocks, gradient = _accumulate(body.pose, stiff, bands[1], bands[2], force)
+        cost += smooth_cost + 0.5 * float((held * above**2).sum())
+        cost += self._add_angles(pose.angles, blocks[0], gradient)
         if self.monocular_prior is not None:
             matrix, slope, prior_cost = self.monocular_prior.normal_equations(
                 pose.orient, pose.angles[:, :SIZE]
@@ -480,25 +487,30 @@ class Track:
             blocks[0][:, 3:UNKNOWNS, 3:UNKNOWNS] += matrix
             gradient[:, 3:UNKNOWNS] += slope
             cost += prior_cost
+        if not bordered:
+            border, corner = np.zeros((*gradient.shape, 0)), np.zeros((0, 0))
+            return NormalEquations(body, blocks, gradient, border, corner, np.zeros(0), cost)
 
-        width = shapes + MIRRORED_OFFSETS.shape[-1] if bordered else 0
-        border, corner = np.zeros((frames, rows.shape[-1], width)), np.zeros((width, width))
-        shared = np.zeros(width)
-        if bordered:
-            by_shared = np.zeros((frames, points, 3, width))
-            by_shared[..., :shapes] = body.betas
-            by_shared[:, :17, :, shapes:] = np.einsum("fab,jbu->fjau", axes, MIRRORED_OFFSETS)
-            columns = by_shared.reshape(frames, 3 * points, width)
-            held = (information @ by_shared).reshape(columns.shape)
-            border = np.swapaxes(rows, 1, 2) @ held
-            corner = np.einsum("fka,fkb->ab", columns, held, optimize=True)
-            shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 3 * points))
-        equations = NormalEquations(body, blocks, gradient, border, corner, shared, cost)
-        if self.contacts is None:
-            return equations
-        return self._add_contacts(equations)
+        shapes = body.betas.shape[-1]
+        width = shapes + MIRRORED_OFFSETS.shape[-1]
+        rows = body.pose.reshape(frames, 3 * points, -1)
+        by_shared = np.zeros((frames, points, 3, width))
+        by_shared[..., :shapes] = body.betas
+        by_shared[:, :17, :, shapes:] = np.einsum("fab,jbu->fjau", axes, MIRRORED_OFFSETS)
+        columns = by_shared.reshape(frames, 3 * points, width)
+        stiffened = (information @ by_shared).reshape(columns.shape)
+        border = np.swapaxes(rows, 1, 2) @ stiffened
+        corner = np.einsum("fka,fkb->ab", columns, stiffened, optimize=True)
+        shared = np.einsum("fka,fk->a", columns, weighted.reshape(frames, 3 * points))
+        for side, ankle in enumerate(ANKLES):  # the height of the body's own ankles
+            row, column = body.pose[:, ankle, 2], body.betas[:, ankle, 2]
+            heavy = held[:, side, None] * column
+            border[..., :shapes] += row[:, :, None] * heavy[:, None]
+            corner[:shapes, :shapes] += heavy.T @ column
+            shared[:shapes] += above[:, side] @ heavy
+        return NormalEquations(body, blocks, gradient, border, corner, shared, cost)
 
-    def differentiate(self, pose: Pose) -> KeypointJacobian:
+    def differentiate(self, pose: Pose, *, by_betas: bool) -> KeypointJacobian:
         """Return the points with derivatives by the unknowns (frames, points, 3, 36) in `pose`.
 
         Some frames at a time, so that the derivatives by all angles stay in the processor's cache.
@@ -507,7 +519,7 @@ class Track:
         keypoints, betas, rows = (np.empty(0) for _ in range(3))
         for start in range(0, frames, CACHED_FRAMES):
             part = slice(start, start + CACHED_FRAMES)
-            body = self.chained.differentiate(parameters[part])
+            body = self.chained.differentiate(parameters[part], by_betas=by_betas)
             if not start:
                 keypoints = np.empty((frames, *body.keypoints.shape[1:]))
                 betas = np.empty((frames, *body.betas.shape[1:]))
@@ -571,26 +583,14 @@ class Track:
         blocks[:, places, places] += stiff * (beyond != 0.0)
         return 0.5 * float(((away @ prior) * away).sum() + stiff * (beyond**2).sum())
 
-    def _add_contacts(self, equations: NormalEquations) -> NormalEquations:
-        """Return the equations with terms for the height of standing ankles, and none below it."""
-        contacts = self.contacts
-        assert contacts is not None
-        body = equations.points
-        keypoints, by_frame, by_betas = body.keypoints, body.pose, body.betas
-        blocks, gradient = equations.blocks, equations.gradient
-        border, corner = equations.border, equations.corner
-        shared, cost = equations.border_gradient, equations.cost
-        shapes = by_betas.shape[-1] if len(corner) else 0
-        for side, ankle in enumerate(ANKLES):
-            above = keypoints[:, ankle, 2] - contacts.height[:, side]
-            weight = np.where(above < 0.0, 1.0, contacts.standing[:, side])
-            weight = weight / self.settings.contact_std_m**2
-            cost += 0.5 * float((weight * above**2).sum())
-            row, column = by_frame[:, ankle, 2], by_betas[:, ankle, 2, :shapes]
-            heavy = weight[:, None] * row
-            blocks[0] += heavy[:, :, None] * row[:, None]
-            gradient += above[:, None] * heavy
-            border[..., :shapes] += heavy[..., None] * column[:, None]
-            corner[:shapes, :shapes] += (weight[:, None] * column).T @ column
-            shared[:shapes] += (weight * above) @ column
-        return NormalEquations(body, blocks, gradient, border, corner, shared, cost)
+    def _weigh_heights(self, keypoints: Floats) -> tuple[Floats, Floats]:
+        """Return weights [1/m^2] and heights [m] of ankles above standing ones (frames, 2).
+
+        A standing ankle has the height of a flat foot's, and no ankle is below it.
+        """
+        if self.contacts is None:
+            none = np.zeros((len(keypoints), len(ANKLES)))
+            return none, none
+        above = keypoints[:, ANKLES, 2] - self.contacts.height
+        weight = np.where(above < 0.0, 1.0, self.contacts.standing)
+        return weight / self.settings.contact_std_m**2, above

@@ -24,6 +24,7 @@ from data_contracts.arrays import Floats
 from worldpose.body import BodyModel
 from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BODY_POSE
+from worldpose.compiled import compile_kernel
 from worldpose.geometry import Rigid
 
 COORDINATES: Final = (
@@ -270,3 +271,45 @@ def _frame(first: Floats, second: Floats) -> Floats:
     along = _unit(first)
     third = _unit(cross(along, second))
     return np.stack([along, cross(third, along), third], axis=-1)
+
+
+def _spread_terms(spread: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    angle, coordinate = np.nonzero(spread)
+    return angle, coordinate, spread[angle, coordinate]
+
+
+SPREAD_TERMS: Final = {size: _spread_terms(spread) for size, spread in SPREADS.items()}
+"""Angle, coordinate and factor of every nonzero entry of `SPREADS`."""
+
+
+def differentiate_points(pose: Floats, size: int) -> Floats:
+    """Return derivatives of points by the unknowns (frames, points, 3, 6 + size).
+
+    Args:
+        pose: (frames, points, 3, 72), by the angles of all joints.
+        size: number of coordinates of the pose.
+    """
+    angle, coordinate, factor = SPREAD_TERMS[size]
+    return _gather_angles(pose, 3 + angle, 6 + coordinate, factor, 6 + size)
+
+
+@compile_kernel
+def _gather_angles(
+    pose: Floats,
+    angle: NDArray[np.int64],
+    unknown: NDArray[np.int64],
+    factor: Floats,
+    unknowns: int,
+) -> Floats:
+    """Return derivatives by the unknowns: sums of those by angles, with factors, (terms,) each."""
+    frames, points = pose.shape[:2]
+    rows = np.zeros((frames, points, 3, unknowns))
+    for t in range(frames):
+        for p in range(points):
+            for a in range(3):
+                rows[t, p, a, a] = 1.0
+                for c in range(3):
+                    rows[t, p, a, 3 + c] = pose[t, p, a, c]
+                for i in range(len(angle)):
+                    rows[t, p, a, unknown[i]] += factor[i] * pose[t, p, a, angle[i]]
+    return rows

@@ -37,6 +37,7 @@ from worldpose.body_fitting.objective import (
     body_axes,
     find_contacts,
     level_feet,
+    propagate,
 )
 from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
 from worldpose.body_fitting.settings import BodyFittingSettings
@@ -197,10 +198,8 @@ def pose_covariance(track: Track, pose: Pose, offsets: Floats) -> tuple[Floats, 
         offsets: (17, 3) [m], the detector's offsets.
     """
     equations = damp_motion(track).equations(pose, offsets, bordered=False)
-    by_pose = equations.points.pose
     inverse = factor(equations.blocks).inverse_blocks()
-    spread: Floats = by_pose @ inverse[:, None] @ by_pose.swapaxes(-1, -2)
-    return equations.points.keypoints, spread
+    return equations.points.keypoints, propagate(equations.points.pose, inverse)
 
 
 def factor(blocks: Floats) -> BandedFactor:

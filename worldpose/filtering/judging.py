@@ -234,15 +234,17 @@ def learn_spread(squared: Floats, stated: Floats, known: Floats, confidence: Flo
     joints = np.broadcast_to(np.arange(squared.shape[1]), squared.shape)[seen]
     squares, base, given = squared[seen], stated[seen], known[seen]
     by_bin, by_joint = np.ones(len(knots) + 1), np.ones(squared.shape[1])
+    members = [
+        [(each, np.flatnonzero(of == each)) for each in np.unique(of)] for of in (bins, joints)
+    ]
     for _ in range(ROUNDS):
-        for group, factor in ((bins, by_bin), (joints, by_joint)):
+        for groups, factor in zip(members, (by_bin, by_joint), strict=True):
             expected = by_bin[bins] * by_joint[joints] * base
-            ratio = squares / (expected + given)
-            for each in np.unique(group):
-                mine = group == each
+            ratio, shares = squares / (expected + given), expected / (expected + given)
+            for each, mine in groups:
                 median = float(np.median(ratio[mine])) / MEDIAN
                 # The factor excludes the variance of the body.
-                share = float(np.median((expected / (expected + given))[mine]))
+                share = float(np.median(shares[mine]))
                 factor[each] = max(LEAST, factor[each] * (1.0 + (median - 1.0) / max(share, 0.3)))
     return Spread(by_joint, knots, by_bin)
 

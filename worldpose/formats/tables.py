@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from data_contracts.arrays import Floats
 from worldpose.errors import UsageError
@@ -232,6 +231,8 @@ def _strides(
     frames: NDArray[np.integer], hips: Floats, ankle: Floats, fps: float
 ) -> list[tuple[int, int]]:
     """Return rows of the first and last frame of the strides of one foot."""
+    from scipy.signal import find_peaks  # late: it takes a second, and reports need no strides
+
     half = max(1, round(0.5 * SPEED_WINDOW_S * fps))
     ahead = np.full(len(frames), np.nan)
     if len(frames) > 2 * half:

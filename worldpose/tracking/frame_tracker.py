@@ -160,8 +160,8 @@ class FrameTracker:
         seen += [(group.joints, group.index >= 0) for group in groups]
         seen = [each for each in seen if np.isfinite(each[0]).any()]
         if seen:
-            bodies = np.stack([each for each, _ in seen])
-            showing = np.stack([each for _, each in seen], axis=1)
+            bodies = np.array([each for each, _ in seen])
+            showing = np.ascontiguousarray(np.array([each for _, each in seen]).T)
             self.visibility.learn(bodies, directions, weights, showing)
 
     def all_people(self) -> list[Person]:
@@ -186,7 +186,7 @@ class FrameTracker:
             return none, np.empty(none.shape), np.empty((0, directions.shape[2], 3))
         self.active.sort(key=lambda person: (not self._is_confirmed(person), person.number))
         confirmed = sum(map(self._is_confirmed, self.active))
-        poses = np.stack([person.pose for person in self.active])
+        poses = np.array([person.pose for person in self.active])
         doubt = [person.uncertainty(frame, self.fps, settings) for person in self.active]
         usual = np.maximum(
             settings.gate_factor * self.gates.usual[:, None],
@@ -374,4 +374,4 @@ def _pose_distances(poses: list[Floats], people: list[Person]) -> Floats:
     """Return mean joint distances (poses, people) [m]."""
     if not poses or not people:
         return np.empty((len(poses), len(people)))
-    return separations(np.stack(poses), np.stack([person.pose for person in people]))
+    return separations(np.array(poses), np.array([person.pose for person in people]))

@@ -5,6 +5,7 @@ One camera, or cameras side by side, do not give joints in 3D; the feet give pla
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -205,9 +206,33 @@ def _smooth_backwards(
         covariance[n] += gain @ (covariance[n + 1] - expected_covariance[n + 1]) @ gain.T
 
 
-def _look(clock: float) -> Floats:
-    """Return the matrix (2, 4) that maps a state to the position `clock` [s] later."""
-    return np.concatenate([np.eye(2), clock * np.eye(2)], axis=1)
+@compile_kernel
+def _compare(
+    states: Floats, covariance: Floats, places: Floats, noise: Floats, clock: float
+) -> tuple[Floats, Floats]:
+    """Return squared Mahalanobis distances and log determinants (tracks, sights).
+
+    Args:
+        states: (tracks, 4), predicted.
+        covariance: (tracks, 4, 4), of them.
+        places: (sights, 2) [m], seen `clock` [s] later.
+        noise: (sights, 2, 2) [m^2], of these places.
+        clock: time of the image minus time of the frame [s].
+    """
+    squared, size = np.empty((len(states), len(places))), np.empty((len(states), len(places)))
+    for t in range(len(states)):
+        state, own = states[t], covariance[t]
+        x, y = state[0] + clock * state[2], state[1] + clock * state[3]
+        xx = own[0, 0] + clock * (own[0, 2] + own[2, 0] + clock * own[2, 2])
+        xy = own[0, 1] + clock * (own[0, 3] + own[2, 1] + clock * own[2, 3])
+        yy = own[1, 1] + clock * (own[1, 3] + own[3, 1] + clock * own[3, 3])
+        for d in range(len(places)):
+            a, b, c = xx + noise[d, 0, 0], xy + noise[d, 0, 1], yy + noise[d, 1, 1]
+            determinant = a * c - b * b
+            u, v = places[d, 0] - x, places[d, 1] - y
+            squared[t, d] = (c * u * u - 2.0 * b * u * v + a * v * v) / determinant
+            size[t, d] = math.log(determinant)
+    return squared, size
 
 
 def track_on_plane(
@@ -471,15 +496,14 @@ def _match(
     """
     if not tracks or not sights:
         return []
-    look = _look(clock)
-    places = np.stack([sight.place for sight in sights])
-    wide = np.stack([sight.noise for sight in sights]) + lasting
-    states = np.stack([track.state for track in tracks])
-    spread = look @ np.stack([track.covariance for track in tracks]) @ look.T
-    total = spread[:, None] + wide[None]
-    off = places[None] - (states @ look.T)[:, None]
-    squared = np.einsum("tdi,tdij,tdj->td", off, np.linalg.inv(total), off)
-    size = np.log(np.linalg.det(total))
+    # Not `np.stack`, which takes several times as long for lists of small arrays.
+    squared, size = _compare(
+        np.array([track.state for track in tracks]),
+        np.array([track.covariance for track in tracks]),
+        np.array([sight.place for sight in sights]),
+        np.array([sight.noise for sight in sights]) + lasting,
+        clock,
+    )
     other = np.zeros_like(squared) if shirts is None else -2.0 * shirts
     # Shirts that differ count towards the gate; shirts that agree do not widen it.
     near = squared + np.maximum(other, 0.0) < GATE
@@ -512,7 +536,7 @@ def _follow_triangulated(tracks: list[_Track], places: Floats, frame: int) -> No
 def _smooth(track: _Track, move: Floats) -> PlanePath:
     """Return the track up to its last sighting, smoothed backwards."""
     steps = track.steps[: track.last_seen - track.first + 1]
-    expected, expected_covariance, state, covariance = map(np.stack, zip(*steps, strict=True))
+    expected, expected_covariance, state, covariance = map(np.array, zip(*steps, strict=True))
     _smooth_backwards(move, expected, expected_covariance, state, covariance)
     return PlanePath(track.first, state, covariance, track.index, track.person)
 

@@ -190,13 +190,13 @@ class CameraGates:
 
     def learn(self, distance: Floats) -> None:
         """Add the ray distances (cameras, persons) [m] of a frame's matches; NaN = none."""
-        for camera, known in enumerate(self._known):
-            new = distance[camera][np.isfinite(distance[camera])][-MAX_HISTORY:]
-            known[(self._count[camera] + np.arange(len(new))) % MAX_HISTORY] = new
-            self._count[camera] += len(new)
+        _append(distance, self._known, self._count)
         is_full = self._count >= MAX_HISTORY
         if is_full.any():
-            self.usual[is_full] = np.median(self._known[is_full], axis=1)
+            # As `np.median`, which takes three times as long.
+            middle = [(MAX_HISTORY - 1) // 2, MAX_HISTORY // 2]
+            ordered = np.partition(self._known[is_full], middle, axis=1)
+            self.usual[is_full] = 0.5 * (ordered[:, middle[0]] + ordered[:, middle[1]])
         for camera in np.flatnonzero((self._count >= MIN_HISTORY) & ~is_full).tolist():
             self.usual[camera] = np.median(self._known[camera, : self._count[camera]])
 
@@ -213,6 +213,22 @@ class CameraGates:
         usual = np.where(np.isfinite(usual), usual, self.usual_pair)
         # The median of Rayleigh's distribution is 1.18 times its scale.
         return np.asarray(np.where(np.isfinite(usual), np.clip(0.85 * usual, low, high), unknown))
+
+
+@compile_kernel
+def _append(distance: Floats, known: Floats, count: Integers) -> None:
+    """Write finite distances (cameras, persons) [m] behind the last ones; the oldest give way.
+
+    Args:
+        distance: distances of a frame.
+        known: (cameras, n) [m], the last n of each camera, written in turn.
+        count: (cameras,), distances so far; increased.
+    """
+    for camera in range(len(known)):
+        for person in range(distance.shape[1]):
+            if np.isfinite(distance[camera, person]):
+                known[camera, count[camera] % known.shape[1]] = distance[camera, person]
+                count[camera] += 1
 
 
 SIZE_SPREAD: Final = 0.15

@@ -145,11 +145,12 @@ class Person:
         """Update with the sighting in `frame`; undetermined joints follow the others."""
         self.sightings[frame] = sighting
         gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
-        known_distances = sighting.ray_distance[~np.isnan(sighting.ray_distance)]
-        self.misfit += gain * (float(known_distances.mean()) - self.misfit)
+        known = sighting.ray_distance[~np.isnan(sighting.ray_distance)]
+        # Not `mean`, which takes as long as all else here.
+        self.misfit += gain * (float(np.add.reduce(known) / len(known)) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
-        pose, shift, known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
-        if not known:
+        pose, shift, is_known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
+        if not is_known:
             return
         if elapsed > 0.0:
             gain = 1.0 - math.exp(-elapsed / settings.velocity_time_s)

@@ -85,12 +85,18 @@ def solve_segment(
         rig: the cameras.
         costs: weights of the two kinds of errors.
     """
+    return _solve_tiles(prepare_tiles(pixels, weights, rig), given, rig, costs)
+
+
+def _solve_tiles(
+    tiles: Floats, given: Floats, rig: Rig, costs: TrackCosts
+) -> tuple[Floats, Floats]:
+    """Return what `solve_segment` does, from the tiles of its observations."""
     frames = np.arange(len(given))
     known = np.isfinite(given[:, 0])
     columns = [np.interp(frames, frames[known], column[known]) for column in given.T]
     points = np.stack(columns, axis=-1)
     covariance = np.empty((len(points), 3, 3))
-    tiles = prepare_tiles(pixels, weights, rig)
     _solve_track(tiles, rig.depths, costs, points, covariance)
     return points, covariance
 
@@ -349,10 +355,11 @@ def learn_motion(
                 if ((seen > 0.0).sum(axis=0) < settings.min_views).any():
                     continue
                 tiles = prepare_tiles(pixels[joint], hidden, rig)
+                seen_tiles = prepare_tiles(pixels[joint], seen, rig)
                 own = np.empty(len(ACCELERATIONS))
                 for n, acceleration in enumerate(ACCELERATIONS):
                     weighed = TrackCosts(noise, limit, (fps**2 / acceleration) ** 2)
-                    x, _ = solve_segment(pixels[joint], seen, given, rig, weighed)
+                    x, _ = _solve_tiles(seen_tiles, given, rig, weighed)
                     own[n] = held_out_cost(tiles, rig.depths, noise, limit, x)
                 costs.append(own)
             error = _whiten_errors(pixels[joint], weights[joint], given, rig, noise, limit)

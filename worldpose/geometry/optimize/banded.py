@@ -68,30 +68,51 @@ def _factorize(lower: Floats) -> bool:
         if t >= 1 and t + 1 < frames:
             _subtract(lower[1, t], lower[2, t - 1], lower[1, t - 1], False)
         block = lower[0, t]
-        for j in range(size):  # column by column, so that inner loops run along rows of `turned`
-            pivot = block[j, j]
-            for k in range(j):
-                pivot -= turned[k, j] * turned[k, j]
-            if not pivot > 0.0:
-                return False
-            root = math.sqrt(pivot)
-            for i in range(j, size):
-                turned[j, i] = block[i, j]
-            for k in range(j):
-                factor = turned[k, j]
-                for i in range(j, size):
-                    turned[j, i] -= factor * turned[k, i]
-            for i in range(j, size):
-                turned[j, i] /= root
-            block[j, j] = root
-            for i in range(j + 1, size):
-                block[i, j] = turned[j, i]
-                block[j, i] = 0.0
+        if not _factorize_block(block, turned):
+            return False
         for ahead in (1, 2):
             if t + ahead < frames:
                 _divide(lower[ahead, t], block)
             else:
                 lower[ahead, t] = 0.0
+    return True
+
+
+@compile_kernel
+def _factorize_block(block: Floats, turned: Floats) -> bool:
+    """Factorise a block in place, with room `turned`; False when it is not positive definite.
+
+    Four columns at a time, so that the rest is read and written a quarter as often; inner loops run
+    along rows of the transposed factor.
+    """
+    size = len(block)
+    for i in range(size):
+        for j in range(i + 1):
+            turned[j, i] = block[i, j]
+    for first in range(0, size, 4):
+        end = min(first + 4, size)
+        for j in range(first, end):
+            row = turned[j]
+            for k in range(first, j):
+                factor = turned[k, j]
+                for i in range(j, size):
+                    row[i] -= factor * turned[k, i]
+            if not row[j] > 0.0:
+                return False
+            root = math.sqrt(row[j])
+            for i in range(j, size):
+                row[i] /= root
+        if end < first + 4:
+            break  # these were the last columns
+        r0, r1, r2, r3 = turned[first], turned[first + 1], turned[first + 2], turned[first + 3]
+        for k in range(end, size):
+            row = turned[k]
+            f0, f1, f2, f3 = r0[k], r1[k], r2[k], r3[k]
+            for i in range(k, size):
+                row[i] -= (f0 * r0[i] + f1 * r1[i]) + (f2 * r2[i] + f3 * r3[i])
+    for i in range(size):
+        for j in range(size):
+            block[i, j] = turned[j, i] if j <= i else 0.0
     return True
 
 

@@ -12,7 +12,6 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.keypoints import KeypointDetections
@@ -300,6 +299,8 @@ def _draw_errors(
     profile: DetectorProfile, frames: int, persons: int, fps: float, rng: np.random.Generator
 ) -> Floats:
     """Return unit errors (frames, persons, 17, 2): resonant, sudden, and shared along limbs."""
+    from scipy.signal import lfilter  # late: it takes a second, and lists of scenarios need none
+
     shape = (persons, 17, 2)
     lead = round(2.0 * fps)
     driven = rng.standard_normal((frames + lead, *shape))
