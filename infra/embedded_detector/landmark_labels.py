@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from numba import njit
+from numpy.typing import NDArray
 from scenes import SIZE, SceneKind, Shot, find_visible, label, render_scene, save
 from scipy.spatial import cKDTree
 

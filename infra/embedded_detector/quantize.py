@@ -6,9 +6,9 @@
 Reads the shipped float weights, and writes `embedded_people.onnx`, `embedded_keypoints.onnx` and
 `embedded_landmarks.onnx` beside them. The ranges of activations come from what the production code
 feeds the nets: rendered scenes of the training kind in FOLDER, the first half of the panorama's
-match and the first hundred frames of the static pair (see real_frames.py). Last layers stay in single precision, since
-positions are sums over their maps. Weights have seven bits: processors without VNNI add pairs of
-products in 16 bits, which overflow with eight.
+match and the first hundred frames of the static pair (see real_frames.py). Last layers stay in
+single precision, since positions are sums over their maps. Weights have seven bits: processors
+without VNNI add pairs of products in 16 bits, which overflow with eight.
 """
 
 from __future__ import annotations
