@@ -12,7 +12,7 @@ from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection import DetectionSettings, People, PeopleFinder
-from worldpose.detection.bundled_nets import CELL, CROP, QuantizedNet
+from worldpose.detection.bundled_nets import CELL, CROP, QuantizedNet, load_weights
 from worldpose.detection.landmark_net import (
     POINTS,
     LandmarkEstimator,
@@ -20,7 +20,8 @@ from worldpose.detection.landmark_net import (
     SeenLandmarks,
     locate,
 )
-from worldpose.detection.models import load_landmarks, weights_of
+from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks, weights_of
+from worldpose.ingest.registration import digest_of_files
 
 RECIPE = Path(__file__).parents[3] / "infra" / "embedded_detector"
 ROWS, COLUMNS = CROP[1] // CELL, CROP[0] // CELL
@@ -150,15 +151,19 @@ def shot():
         yield shot, labels.label_landmarks(shot)
 
 
+def test_the_net_in_integers_was_made_from_the_shipped_weights():
+    net = QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx"))
+    assert net.weights_sha256 == digest_of_files(LANDMARK_WEIGHTS)
+
+
 @pytest.mark.parametrize("integers", [False, True])
 def test_the_shipped_net_finds_landmarks_of_unknown_people(shot, integers):
     rendered, truth = shot
-    device = load_landmarks(DetectionSettings(landmarks=True))
-    if not integers:
-        from worldpose.detection.bundled_nets import load_weights
-        from worldpose.detection.models import LANDMARK_WEIGHTS
-
-        device = LandmarkEstimator(load_weights(LANDMARK_WEIGHTS, LandmarkNet()))
+    device = (
+        load_landmarks(DetectionSettings(landmarks=True))
+        if integers
+        else LandmarkEstimator(load_weights(LANDMARK_WEIGHTS, LandmarkNet()))
+    )
     height = truth.boxes[:, 3] - truth.boxes[:, 1]
     kept = ~truth.ignored & (height > 34.0)
     assert kept.sum() >= 4
