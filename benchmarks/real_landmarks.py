@@ -25,9 +25,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from stills import read_labels
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import AnyFloats, Floats, Image
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body import fold_keypoints, load_open_body
@@ -40,7 +39,7 @@ from worldpose.detection.models import load_bundled_detector, load_bundled_pose
 from worldpose.detection.suppression import combine_boxes
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.training.labels import PictureCache
+from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import TORSO_SHARE, torso_sizes
 from worldpose.video import open_video
 
@@ -161,7 +160,7 @@ def find_people(image: Image, nets: LandmarkEstimator) -> tuple[KeypointDetectio
     return poses, nets.estimate(image, np.asarray(poses.boxes, dtype=np.float64))
 
 
-def similarity(start: Floats, end: Floats) -> Floats:
+def similarity(start: AnyFloats, end: AnyFloats) -> Floats:
     """Return the similarity (2, 3) that maps points (n, 2) best to others."""
     a, b = start - start.mean(axis=0), end - end.mean(axis=0)
     square = float((a**2).sum())

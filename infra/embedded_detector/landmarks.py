@@ -285,7 +285,7 @@ def state_errors(net: LandmarkNet, judged: dict[str, NDArray[Any]]) -> None:
     high = np.nanquantile(away, 0.95, axis=0) / math.sqrt(5.99)
     say(f"standard deviations times {np.median(high):.2f} ({high.min():.2f} to {high.max():.2f})")
     with torch.no_grad():
-        net.doubt.bias += torch.from_numpy(np.log(high)).float()
+        net.doubt.bias.add_(torch.from_numpy(np.log(high)).float())
 
 
 def say(line: str) -> None:
