@@ -7,14 +7,14 @@ No real image has labelled landmarks.
 
 stills: twelve stills of football matches with joints labelled by eye (see stills.py). A joint
 follows from the landmarks of its neighbouring segments, by weights that are fitted to the body
-model in simulated poses. So landmarks are compared with labels, beside the joints of the bundled
-pose net in the same boxes, and beside joints from the true landmarks of renderings.
+model in simulated poses (errors of joints from true landmarks come first). So landmarks are
+compared with labels, as are the joints of the bundled pose net in the same boxes.
 
 pair: two cameras 0.46 m apart (see tests/real/static_pair.py). Both show a person from one side, so
 that a similarity transform maps one image of a person to the other. It is fitted to all joints and
 all landmarks but those of one segment (left out in turn); the distance of the landmarks left out
-is given in percent of the person's height, beside that of joints. Lengths between landmarks of
-one segment, over the person's height, are compared between both cameras, too.
+is given in percent of the person's height, and that of joints, too. Lengths between landmarks of
+one segment are compared between both cameras.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def similarity(start: AnyFloats, end: AnyFloats) -> Floats:
 
 
 def compare_pair(data: Path, nets: LandmarkEstimator, frames: int, drawn: Path | None) -> None:
-    """Print how well the landmarks of two cameras agree."""
+    """Print differences between the landmarks of two cameras."""
     parts = ("head", "trunk", "pelvis", "upper_arm", "forearm", "thigh", "shank", "foot")
     member = {part: [k for k, name in enumerate(POINTS) if part in name] for part in parts}
     off: dict[str, list[float]] = {name: [] for name in ("joints", *parts)}

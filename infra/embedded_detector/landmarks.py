@@ -1,9 +1,9 @@
 """Trains the net of landmarks that ships with the project, on rendered scenes; scores it.
 
-    python infra/embedded_detector/landmarks.py FOLDER [--share 1.0] [scenes train figures]
+    python infra/embedded_detector/landmarks.py FOLDER [--share 1.0] [scenes train score]
 
-The net begins with the features of the shipped keypoint net. Weights, checkpoint and figures.json
-end in FOLDER; with another torch their bytes differ, but metrics are similar.
+The net begins with the features of the shipped keypoint net. Weights, checkpoints and
+landmark_scores.json end in FOLDER; with another torch their bytes differ, but metrics are similar.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def summarize(judged: dict[str, NDArray[Any]]) -> dict[str, float]:
 
 
 def main(folder: Path, parts: Sequence[str], share: float) -> None:
-    """Run the named parts: `scenes`, `train`, `figures`.
+    """Run the named parts: `scenes`, `train`, `score`.
 
     Args:
         folder: of all outputs.
@@ -232,10 +232,10 @@ def main(folder: Path, parts: Sequence[str], share: float) -> None:
     weights = folder / "embedded_landmarks.safetensors"
     if "train" in parts:
         train_phases(folder, cache, share)
-    if "figures" in parts:
+    if "score" in parts:
         net = load_weights(weights, LandmarkNet())
         figures = summarize(judge(net, read_landmarks(folder / "held_out"), cache, 3200))
-        (folder / "landmark_figures.json").write_text(json.dumps(figures, indent=2) + "\n")
+        (folder / "landmark_scores.json").write_text(json.dumps(figures, indent=2) + "\n")
         say(json.dumps(figures))
 
 
@@ -296,7 +296,7 @@ def say(line: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("parts", nargs="*", default=["scenes", "train", "figures"])
+    parser.add_argument("parts", nargs="*", default=["scenes", "train", "score"])
     parser.add_argument("--share", type=float, default=1.0)
     given = parser.parse_args()
     main(given.folder, given.parts, given.share)
