@@ -78,7 +78,7 @@ class DetectionSettings(Record):
     half of two people; poses take twice as long. Not with `flip_test` or another pose net."""
     landmarks: bool = False
     """A second net also finds 64 landmarks of the surface, heels and toes. It takes as long as the
-    net of joints, which stay as they are. Off: bodies do not get better by these points yet
+    net of joints, which stay as they are. Off: bodies hardly get better by these points yet
     (docs/results/measured.md)."""
     min_keypoint_confidence: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
