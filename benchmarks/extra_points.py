@@ -4,8 +4,8 @@
         [--landmarks] [--difficulty 0.84]
 
 The simulated detector gives `FEET` besides COCO-17 (`worldpose.simulation.scene.detect_points`),
-and with `--landmarks` also the 64 `LANDMARKS` of the surface. No net that gives landmarks exists:
-this shows how accurate one has to be. The columns are bodies fitted without the points, bodies
+and with `--landmarks` also the 64 `LANDMARKS` of the surface, with independent errors: this shows
+how accurate a net of landmarks has to be. The columns are bodies fitted without the points, bodies
 fitted with them, and the triangulated points. Errors are mean distances to the truth [mm]; the
 direction of a foot is that from the heel to the middle of the toes [degrees]. Settings were not
 chosen on seeds 801 and above.

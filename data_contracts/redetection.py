@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
-from data_contracts.keypoints import FRAME, KEYPOINT_ARRAYS, KEYPOINT_LABELS
+from data_contracts.keypoints import (
+    EXTRA_ARRAYS,
+    FRAME,
+    KEYPOINT_ARRAYS,
+    KEYPOINT_LABELS,
+    OPTIONAL_POINTS,
+    POINT_ATTRIBUTE,
+)
 
 REDETECTION = GroupLayout(
     stage="redetection",
@@ -12,6 +19,7 @@ REDETECTION = GroupLayout(
     coordinates=(FRAME,),
     arrays=(
         *KEYPOINT_ARRAYS,
+        *EXTRA_ARRAYS,
         ArrayLayout(
             name="found_again",
             dims=("frame", "detection"),
@@ -33,7 +41,8 @@ REDETECTION = GroupLayout(
         ),
     ),
     labels=KEYPOINT_LABELS,
-    attributes={"camera_id": "camera of the match"},
+    attributes={"camera_id": "camera of the match", **POINT_ATTRIBUTE},
+    optional=OPTIONAL_POINTS,
 )
 
 

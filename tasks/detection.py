@@ -25,6 +25,7 @@ from worldpose.detection import (
     PeopleFinder,
     Place,
     load_detectors,
+    load_landmarks,
     load_pose,
     load_score_map,
     weights_of,
@@ -61,6 +62,7 @@ def detection(work: Work) -> str:
             attributes={
                 "camera_id": work.recipe.sources["camera"],
                 "unreadable": found.unreadable,
+                **detections.labels(),
             },
         )
     return work.key
@@ -103,6 +105,7 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
         load_pose(settings),
         settings,
         load_score_map(settings) if given is None else None,
+        landmarks := load_landmarks(settings),
     )
     require_weights(settings, sources["weights"])
     most = 0
@@ -118,6 +121,7 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
                     sources["first_frame"], sources["first_frame"] + sources["frame_count"]
                 ),
                 **{name: values[:, :most] for name, values in spool.arrays().items()},
+                **({} if landmarks is None else {"point": landmarks.points}),
             }
         ),
         stretches(np.array(report.unreadable, dtype=np.int64)),

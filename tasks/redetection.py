@@ -78,7 +78,10 @@ def redetection(work: Work) -> str:
             REDETECTION,
             arrays=_arrays(case, sought, found, verdicts),
             coordinates={"frame": case.detected.frame},
-            attributes={"camera_id": work.recipe.sources["camera"]},
+            attributes={
+                "camera_id": work.recipe.sources["camera"],
+                **case.detected.labels(),
+            },
         )
         for name in ("found", "unsure", "elsewhere", "another"):
             result.figures[name] = float(np.count_nonzero(getattr(verdicts, name)))

@@ -1,14 +1,14 @@
 """Writes the bundled nets in 8-bit integers, which CPUs without a GPU compute three times as fast.
 
     pip install onnx
-    python infra/embedded_detector/quantize.py DATA FOLDER
+    python infra/embedded_detector/quantize.py DATA FOLDER [--only people keypoints landmarks]
 
-Reads the shipped float weights, and writes `embedded_people.onnx` and `embedded_keypoints.onnx`
-beside them. The ranges of activations come from what the production code feeds the nets: rendered
-scenes of the training kind in FOLDER, the first half of the panorama's match and the first hundred
-frames of the static pair (see real_frames.py). Last layers stay in single precision, since
-positions are sums over their maps. Weights have seven bits: processors without VNNI add pairs of
-products in 16 bits, which overflow with eight.
+Reads the shipped float weights, and writes `embedded_people.onnx`, `embedded_keypoints.onnx` and
+`embedded_landmarks.onnx` beside them. The ranges of activations come from what the production code
+feeds the nets: rendered scenes of the training kind in FOLDER, the first half of the panorama's
+match and the first hundred frames of the static pair (see real_frames.py). Last layers stay in
+single precision, since positions are sums over their maps. Weights have seven bits: processors
+without VNNI add pairs of products in 16 bits, which overflow with eight.
 """
 
 from __future__ import annotations
@@ -47,9 +47,11 @@ from worldpose.detection.bundled_nets import (
     KeypointNet,
     PeopleNet,
     load_weights,
+    place_net,
 )
 from worldpose.detection.bundled_pose import BundledPoseEstimator
-from worldpose.detection.models import BUNDLED_WEIGHTS, QUANTIZED_WEIGHTS
+from worldpose.detection.landmark_net import LandmarkNet, SeenLandmarks
+from worldpose.detection.models import BUNDLED_WEIGHTS, LANDMARK_WEIGHTS
 from worldpose.ingest.registration import digest_of_files
 from worldpose.training import read_picture
 
@@ -215,26 +217,31 @@ def take_bytes(model: onnx.ModelProto) -> None:
 
 
 def main() -> None:
-    """Write both files."""
+    """Write the files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("folder", type=Path)
+    nets = ("people", "keypoints", "landmarks")
+    parser.add_argument("--only", nargs="+", choices=nets, default=nets)
     options = parser.parse_args()
     people = load_weights(BUNDLED_WEIGHTS[0], PeopleNet())
     keypoints = load_weights(BUNDLED_WEIGHTS[1], KeypointNet())
     images = calibration_images(options.data, options.folder)
     frames, crops = collect_inputs(images, people, keypoints)
     print(f"{len(frames)} frames, {len(crops)} batches of crops")
-    quantize(people, frames, ("logits", "sides"), ("/head/head.1",), BUNDLED_WEIGHTS[0])
-    quantize(
-        keypoints,
-        crops,
-        ("maps", "doubt", "boxes", "fit", "trust"),
-        ("/head/head.1", "/outline/outline.1", "/around"),
-        BUNDLED_WEIGHTS[1],
-    )
-    for file in QUANTIZED_WEIGHTS:
-        print(f"{file.name}: {file.stat().st_size / 1e6:.1f} MB")
+    # The net of landmarks takes the crops of joints.
+    landmarks = place_net(load_weights(LANDMARK_WEIGHTS, LandmarkNet()), "cpu")
+    head, around = "/head/head.1", "/around"
+    seen = ("maps", "doubt", "boxes", "fit", "trust")
+    for net, inputs, outputs, kept, weights in (
+        (people, frames, ("logits", "sides"), (head,), BUNDLED_WEIGHTS[0]),
+        (keypoints, crops, seen, (head, "/outline/outline.1", around), BUNDLED_WEIGHTS[1]),
+        (landmarks, crops, SeenLandmarks._fields, (head, around), LANDMARK_WEIGHTS),
+    ):
+        if weights.stem.removeprefix("embedded_") in options.only:
+            quantize(net, inputs, outputs, kept, weights)
+            file = weights.with_suffix(".onnx")
+            print(f"{file.name}: {file.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

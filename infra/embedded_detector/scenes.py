@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
+from worldpose.body import BodyParameters
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.image_formation import RenderedFrame
+from worldpose.simulation.mannequins import Surfaces
 from worldpose.simulation.matches import open_view, render_frame
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import (
@@ -109,6 +111,42 @@ def read_set(folder: Path) -> list[LabelledPicture]:
 def _scene(
     folder: Path, kind: SceneKind, seed: int, views: int, frames: int
 ) -> list[LabelledPicture]:
+    return [save(folder, each) for each in render_scene(kind, seed, views=views, frames=frames)]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image of a scene with its truth.
+
+    Attributes:
+        name: file name.
+        rendered: the image with its pixel labels.
+        camera: the camera that took it.
+        joints: (persons, 17, 3) [m], world.
+        poses: bodies of the people (persons,).
+        surfaces: their clothed surfaces.
+    """
+
+    name: str
+    rendered: RenderedFrame
+    camera: Camera
+    joints: NDArray[np.float64]
+    poses: BodyParameters
+    surfaces: Surfaces
+
+
+def save(folder: Path, shot: Shot) -> LabelledPicture:
+    """Write the image of a shot into a folder, and return it with the labels of its joints."""
+    path = folder / shot.name
+    cv2.imwrite(str(path), shot.rendered.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    pixels = shot.camera.project(shot.joints.reshape(-1, 3)).reshape(-1, 17, 2)
+    visible = np.where(find_visible(shot.rendered.person_ids, pixels), 2, 1)
+    visible[~np.isfinite(pixels).all(axis=-1)] = 0
+    return label(path, shot.rendered, pixels, visible)
+
+
+def render_scene(kind: SceneKind, seed: int, *, views: int, frames: int) -> Iterator[Shot]:
+    """Yield the images of a scene: all moments of one view after the other."""
     rng = np.random.default_rng(seed)
     scenario = _scenario(kind, rng)
     pitch = PitchTemplate.from_spec(scenario.pitch)
@@ -119,32 +157,35 @@ def _scene(
     joints = crowd.joints(times)
     roles = assign_roles(scenario.crowd, len(crowd.paths))
     cast = dress_people(poses.betas[:, 0], roles, seed, settings.patterns)
-    pictures = []
     for index in range(views):
         camera = _camera(kind, scenario.pitch, crowd, joints[0], rng)
         view = open_view(camera, pitch, seed, settings)
         for frame in range(frames):
-            rendered = render_frame(
-                view, cast, cast.pose(poses[:, frame]), cast.pose(later[:, frame]), frame=frame
-            )
-            path = folder / f"{index}_{frame}.jpg"
-            cv2.imwrite(str(path), rendered.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-            pictures.append(label(path, rendered, camera, joints[frame]))
-    return pictures
+            surfaces = cast.pose(poses[:, frame])
+            rendered = render_frame(view, cast, surfaces, cast.pose(later[:, frame]), frame=frame)
+            name = f"{index}_{frame}.jpg"
+            yield Shot(name, rendered, camera, joints[frame], poses[:, frame], surfaces)
 
 
 def label(
-    path: Path, rendered: RenderedFrame, camera: Camera, joints: NDArray[np.float64]
+    path: Path,
+    rendered: RenderedFrame,
+    pixels: NDArray[np.float64],
+    visible: NDArray[np.int64],
 ) -> LabelledPicture:
-    """Return the labels of a rendered frame; joints (persons, 17, 3) [m], world."""
+    """Return the labels of a rendered frame, of people whose box lies in it.
+
+    Args:
+        path: of its image.
+        rendered: the image with its pixel labels.
+        pixels: (persons, points, 2) [px].
+        visible: (persons, points): 2 visible, 1 occluded, 0 not labelled.
+    """
     height, width = rendered.image.shape[:2]
     limits = np.array([width, height, width, height]) - 0.5
     boxes = np.clip(rendered.boxes, -0.5, limits)
     sides = boxes[:, 2:] - boxes[:, :2]
     there = np.isfinite(boxes).all(axis=1) & (np.nan_to_num(sides) > 1.0).all(axis=1)
-    pixels = camera.project(joints.reshape(-1, 3)).reshape(-1, 17, 2)
-    visible = np.where(_find_visible(rendered.person_ids, pixels), 2, 1)
-    visible[~np.isfinite(pixels).all(axis=-1)] = 0
     return LabelledPicture(
         path=path,
         boxes=boxes[there],
@@ -154,8 +195,8 @@ def label(
     )
 
 
-def _find_visible(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether a person fills a pixel near each of the person's joints (persons, 17)."""
+def find_visible(person_ids: NDArray[np.int16], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether a person fills a pixel near each of its points (persons, points)."""
     height, width = person_ids.shape
     shown = np.zeros(pixels.shape[:2], dtype=bool)
     # Distorted points far outside may overflow an integer.

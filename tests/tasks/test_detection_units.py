@@ -108,6 +108,46 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     assert figures.figures["unreadable_share"] == pytest.approx(0.2)
 
 
+class Marking:
+    """Marks one point of every person, at the left of the box."""
+
+    points = ("left_heel", "right_heel")
+
+    def add_points(self, picture, people):
+        at = np.full((len(people.score), 2, 2), np.nan)
+        at[:, 0] = people.boxes[:, :2] + [0.0, 5.0]
+        return people.add_points(self.points, at, np.where(np.isfinite(at[..., 0]), 0.5, np.nan))
+
+
+def test_landmarks_of_videos_reach_triangulation_and_cameras_without_them_have_none(
+    filmed, tmp_path, reading, monkeypatch
+):
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    names = [stage.name for stage in METHOD]
+    plain = computed(store, match, names.index("tracking"))
+    monkeypatch.setattr(tasks.detection, "load_landmarks", lambda settings: Marking())
+    other = Store.create(tmp_path / "other")
+    match, _ = register(other, filmed)
+    results = computed(other, match, names.index("tracking"))
+    seen = other.open_result("filmed", "detection", "left.early", results["detection/left.early"])
+    assert seen["point"].values.tolist() == list(Marking.points)
+    before = store.open_result("filmed", "detection", "left.early", plain["detection/left.early"])
+    assert "extra_keypoints" not in before and "point" not in before.attrs
+    for name in ("keypoints", "confidence", "boxes", "score"):
+        np.testing.assert_array_equal(seen[name].values, before[name].values)
+    plan = RunPlan(other, match, {}, results=results)
+    early, _ = plan.plan_stage(METHOD[names.index("tracking")])
+    clip = open_clip(other, early.work(other.url, match, "0001")).detections
+    assert clip.points == Marking.points
+    part = clip[:3]
+    assert part.extra_keypoints.shape == (3, 2, 1, 2, 2)
+    np.testing.assert_array_equal(
+        part.extra_keypoints[:, :, 0, 0], part.boxes[:, :, 0, :2] + [0.0, 5.0]
+    )
+    assert np.isnan(part.extra_keypoints[:, :, :, 1]).all()
+
+
 def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     filmed, tmp_path, reading, monkeypatch
 ):

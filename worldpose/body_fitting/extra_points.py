@@ -18,7 +18,7 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.keypoints import JOINT_NAMES, VERTEX_OF_POINT, point_segments
+from worldpose.body.keypoints import JOINT_NAMES, LANDMARKS, VERTEX_OF_POINT, point_segments
 from worldpose.body.model import SMPL_VERTICES
 from worldpose.body_fitting.objective import Evidence
 from worldpose.body_fitting.solver import Shapes, Solver
@@ -41,7 +41,9 @@ FOOT_TIME_S: Final = 0.1
 MIRROR: Final = np.array([-1.0, 1.0, 1.0])
 """Of vectors in the axes of the unposed body: left, up, forward."""
 KEPT_BIAS_M: Final = 0.01
-"""Part of the points' common bias that stays in their covariance per axis [m]."""
+"""Least part of the points' common bias that stays in their covariance per axis [m]."""
+NORMAL_MAD: Final = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +115,11 @@ def learn_point_offsets(
     people: Mapping[int, Evidence],
     shapes: Shapes,
     fps: float,
-) -> tuple[Floats, Floats]:
-    """Return the offsets of a detector's points and their variance (points, 3) [m, m^2].
+) -> tuple[Floats, Floats, Floats]:
+    """Return the offsets of a detector's points, their variance, and the variance around them.
+
+    All are (points, 3) [m, m^2, m^2]. The last is the mean over persons of the squared spread in
+    time, from the median absolute deviation: errors that views share and that differ by pose.
 
     Args:
         solver: result of `with_points`.
@@ -141,14 +146,18 @@ def learn_point_offsets(
 
     for _ in range(PASSES):
         moved = move_points(solver, points, offsets)
-        medians = []
+        medians, spreads = [], []
         for own in map_in_threads(residuals, sample):
             seen = np.isfinite(own[..., 0])
             median = np.full(offsets.shape, np.nan)
+            spread = np.full(offsets.shape, np.nan)
             for point in np.flatnonzero(seen.any(axis=0)):
-                median[point] = np.median(own[seen[:, point], point], axis=0)
+                its = own[seen[:, point], point]
+                median[point] = np.median(its, axis=0)
+                spread[point] = (NORMAL_MAD * np.median(np.abs(its - median[point]), axis=0)) ** 2
             medians.append(median)
-        each = np.array(medians)
+            spreads.append(spread)
+        each, around = np.array(medians), np.array(spreads)
         for place in range(len(points)):
             values = each[:, place]
             other = _mirror_place(points, place)
@@ -158,7 +167,32 @@ def learn_point_offsets(
             weight = len(values) / OWN_STD_M**2 + 1.0 / OFFSET_STD_M**2
             offsets[place] = values.sum(axis=0) / OWN_STD_M**2 / weight
             variance[place] = 1.0 / weight
-    return offsets, variance
+    with np.errstate(invalid="ignore"):
+        varying = np.nan_to_num(np.nansum(around, axis=0) / np.isfinite(around).sum(axis=0))
+    return offsets, variance, varying
+
+
+def _kept_variance(
+    model: BodyModel, points: tuple[str, ...], varying: Floats, common_bias: Floats
+) -> Floats:
+    """Return the part of the points' common bias that stays in their covariance (points, 3) [m^2].
+
+    A net errs alike in the landmarks of one segment, in all views and for many frames: together
+    they count as one, whose error is that of residuals over time.
+
+    Args:
+        model: the body.
+        points: names of the points.
+        varying: (points, 3) [m^2], variance of residuals around the offsets.
+        common_bias: (points,) per axis [m], expected without residuals.
+    """
+    least = np.maximum(varying, KEPT_BIAS_M**2)
+    if not any(point in LANDMARKS for point in points):
+        usual = np.minimum(KEPT_BIAS_M**2, common_bias**2)
+        return np.repeat(usual[:, None], 3, axis=1)
+    its = point_segments(model, points)
+    alike: Floats = (its[:, None] == its).sum(axis=1)[:, None] * least
+    return alike
 
 
 def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
@@ -278,9 +312,12 @@ def prepare_points(
         }
 
     # With the bias in their covariance the points hardly move the bodies: residuals show it.
-    offsets, variance = learn_point_offsets(solver, points, add(found.covariance), shapes, fps)
-    modelled = np.maximum(found.common_bias**2 - KEPT_BIAS_M**2, 0.0)
-    whole = add(found.covariance - modelled[:, None, None] * np.eye(3))
+    offsets, variance, varying = learn_point_offsets(
+        solver, points, add(found.covariance), shapes, fps
+    )
+    kept = _kept_variance(solver.chained.model, points, varying, found.common_bias)
+    modelled = found.common_bias[:, None] ** 2 - kept
+    whole = add(found.covariance - modelled[..., None] * np.eye(3))
     model = solver.chained.model
     shape = found.joints.shape
     bias = found.common_bias[:, None] ** 2 + variance + settings.own_bias_std_m**2

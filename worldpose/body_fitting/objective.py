@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from data_contracts.conventions import COCO17, COCO17_SIGMAS
+from data_contracts.conventions import COCO17, COCO17_SIGMAS, FEET
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
@@ -538,8 +538,10 @@ class Track:
         bands = [np.zeros((frames, points)) for _ in range(3)]
         slope, cost = np.zeros_like(keypoints), 0.0
         if frames > 2:
-            further = np.full(points - len(ACCELERATION_SCALE), POINT_ACCELERATION)
-            scale = np.concatenate([ACCELERATION_SCALE, further])
+            further = points - len(ACCELERATION_SCALE)
+            # A body accelerates as one: many points tell no more of it than those of the feet.
+            many = POINT_ACCELERATION * max(1.0, further / len(FEET)) ** 0.5
+            scale = np.concatenate([ACCELERATION_SCALE, np.full(further, many)])
             spread = self.acceleration * scale / self.fps**2
             second = keypoints[2:] - 2.0 * keypoints[1:-1] + keypoints[:-2]
             tail = 3.0 * settings.acceleration_loss_scale**2

@@ -10,7 +10,13 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.detection.interfaces import Detector, People, PoseEstimator
-    from worldpose.detection.models import load_detectors, load_pose, load_score_map, weights_of
+    from worldpose.detection.models import (
+        load_detectors,
+        load_landmarks,
+        load_pose,
+        load_score_map,
+        weights_of,
+    )
     from worldpose.detection.pipeline import DetectionReport, PeopleFinder, Place, detect_people
     from worldpose.detection.settings import DetectionSettings
 
@@ -24,6 +30,7 @@ __all__ = [
     "PoseEstimator",
     "detect_people",
     "load_detectors",
+    "load_landmarks",
     "load_pose",
     "load_score_map",
     "weights_of",
@@ -39,6 +46,7 @@ __getattr__ = import_on_use(
         ),
         "worldpose.detection.models": (
             "load_detectors",
+            "load_landmarks",
             "load_pose",
             "load_score_map",
             "weights_of",

@@ -108,3 +108,19 @@ class FindsOccludedPeople(PoseEstimator, Protocol):
             image: the whole frame.
             people: detected in it.
         """
+
+
+class PointEstimator(Protocol):
+    """An estimator of points besides COCO-17 of people whose boxes are known."""
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """Names of the points."""
+
+    def add_points(self, image: Image, people: KeypointDetections) -> KeypointDetections:
+        """Return the people of one frame with these points and no others.
+
+        Args:
+            image: the whole frame.
+            people: (people,) with boxes; none is a valid request.
+        """

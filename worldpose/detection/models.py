@@ -6,7 +6,7 @@ import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from data_contracts.checkpoint import Checkpoint
 from worldpose.detection.interfaces import Detector, PoseEstimator, ScoreMap
@@ -16,6 +16,9 @@ from worldpose.errors import InputError
 from worldpose.formats.files import read_json
 from worldpose.ingest.registration import digest_of_files
 from worldpose.ingest.validation import validate_record
+
+if TYPE_CHECKING:
+    from worldpose.detection.landmark_net import LandmarkEstimator
 
 LIBRARIES: Final = {
     "embedded": ("torch", "onnxruntime"),
@@ -30,6 +33,9 @@ BUNDLED_WEIGHTS: Final = (
     Path(__file__).with_name("embedded_keypoints.safetensors"),
 )
 """Shipped weights of the bundled detector and of the bundled pose estimator."""
+
+LANDMARK_WEIGHTS: Final = Path(__file__).with_name("embedded_landmarks.safetensors")
+"""Shipped weights of the net of landmarks."""
 
 QUANTIZED_WEIGHTS: Final = tuple(file.with_suffix(".onnx") for file in BUNDLED_WEIGHTS)
 """The same in 8-bit integers, for CPUs (infra/embedded_detector/quantize.py)."""
@@ -155,6 +161,25 @@ def load_bundled_pose(
     return BundledPoseEstimator(net, device, half)
 
 
+def load_landmarks(settings: DetectionSettings) -> LandmarkEstimator | None:
+    """Return the estimator of landmarks; None if the settings ask for none.
+
+    On a CPU it computes in integers.
+
+    Raises:
+        InputError: torch is not installed.
+    """
+    if not settings.landmarks:
+        return None
+    nets = _bundled_nets()
+    from worldpose.detection.landmark_net import LandmarkEstimator, LandmarkNet
+
+    if settings.device == "cpu":
+        return LandmarkEstimator(nets.QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx")))
+    net = nets.load_weights(LANDMARK_WEIGHTS, LandmarkNet())
+    return LandmarkEstimator(net, settings.device, settings.half)
+
+
 def _bundled_nets() -> ModuleType:
     """Return the module of the bundled nets, which needs torch."""
     try:
@@ -177,7 +202,7 @@ def weights_of(settings: DetectionSettings) -> dict[str, str | None]:
     Raises:
         InputError: an unknown kind, or missing weights.
     """
-    names = (*settings.detector, settings.pose)
+    names = (*settings.detector, settings.pose, *(["embedded"] if settings.landmarks else []))
     found: dict[str, str | None] = {}
     for name in names:
         kind, path = _split_name(name)

@@ -16,10 +16,16 @@ from worldpose.detection.interfaces import (
     Detector,
     FindsOccludedPeople,
     People,
+    PointEstimator,
     PoseEstimator,
     ScoreMap,
 )
-from worldpose.detection.models import load_detectors, load_pose, load_score_map
+from worldpose.detection.models import (
+    load_detectors,
+    load_landmarks,
+    load_pose,
+    load_score_map,
+)
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.views import TiledDetector
@@ -170,6 +176,7 @@ class PeopleFinder:
         estimator: PoseEstimator,
         settings: DetectionSettings,
         score_map: ScoreMap | None = None,
+        landmarks: PointEstimator | None = None,
     ) -> None:
         """Combine detectors, an estimator and settings.
 
@@ -179,6 +186,7 @@ class PeopleFinder:
             settings: settings of the stage. Its thresholds apply to the nets' own scores.
             score_map: makes probabilities of the scores of the people found, at the very end;
                 None = not known, scores stay.
+            landmarks: finds points besides COCO-17 of the people found; None = none.
         """
         self._detectors = [
             detector
@@ -187,6 +195,7 @@ class PeopleFinder:
             for detector in detectors
         ]
         self._estimator, self._settings, self._score_map = estimator, settings, score_map
+        self._landmarks = landmarks
         self._parts: list[Part] | None = None
         self.report = DetectionReport()
 
@@ -288,9 +297,9 @@ class PeopleFinder:
         self.report.unsure += len(found.score) - len(distinct.score)
         best = np.sort(np.argsort(-distinct.score, kind="stable")[: settings.max_people])
         kept = distinct.select(best)
-        if self._score_map is None:
-            return kept
-        return replace(kept, score=self._score_map.probability(kept.score))
+        if self._score_map is not None:
+            kept = replace(kept, score=self._score_map.probability(kept.score))
+        return kept if self._landmarks is None else self._landmarks.add_points(image, kept)
 
     def _chunk(self, numbers: list[int], rows: list[KeypointDetections]) -> KeypointDetections:
         """Return the detections of frames in one record, padded to `max_people` with NaN."""
@@ -302,6 +311,13 @@ class PeopleFinder:
             score=np.full(shape, np.nan, dtype=np.float32),
             frame=np.array(numbers, dtype=np.int64),
         )
+        if self._landmarks is not None:
+            points = self._landmarks.points
+            chunk = chunk.add_points(
+                points,
+                np.full((*shape, len(points), 2), np.nan, dtype=np.float32),
+                np.full((*shape, len(points)), np.nan, dtype=np.float32),
+            )
         for row, found in enumerate(rows):
             count = len(found.score)
             for name, values in found.arrays().items():
@@ -333,7 +349,11 @@ def detect_people(
         InputError: a net or its file is missing or invalid.
     """
     finder = PeopleFinder(
-        load_detectors(settings), load_pose(settings), settings, load_score_map(settings)
+        load_detectors(settings),
+        load_pose(settings),
+        settings,
+        load_score_map(settings),
+        load_landmarks(settings),
     )
     place = None if camera is None or pitch is None else Place(camera, pitch)
     chunks = list(finder.find(enumerate(images), place))

@@ -76,6 +76,10 @@ class DetectionSettings(Record):
     """The embedded pose net also searches boxes shifted to the side of every detected person, where
     a detector sees the person in front alone. This finds more people, and more false boxes that are
     half of two people; poses take twice as long. Not with `flip_test` or another pose net."""
+    landmarks: bool = False
+    """A second net also finds 64 landmarks of the surface, heels and toes. It takes as long as the
+    net of joints, which stay as they are. Off: bodies hardly get better by these points yet
+    (docs/results/measured.md)."""
     min_keypoint_confidence: float = Field(default=0.05, ge=0, lt=1)
     """A keypoint below this confidence was not found [1]."""
     oks_nms: float = Field(default=0.85, ge=1e-6, le=1)

@@ -130,6 +130,7 @@ def keypoint_batch(
     cache: PictureCache,
     settings: KeypointCrops,
     rng: np.random.Generator,
+    flip: Sequence[int] = COCO17_FLIP,
 ) -> KeypointBatch:
     """Return a batch; the same generator gives the same one.
 
@@ -138,13 +139,14 @@ def keypoint_batch(
         cache: reads their images.
         settings: number and augmentation of the crops.
         rng: draws people, errors of boxes and augmentations.
+        flip: (points,) number of each point's mirror image, for labels of other points than joints.
     """
     count = settings.crops
     crops = np.empty((count, CROP[1], CROP[0], 3), dtype=np.uint8)
     cells = (CROP[1] // MAP_CELL, CROP[0] // MAP_CELL)
     around = np.empty((count, MAP_COUNT, *cells), np.float32)
-    keypoints = np.empty((count, 17, 2), dtype=np.float32)
-    visible = np.empty((count, 17), dtype=np.int8)
+    keypoints = np.empty((count, len(flip), 2), dtype=np.float32)
+    visible = np.empty((count, len(flip)), dtype=np.int8)
     tolerance = np.empty(count, dtype=np.float32)
     boxes = np.full((count, 4), np.nan, dtype=np.float32)
     all_boxes = np.full((count, MAX_NEIGHBOURS, 4), np.nan, dtype=np.float32)
@@ -173,7 +175,7 @@ def keypoint_batch(
         if rng.random() < settings.smaller and tall > settings.min_height:
             farther = tall / np.exp(rng.uniform(np.log(settings.min_height), np.log(tall)))
         seen = _cut_shrunk(cache[labelled.path], mapping, crop[2] / farther)
-        order = np.array(COCO17_FLIP) if mirrored else slice(None)
+        order = np.array(flip) if mirrored else slice(None)
         pixels = (labelled.keypoints[person][order] - mapping[:, 2]) @ np.linalg.inv(
             mapping[:, :2]
         ).T

@@ -52,6 +52,29 @@ def test_the_shipped_recipe_goes_on_where_it_was_killed_and_ends_with_the_same_w
     assert said.count("resumes after step 1") == 2
 
 
+@pytest.mark.slow
+def test_the_recipe_of_landmarks_gives_weights_that_state_their_errors(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE)
+    recipe = importlib.import_module("landmarks")
+    scenes = {name: (kind, count, 1, 1) for name, (kind, count, _, _) in recipe.SCENES.items()}
+    monkeypatch.setattr(recipe, "SCENES", scenes)
+    said = []
+    monkeypatch.setattr(recipe, "say", said.append)
+    recipe.main(tmp_path, ["scenes", "train", "score"], 1e-3)
+    first = (tmp_path / "embedded_landmarks.safetensors").read_bytes()
+    scores = json.loads((tmp_path / "landmark_scores.json").read_text())
+    assert scores["in_95_visible"] > 0.6  # of other images than those that it was scaled on
+    assert any(line.startswith("standard deviations times") for line in said)
+    # Phases that are done are read, with the same result.
+    before = len(said)
+    recipe.main(tmp_path, ["train"], 1e-3)
+    assert (tmp_path / "embedded_landmarks.safetensors").read_bytes() == first
+    assert not any("loss" in line for line in said[before:])
+    flip = recipe.FLIP
+    assert [flip[other] for other in flip] == list(range(len(flip)))
+    assert all(other != point for point, other in enumerate(flip))
+
+
 @pytest.fixture
 def real_frames(monkeypatch):
     monkeypatch.syspath_prepend(RECIPE)

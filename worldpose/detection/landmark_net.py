@@ -1,0 +1,199 @@
+"""The net that ships with the project for landmarks of the body's surface, heels and toes.
+
+It takes the crops and maps of the bundled keypoint net and has that net's features, but other
+heads: a map of each landmark's position, its standard deviation, and whether it is visible. It
+learned from renderings of the body model alone (infra/embedded_detector). Needs torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from data_contracts.arrays import Floats, Image
+from data_contracts.conventions import FEET
+from data_contracts.keypoints import KeypointDetections
+from worldpose.body.keypoints import LANDMARKS
+from worldpose.detection.bundled_nets import (
+    CELL,
+    CROP,
+    MAP_COUNT,
+    Block,
+    Pyramid,
+    QuantizedNet,
+    peaks,
+    placed_net,
+)
+from worldpose.detection.bundled_pose import (
+    BATCH,
+    MAP_CELL,
+    SAME_PERSON_IOU,
+    crops_around,
+    cut_crop,
+    frame_from_crop,
+    surroundings,
+)
+from worldpose.geometry.boxes import box_iou
+
+POINTS: Final = (*LANDMARKS, *FEET)
+"""Points of the net in order: landmarks of the surface, then heels and toes."""
+MAX_ERROR_SHARE: Final = 0.05
+"""Largest error of a correct point, as a share of the box's longer side [1]; as for joints."""
+MIN_VISIBLE: Final = 0.5
+"""Points that are less probably visible are missing [1]."""
+
+
+class SeenLandmarks(NamedTuple):
+    """Output of the net for crops.
+
+    Attributes:
+        maps: logits of each point's position (batch, points, rows, columns); a softmax over the
+            cells of a map gives probabilities.
+        doubt: logarithm of the standard deviation from the crop as a whole (batch, points).
+        visible: logits that points are visible (batch, points).
+        trust: weight of the logarithm of a map's extent in that of the standard deviation
+            (points,).
+    """
+
+    maps: Tensor
+    doubt: Tensor
+    visible: Tensor
+    trust: Tensor
+
+    def decode(self) -> tuple[Tensor, Tensor]:
+        """Return positions (batch, points, 2) and standard deviations per axis [px of the crop]."""
+        places, extent = locate(self.maps)
+        return places, torch.exp(self.doubt + self.trust * extent)
+
+
+def locate(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions and the logarithms of the extents of maps around them.
+
+    Args:
+        maps: (batch, points, rows, columns) logits.
+
+    Returns:
+        Positions (batch, points, 2) [px of the crop], and the logarithm of the root mean square
+        distance per axis of a map's probability from there (batch, points) [log px].
+    """
+    places, _ = peaks(maps)
+    rows, columns = maps.shape[-2:]
+    chance = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
+    x, y = (CELL * torch.arange(n, device=maps.device) + 0.5 * (CELL - 1) for n in (columns, rows))
+    across = (chance.sum(dim=2) * (x - places[..., :1]).square()).sum(dim=-1)
+    down = (chance.sum(dim=3) * (y - places[..., 1:]).square()).sum(dim=-1)
+    return places, 0.5 * torch.log(0.5 * (across + down) + 1e-3)
+
+
+class LandmarkNet(nn.Module):
+    """Net for points of the body's surface of the person in a crop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        stem = nn.Sequential(Block(3, 16, stride=2), Block(16, 32, stride=2))
+        self.pyramid = Pyramid(stem, (32, 64, 128), (2, 2, 2))
+        self.around = nn.Conv2d(MAP_COUNT, 32, 3, padding=1, bias=False)
+        self.head = nn.Sequential(Block(32, 96), nn.Conv2d(96, CELL**2 * len(POINTS), 1))
+        self.doubt = nn.Linear(128, len(POINTS))
+        self.trust = nn.Parameter(torch.ones(len(POINTS)))
+        self.visible = nn.Sequential(nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, len(POINTS)))
+
+    def forward(self, crops: Tensor, surroundings: Tensor) -> SeenLandmarks:
+        """Return the net's output for crops; arguments as of `bundled_nets.KeypointNet`."""
+        features, coarsest = self.pyramid(crops, self.around(surroundings))
+        maps = functional.pixel_shuffle(self.head(features), CELL)
+        whole = coarsest.float().mean(dim=(2, 3))
+        # The uncertainty of a point must not change the features that find it.
+        return SeenLandmarks(
+            maps.float(), self.doubt(whole.detach()), self.visible(whole), self.trust
+        )
+
+
+class LandmarkEstimator:
+    """Estimates points of the surface of people whose boxes are known.
+
+    Attributes:
+        points: names of the points.
+    """
+
+    points = POINTS
+
+    def __init__(
+        self, net: LandmarkNet | QuantizedNet, device: str = "cpu", half: bool = False
+    ) -> None:
+        self._net = placed_net(net, device, half)
+
+    def add_points(self, image: Image, people: KeypointDetections) -> KeypointDetections:
+        """Return the people of a frame with `POINTS`.
+
+        Confidence is the probability that a point is correct, from its standard deviation: within
+        a twentieth of the box's longer side, as for joints. Points that are probably not visible
+        are missing.
+
+        Args:
+            image: the whole frame.
+            people: (people,) with boxes.
+        """
+        found = self.estimate(image, np.asarray(people.boxes, dtype=np.float64))
+        sides = people.boxes[:, 2:] - people.boxes[:, :2]
+        tolerance = MAX_ERROR_SHARE * sides.max(axis=1, initial=0.0)[:, None]
+        confidence = np.clip(-np.expm1(-0.5 * (tolerance / found.std) ** 2), 1e-3, 1.0)
+        shown = found.visible >= MIN_VISIBLE
+        return people.add_points(
+            POINTS,
+            np.where(shown[..., None], found.places, np.nan),
+            np.where(shown, confidence, np.nan),
+        )
+
+    def estimate(self, image: Image, boxes: Floats) -> Landmarks:
+        """Return the points of the person in each box.
+
+        Args:
+            image: the whole frame.
+            boxes: (people, 4) x0, y0, x1, y1 [px].
+        """
+        shape = (len(boxes), len(POINTS))
+        found = Landmarks(np.empty((*shape, 2)), np.empty(shape), np.empty(shape))
+        shares = box_iou(boxes, boxes)
+        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
+        cells = CROP[1] // MAP_CELL, CROP[0] // MAP_CELL
+        for start in range(0, len(maps), BATCH):
+            part = maps[start : start + BATCH]
+            crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
+            around = np.zeros((BATCH, MAP_COUNT, *cells), dtype=np.float32)
+            for index, mapping in enumerate(part):
+                person = start + index
+                others = boxes[shares[person] <= SAME_PERSON_IOU]
+                crops[index] = cut_crop(image, mapping, CROP)
+                around[index] = surroundings(boxes[person], others, mapping, CROP)
+            with torch.inference_mode():
+                seen = SeenLandmarks(*self._net(crops, around))
+                decoded = (*seen.decode(), torch.sigmoid(seen.visible))
+            places, std, visible = (each.double().cpu().numpy() for each in decoded)
+            for index, mapping in enumerate(part):
+                person = start + index
+                scale = float(np.sqrt(abs(np.linalg.det(mapping[:, :2]))))
+                found.places[person] = places[index] @ mapping[:, :2].T + mapping[:, 2]
+                found.std[person] = scale * std[index]
+                found.visible[person] = visible[index]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Points of the surface of people in one frame.
+
+    Attributes:
+        places: (people, points, 2) [px].
+        std: (people, points) standard deviation per axis [px].
+        visible: (people, points) probability that the surface there is visible [1].
+    """
+
+    places: Floats
+    std: Floats
+    visible: Floats
