@@ -95,6 +95,21 @@ class Cost:
     total: int
 
 
+def stage_spans(project: Path, folder: Path) -> dict[str, tuple[float, float]]:
+    """Return start of the first and end of the last unit of each stage of the latest run [s]."""
+    store = Store.open(str(project))
+    record = store.run(read_match(folder).spec.match_id, "latest")
+    spans: dict[str, tuple[float, float]] = {}
+    for name in record.executed:
+        stage, _, unit = name.partition("/")
+        manifest = store.manifest(record.match_id, stage, unit, record.results[name])
+        last = manifest.created_at.timestamp()
+        first = (manifest.created_at - timedelta(seconds=manifest.seconds)).timestamp()
+        known = spans.get(stage, (first, last))
+        spans[stage] = min(first, known[0]), max(last, known[1])
+    return spans
+
+
 def measure(folder: Path, project: Path) -> dict[str, Cost]:
     """Run a match in a new project and return the cost of its stages and of `all`."""
     command = [str(WORLDPOSE), "run", str(folder), "--project", str(project)]
@@ -110,16 +125,7 @@ def measure(folder: Path, project: Path) -> dict[str, Cost]:
     whole = time.time() - begin
     if code != 0:
         raise SystemExit(f"{' '.join(command)} ended with {code}: see {log.name}")
-    store = Store.open(str(project))
-    record = store.run(read_match(folder).spec.match_id, "latest")
-    spans: dict[str, tuple[float, float]] = {}
-    for name in record.executed:
-        stage, _, unit = name.partition("/")
-        manifest = store.manifest(record.match_id, stage, unit, record.results[name])
-        last = manifest.created_at.timestamp()
-        first = (manifest.created_at - timedelta(seconds=manifest.seconds)).timestamp()
-        known = spans.get(stage, (first, last))
-        spans[stage] = min(first, known[0]), max(last, known[1])
+    spans = stage_spans(project, folder)
     costs = {
         stage: Cost(last - first, *memory.peak(first, last))
         for stage, (first, last) in sorted(spans.items(), key=lambda item: item[1])
