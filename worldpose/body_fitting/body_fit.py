@@ -45,7 +45,6 @@ from worldpose.body_fitting.solver import (
     Shapes,
     Solver,
     fit_shapes,
-    pose_covariance,
 )
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
@@ -60,9 +59,6 @@ KEPT_BIAS: Final = 0.01
 model the rest."""
 MAX_OFFSET: Final = 3.0
 """Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
-THREAD_FRAMES: Final = 10_000
-"""Frames of a clip up to which two people are solved at the same time: the equations of a track
-take 60 KB per frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +186,9 @@ def fit_bodies(
 
     def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
         own, span = by_person[person], spans[person]
-        pose, track = solver.solve_poses(own, shapes.people[person], shapes.offsets, fps, prior)
-        points, random = pose_covariance(track, pose, shapes.offsets)
+        pose, points, random = solver.solve_windows(
+            own, shapes.people[person], shapes.offsets, fps, prior
+        )
         spread = random[:, :17] + bias[:, None, None] ** 2 * np.eye(3)
         determined = None if extra is None else extra.determined[person]
         own_joints = points[:, :17], spread
@@ -199,8 +196,7 @@ def fit_bodies(
         if extra is not None:
             extra.put(person, span, bodies, random[:, 17:])
 
-    # Tracks of many minutes need gigabytes each: one at a time.
-    for _ in (map_in_threads if frames <= THREAD_FRAMES else map)(fit_person, spans):
+    for _ in map_in_threads(fit_person, spans):
         pass
     if evidence.monocular_poses is not None:
         priors = _monocular_priors(

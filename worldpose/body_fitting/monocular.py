@@ -257,6 +257,12 @@ class MonocularPrior:
     """(frames,) share of the variance left after correction by known frames (`carry_errors`)
     [1]."""
 
+    def of(self, part: slice) -> MonocularPrior:
+        """Return the poses of some frames."""
+        left = self.left if isinstance(self.left, float) else self.left[part]
+        own = self.orient[part], self.angles[part], self.used[part]
+        return MonocularPrior(*own, self.precision, self.correlated_frames, left)
+
     def normal_equations(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
         """Return matrices (frames, 33, 33), gradient (frames, 33) and cost for a pose.
 

@@ -11,7 +11,8 @@ seconds of each person are used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -54,6 +55,11 @@ accelerates as one: the search may count them all, the covariance of its poses m
 DAMPING: Final = 0.01
 """Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
 direction that uncertain."""
+WINDOW_FRAMES: Final = 3000
+"""Frames of a person that are solved together: their equations take 60 KB per frame."""
+MARGIN_S: Final = 3.0
+"""Time before and after a window that is solved with it [s]. Motion ties a pose to those within
+some tenths of a second."""
 UNRELATED_ACCELERATION: Final = 1e9
 """Acceleration of a body whose frames say nothing of each other [m/s^2]."""
 
@@ -108,6 +114,50 @@ class Solver:
             searched = guided if costs[1] < costs[0] else searched
         return searched
 
+    def solve_windows(
+        self,
+        evidence: Evidence,
+        shape: Shape,
+        offsets: Floats,
+        fps: float,
+        monocular_prior: MonocularPrior | None = None,
+    ) -> tuple[Pose, Floats, Floats]:
+        """Return one person's poses, and their points and covariance as in `pose_covariance`.
+
+        A long track is solved in overlapping windows, so that memory does not grow with it. Where
+        a window begins or ends without any observation, bodies mean nothing.
+        """
+        frames = len(evidence.joints)
+        pose = Pose(
+            np.zeros((frames, 3)),
+            np.zeros((frames, 3)),
+            np.tile(self.prior.mean, (frames, 1)),
+            shape.betas,
+        )
+        alone = Pose(pose.transl[:1], pose.orient[:1], pose.angles[:1], shape.betas)
+        still = self.chained.differentiate(alone.parameters()).keypoints
+        points = np.tile(still, (frames, 1, 1))
+        spread = np.zeros((*points.shape, 3))
+        known = evidence.known.any(axis=1)
+        for part, kept in _windows(frames, fps, self.settings):
+            seen = part.start + np.flatnonzero(known[part])
+            if not len(seen):
+                continue
+            own = slice(int(seen[0]), int(seen[-1]) + 1)
+            solved, track = self.solve_poses(
+                Evidence(evidence.joints[own], evidence.information[own]),
+                shape,
+                offsets,
+                fps,
+                None if monocular_prior is None else monocular_prior.of(own),
+            )
+            found, errors = pose_covariance(track, solved, offsets)
+            to = slice(max(kept.start, own.start), min(kept.stop, own.stop))
+            of = slice(to.start - own.start, to.stop - own.start)
+            pose.transl[to], pose.orient[to] = solved.transl[of], solved.orient[of]
+            pose.angles[to], points[to], spread[to] = solved.angles[of], found[of], errors[of]
+        return pose, points, spread
+
     def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
         """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
         for step in range(self.settings.steps):
@@ -148,6 +198,19 @@ class Solver:
             level = slice(None) if seen is None else ~seen[:, foot - 7]
             angles[level, foot - 1] = Rigid(turned[level], np.zeros(3)).rotvec
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
+
+
+def _windows(
+    frames: int, fps: float, settings: BodyFittingSettings
+) -> Iterator[tuple[slice, slice]]:
+    """Yield frames that are solved together, and those of them that are kept."""
+    margin = math.ceil(max(MARGIN_S, 2.0 * settings.max_filled_gap_s) * fps)
+    size = max(WINDOW_FRAMES, 2 * margin)
+    starts = range(0, frames, size) if frames > size + margin else (0,)
+    for start in starts:
+        stop = start + size if len(starts) > 1 and start + size < frames else frames
+        first, last = max(0, start - margin), min(frames, stop + margin)
+        yield slice(first, last), slice(start, stop)
 
 
 def _take_step(track: Track, pose: Pose, offsets: Floats) -> Pose:

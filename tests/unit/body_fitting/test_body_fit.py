@@ -5,7 +5,13 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from worldpose.body import BodyParameters
-from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies, report_fit
+from worldpose.body_fitting import (
+    BodyFittingSettings,
+    ClipEvidence,
+    fit_bodies,
+    report_fit,
+    solver,
+)
 from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import InputError
 
@@ -73,6 +79,29 @@ def test_gaps_are_filled_marked_and_less_sure():
     error = np.linalg.norm(fit.joints - KEYPOINTS(truth)[:, None], axis=-1)
     # 0.2 s of a stride, interpolate_gaps by its ends.
     assert error[25:35].mean() < 0.10
+
+
+def test_long_tracks_are_solved_in_windows_with_the_same_result(monkeypatch):
+    rng = np.random.default_rng(11)
+    truth = walker(1300, rng)
+    joints, covariance = seen(truth, 0.03, rng)
+    joints[200:1100] = np.nan  # no window of 300 frames and its margins sees frames 600 to 900
+    joints[1200:1230, 0, :9] = np.nan
+    evidence = ClipEvidence(joints, covariance, 50.0)
+    whole = fit_bodies(MODEL, evidence, SETTINGS)
+    monkeypatch.setattr(solver, "WINDOW_FRAMES", 300)
+    fit = fit_bodies(MODEL, evidence, SETTINGS)
+    gone = np.isnan(fit.joints[:, 0, 0, 0])
+    np.testing.assert_array_equal(gone, np.isnan(whole.joints[:, 0, 0, 0]))
+    np.testing.assert_array_equal(np.flatnonzero(gone), np.arange(200, 1100))
+    # At a gap that a whole window lies in, motion is not carried over from the other side.
+    far = ~gone & ((np.arange(1300) < 140) | (np.arange(1300) >= 1160))
+    np.testing.assert_allclose(fit.joints[far], whole.joints[far], atol=1e-6)
+    np.testing.assert_allclose(fit.covariance[far], whole.covariance[far], rtol=2e-3, atol=1e-10)
+    near = ~gone & ~far
+    exact = KEYPOINTS(truth)[near, None]
+    errors = [np.linalg.norm(one.joints[near] - exact, axis=-1).mean() for one in (whole, fit)]
+    assert errors[1] < 1.05 * errors[0]
 
 
 def test_stated_regions_hold_the_true_joints_in_sight_and_in_gaps():
