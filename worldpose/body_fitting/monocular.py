@@ -12,7 +12,7 @@ an inaccurate method gets almost no weight, and an accurate one helps.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -259,9 +259,13 @@ class MonocularPrior:
 
     def of(self, part: slice) -> MonocularPrior:
         """Return the poses of some frames."""
-        left = self.left if isinstance(self.left, float) else self.left[part]
-        own = self.orient[part], self.angles[part], self.used[part]
-        return MonocularPrior(*own, self.precision, self.correlated_frames, left)
+        return replace(
+            self,
+            orient=self.orient[part],
+            angles=self.angles[part],
+            used=self.used[part],
+            left=self.left if isinstance(self.left, float) else self.left[part],
+        )
 
     def normal_equations(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
         """Return matrices (frames, 33, 33), gradient (frames, 33) and cost for a pose.

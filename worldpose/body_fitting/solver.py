@@ -138,7 +138,7 @@ class Solver:
         still = self.chained.differentiate(alone.parameters()).keypoints
         points = np.tile(still, (frames, 1, 1))
         spread = np.zeros((*points.shape, 3))
-        known = evidence.known.any(axis=1)
+        known = np.asarray(evidence.known.any(axis=1))
         for part, kept in _windows(frames, fps, self.settings):
             seen = part.start + np.flatnonzero(known[part])
             if not len(seen):
