@@ -260,8 +260,8 @@ def main() -> None:
     for views in PUBLISHED:
         counts = [result[name][views] for name in ("results", "extra", "false", "unknown")]
         print(
-            f"{views} views: {counts[0]} results, {counts[1]} beyond the people annotated in 3D, "
-            f"of whom {counts[2]} are false and {counts[3]} cannot be judged"
+            f"{views} views: {counts[0]} results, {counts[1]} beyond the people annotated in 3D; "
+            f"{counts[2]} of these are false and {counts[3]} cannot be judged"
         )
 
 
