@@ -124,8 +124,9 @@ class Solver:
     ) -> tuple[Pose, Floats, Floats]:
         """Return one person's poses, and their points and covariance as in `pose_covariance`.
 
-        A long track is solved in overlapping windows, so that memory does not grow with it. Where
-        a window begins or ends without any observation, bodies mean nothing.
+        A long track is solved in overlapping windows, so that the memory of its equations does not
+        grow with it. Where a window begins or ends without any observation, or its kept frames
+        have none, bodies mean nothing.
         """
         frames = len(evidence.joints)
         pose = Pose(
@@ -141,7 +142,7 @@ class Solver:
         known = np.asarray(evidence.known.any(axis=1))
         for part, kept in _windows(frames, fps, self.settings):
             seen = part.start + np.flatnonzero(known[part])
-            if not len(seen):
+            if not ((seen >= kept.start) & (seen < kept.stop)).any():
                 continue
             own = slice(int(seen[0]), int(seen[-1]) + 1)
             solved, track = self.solve_poses(
