@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic
+from typing import Any, Generic, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,6 +264,17 @@ class KeypointDetections(Generic[Array]):
             keypoints[..., to, :] = self.extra_keypoints[..., of, :]
             confidence[..., to] = self.extra_confidence[..., of]
         return replace(self, points=points, extra_keypoints=keypoints, extra_confidence=confidence)
+
+
+class TrackedFrames(Protocol):
+    """Detections of tracked people that are read by frames; `KeypointDetections` are some."""
+
+    @property
+    def detection_index(self) -> NDArray[np.integer]:
+        """(frames, cameras, persons), as of `KeypointDetections`."""
+
+    def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
+        """Return the detections in some frames, in memory."""
 
 
 KEYPOINT_LABELS: dict[str, tuple[str, ...]] = {

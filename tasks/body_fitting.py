@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, GroupLayout
+from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Recipe, Work
-from tasks.clip_inputs import ClipInputs, open_clip
+from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip
+from tasks.spool import open_spool
 from tasks.triangulation import camera_errors, load_triangulation_settings
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.body import BodyModel, digest_of_body, find_body
@@ -23,6 +24,7 @@ from worldpose.body_fitting import (
     BodyFit,
     BodyFittingSettings,
     ClipEvidence,
+    FitMetrics,
     Ground,
     MonocularPoses,
     RayConstraints,
@@ -31,14 +33,16 @@ from worldpose.body_fitting import (
     compare_held_out,
     far_offsets,
     find_ray_constraints,
-    fit_bodies,
-    report_fit,
+    fit_in_windows,
 )
 from worldpose.errors import InputError
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import ExtraJoints, undo_swaps
+
+MEASURED_FRAMES: Final = 3300
+"""Frames of a clip from which medians of metrics are computed."""
 
 
 @unit_task
@@ -47,8 +51,7 @@ def body_fitting(work: Work) -> str:
     store = Store.open(work.project)
     with store.publish(work) as result:
         people = open_people(store, work)
-        model, fit = fit_people(people, work.recipe)
-        publish_fit(result, BODY_FITTING, people, model, fit)
+        fit = publish_fit(store, result, BODY_FITTING, people, work.recipe)
         result.figures.update(_compare_with_joints(store, work, people, fit))
     return work.key
 
@@ -67,7 +70,7 @@ def _compare_with_joints(
         SeenClip(
             clip.cameras,
             camera_errors(work, clip),
-            people.detections,
+            people,
             load_triangulation_settings(store, placed.recipe, unit),
             clip.fps,
         ),
@@ -76,48 +79,137 @@ def _compare_with_joints(
     return {} if held_out is None else held_out.figures()
 
 
-@dataclass(frozen=True, eq=False)
+Views = Callable[[slice], tuple[RayConstraints, MonocularPoses | None]]
+"""Lines of sight and monocular poses of a moving camera in some frames."""
+
+
 class ClipPeople:
-    """Observations of the people of one clip by the static cameras.
+    """Observations of the people of one clip by the static cameras, read by frames.
 
     Attributes:
-        clip: cameras, frames and clock.
-        detections: detections of these people, as triangulated: left-right swaps are undone.
+        clip: cameras, detections, frames and clock.
         person: (persons,) ids.
-        joints: (frames, persons, 17, 3) [m], world, triangulated.
-        covariance: (frames, persons, 17, 3, 3) [m^2].
-        shared_covariance: (frames, persons, 3, 3) [m^2], the part of it that moves all joints
-            together.
-        common_bias: (17,) per axis, systematic error shared by all views [m]; in `covariance`.
-        extra: points besides COCO-17, triangulated; None without any.
+        common_bias: (17,) per axis, systematic error shared by all views [m]; in the covariance of
+            joints.
+        views: a moving camera; None without one.
     """
 
-    clip: ClipInputs
-    detections: KeypointDetections
-    person: NDArray[np.integer]
-    joints: Floats
-    covariance: Floats
-    shared_covariance: Floats
-    common_bias: Floats
-    extra: ExtraJoints | None
+    def __init__(self, clip: ClipInputs, placed: xr.Dataset, views: Views | None = None) -> None:
+        """Open the people.
+
+        Args:
+            clip: cameras and tracked people.
+            placed: the people's triangulated joints.
+            views: a moving camera.
+        """
+        self.clip = clip
+        self.person: NDArray[np.integer] = placed["person"].values
+        self.common_bias: Floats = placed["common_bias"].values
+        self.views = views
+        self._placed = placed
+        self._exchanged = ChunkedRows(placed["exchanged"])
+        self._last: tuple[slice, ClipEvidence] | None = None
+        self._whole: tuple[slice, ClipEvidence] | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of frames and of persons."""
+        return len(self.clip.detections.frame), len(self.person)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of match time [1/s]."""
+        return self.clip.fps
+
+    @property
+    def stride(self) -> int:
+        """Of this many frames, medians of metrics use one."""
+        return max(1, -(-self.size[0] // MEASURED_FRAMES))
+
+    @property
+    def detection_index(self) -> NDArray[np.integer]:
+        """(frames, cameras, persons), each tracked person's detection; -1 = not seen."""
+        return self.clip.detections.detection_index
+
+    def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
+        """Return the detections in some frames, as triangulated: left-right swaps are undone."""
+        rows = np.arange(self.size[0])[frames]
+        if isinstance(frames, slice):
+            exchanged = self._exchanged[slice(int(rows[0]), int(rows[-1]) + 1)]
+        else:
+            exchanged = self._placed["exchanged"].isel(frame=rows).values
+        return undo_swaps(self.clip.detections[rows], exchanged)
+
+    def read_joints(self, frames: slice) -> ClipEvidence:
+        """Return the triangulated joints and points of some frames."""
+        if self._last is None or not _holds(self._last[0], frames):
+            placed = self._placed.isel(frame=frames)
+            self._last = (
+                frames,
+                ClipEvidence(
+                    placed["joints"].values,
+                    placed["covariance"].values,
+                    self.fps,
+                    common_bias=self.common_bias,
+                    shared_covariance=placed["shared_covariance"].values,
+                    extra=extra_joints(placed),
+                ),
+            )
+        return _part(self._last, frames)
+
+    def read(self, frames: slice) -> ClipEvidence:
+        """Return all evidence in some frames."""
+        if self._whole is None or not _holds(self._whole[0], frames):
+            placed = self.read_joints(frames)
+            alone = find_ray_constraints(self.clip.cameras, _Frames(self, frames), placed.joints)
+            views, monocular = [alone], None
+            if self.views is not None:
+                moving, monocular = self.views(frames)
+                views.append(moving)
+            self._whole = (
+                frames,
+                replace(placed, ray_constraints=views, monocular_poses=monocular),
+            )
+        return _part(self._whole, frames)
 
 
-def open_people(store: Store, work: Work) -> ClipPeople:
-    """Read the tracked and triangulated people of the clip of `work`."""
-    clip = open_clip(store, work)
+def _holds(held: slice, frames: slice) -> bool:
+    return bool(held.start <= frames.start and frames.stop <= held.stop)
+
+
+def _part(read: tuple[slice, ClipEvidence], frames: slice) -> ClipEvidence:
+    held, evidence = read
+    if held == frames:
+        return evidence
+    return evidence.read(slice(frames.start - held.start, frames.stop - held.start))
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Detections of some frames of a clip, read when needed."""
+
+    people: ClipPeople
+    frames: slice
+
+    @property
+    def detection_index(self) -> NDArray[np.integer]:
+        """(frames, cameras, persons), as of `ClipPeople`."""
+        return self.people.detection_index[self.frames]
+
+    def __getitem__(self, frames: slice | Integers) -> KeypointDetections:
+        """Return the detections in some of these frames."""
+        if isinstance(frames, slice):
+            first = self.frames.start
+            return self.people[slice(first + frames.start, first + frames.stop)]
+        return self.people[self.frames.start + frames]
+
+
+def open_people(store: Store, work: Work, views: Views | None = None) -> ClipPeople:
+    """Open the tracked and triangulated people of the clip of `work`."""
     placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
     tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
-    detections = clip.detections[:].assign_people(tracks["detection_index"].values)
-    return ClipPeople(
-        clip,
-        undo_swaps(detections, placed["exchanged"].values),
-        placed["person"].values,
-        placed["joints"].values,
-        placed["covariance"].values,
-        placed["shared_covariance"].values,
-        placed["common_bias"].values,
-        extra_joints(placed),
-    )
+    clip = open_clip(store, work).assign_people(tracks["detection_index"].values)
+    return ClipPeople(clip, placed, views)
 
 
 def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
@@ -131,44 +223,6 @@ def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
         placed["extra_views"].values,
         placed["extra_common_bias"].values,
     )
-
-
-def fit_people(
-    people: ClipPeople,
-    recipe: Recipe,
-    *,
-    views: Sequence[RayConstraints] = (),
-    monocular_poses: MonocularPoses | None = None,
-    known: Mapping[int, Shape] | None = None,
-) -> tuple[BodyModel, BodyFit]:
-    """Fit a clip's bodies.
-
-    Args:
-        people: people of the clip.
-        recipe: recipe of this stage: its settings, body model and pitch.
-        views: ray constraints of further cameras.
-        monocular_poses: monocular poses (S4).
-        known: shapes from other clips, by person index.
-    """
-    model, settings, ground = _fitting_basis(people, recipe)
-    alone = find_ray_constraints(people.clip.cameras, people.detections, people.joints)
-    fit = fit_bodies(
-        model,
-        ClipEvidence(
-            people.joints,
-            people.covariance,
-            people.clip.fps,
-            ray_constraints=[alone, *views],
-            monocular_poses=monocular_poses,
-            common_bias=people.common_bias,
-            shared_covariance=people.shared_covariance,
-            extra=people.extra,
-        ),
-        settings,
-        ground,
-        known_shapes=known,
-    )
-    return model, fit
 
 
 def _fitting_basis(
@@ -185,44 +239,75 @@ def _fitting_basis(
     return find_same_body(settings.body_model, sources["body_model_sha256"]), settings, ground
 
 
+@dataclass
+class FurtherArrays:
+    """Arrays of a result besides those of bodies.
+
+    Attributes:
+        of_part: arrays of consecutive frames, given these, their bodies, and the evidence about
+            them.
+        arrays: arrays without frames.
+        attributes: attributes of the group.
+        known_shapes: shapes from other clips, by person index.
+    """
+
+    of_part: Callable[[slice, BodyFit, ClipEvidence], Mapping[str, NDArray[Any]]]
+    arrays: Mapping[str, NDArray[Any]]
+    attributes: Mapping[str, Any]
+    known_shapes: Mapping[int, Shape]
+
+
 def publish_fit(
+    store: Store,
     result: ResultWriter,
     layout: GroupLayout,
     people: ClipPeople,
-    model: BodyModel,
-    fit: BodyFit,
-    further: Mapping[str, NDArray[Any]] | None = None,
-    attributes: Mapping[str, Any] | None = None,
-) -> None:
-    """Write bodies, the arrays in `further`, the group's other attributes, and their metrics."""
-    extra: dict[str, NDArray[Any]] = {}
-    points: dict[str, list[str]] = {}
-    if fit.extra is not None:
-        points = {"point": list(fit.extra.points)}
-        extra = {
-            "extra_joints": fit.extra.joints,
-            "extra_covariance": fit.extra.covariance,
-            "extra_offsets": fit.extra.offsets,
-        }
-    result.write(
-        layout,
-        arrays={
+    recipe: Recipe,
+    further: FurtherArrays | None = None,
+) -> BodyFit:
+    """Fit the bodies of a clip in windows, and write them with their metrics.
+
+    Args:
+        store: the store.
+        result: writer of the result.
+        layout: its layout.
+        people: people of the clip.
+        recipe: recipe of `body_fitting`: its settings, body model and pitch.
+        further: what a result has besides bodies.
+
+    Returns:
+        Bodies of the last window, with the shapes and offsets of the clip.
+    """
+    model, settings, ground = _fitting_basis(people, recipe)
+    known = {} if further is None else further.known_shapes
+    metrics = FitMetrics(people.fps, people.stride)
+    windows = fit_in_windows(model, people, settings, ground, known)
+    with open_spool(store) as spool:
+        for part, fit in windows:
+            spool.add(_part_arrays(fit))
+            evidence = people.read(part)
+            if further is not None:
+                spool.add(further.of_part(part, fit, evidence))
+            metrics.add(fit, evidence.joints, (people.clip.cameras, _Frames(people, part)))
+        whole = {
             "betas": fit.betas,
             "betas_covariance": fit.betas_covariance,
-            "global_orient": fit.parameters.global_orient,
-            "body_pose": fit.parameters.body_pose,
-            "transl": fit.parameters.transl,
-            "joints": fit.joints,
-            "covariance": fit.covariance,
-            "filled": fit.filled,
-            "guided": fit.guided,
             "joint_offsets": fit.offsets,
-            **extra,
-            **(further or {}),
-        },
-        coordinates={"frame": people.detections.frame, "person": people.person},
-        attributes={"body_model": model.name, **points, **(attributes or {})},
-    )
+        }
+        points: dict[str, list[str]] = {}
+        if fit.extra is not None:
+            whole["extra_offsets"] = fit.extra.offsets
+            points = {"point": list(fit.extra.points)}
+        result.write(
+            layout,
+            arrays=spool.arrays() | whole | dict({} if further is None else further.arrays),
+            coordinates={"frame": people.clip.detections.frame, "person": people.person},
+            attributes={
+                "body_model": model.name,
+                **points,
+                **({} if further is None else further.attributes),
+            },
+        )
     far = far_offsets(fit.offsets, people.common_bias)
     if far:
         joints = ", ".join(
@@ -234,9 +319,25 @@ def publish_fit(
             f"{joints}. One of the two is wrong there: compare both with the images, or export "
             "--stage retriangulation."
         )
-    static = people.clip.cameras, people.detections
-    report = report_fit(fit, people.joints, people.clip.fps, static)
-    result.figures.update(figures_of(report, [f"person{person}" for person in people.person]))
+    persons = [f"person{person}" for person in people.person]
+    result.figures.update(figures_of(metrics.report(), persons))
+    return fit
+
+
+def _part_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays with a frame dimension."""
+    arrays: dict[str, NDArray[Any]] = {
+        "global_orient": fit.parameters.global_orient,
+        "body_pose": fit.parameters.body_pose,
+        "transl": fit.parameters.transl,
+        "joints": fit.joints,
+        "covariance": fit.covariance,
+        "filled": fit.filled,
+        "guided": fit.guided,
+    }
+    if fit.extra is not None:
+        arrays |= {"extra_joints": fit.extra.joints, "extra_covariance": fit.extra.covariance}
+    return arrays
 
 
 def find_same_body(name: str, sha256: str | None) -> BodyModel:

@@ -10,16 +10,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.refitting import REFITTING
 from data_contracts.work import Work
-from tasks.body_fitting import fit_people, open_people, publish_fit
+from tasks.body_fitting import FurtherArrays, open_people, publish_fit
 from tasks.plane_bodies import publish_plane_bodies
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
+    BodyFit,
     BodyFittingSettings,
+    ClipEvidence,
+    MonocularEstimates,
     MonocularPoses,
     RayConstraints,
     Shape,
@@ -51,100 +55,112 @@ def refitting(work: Work) -> str:
     before = store.manifest(
         work.recipe.match_id, "body_fitting", unit, work.recipe.inputs[f"body_fitting/{unit}"]
     ).recipe
+    fitted = open_input(store, work, f"body_fitting/{unit}")
     with store.publish(work) as result:
-        people = open_people(store, work)
-        joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
-        views: list[RayConstraints] = []
-        monocular_poses: MonocularPoses | None = None
+        views: _BroadcastViews | None = None
         if f"broadcast_calibration/{unit}" in work.recipe.inputs:
-            pictures = _pictures(store, work, people.detections.frame)
-            views = [_view(store, work, pictures, joints)]
-            monocular_poses = _read_monocular_poses(work, pictures, joints)
+            views = _BroadcastViews.open(store, work, fitted)
+        people = open_people(store, work, views)
         weight = BodyFittingSettings.model_validate(before.settings).shape_weight
         known = _known_shapes(store, work, people.person, weight)
-        model, fit = fit_people(
-            people, before, views=views, monocular_poses=monocular_poses, known=known
-        )
-        recognised = views[0].seen if views else np.zeros(joints.shape[:2], dtype=bool)
         pooled = np.isin(np.arange(len(people.person)), list(known))
-        further = {"recognised": recognised, "pooled": pooled}
-        publish_fit(result, REFITTING, people, model, fit, further, {"without_body": {}})
-        moved = np.linalg.norm(fit.joints - joints, axis=-1)
-        result.figures["recognised"] = float(recognised.sum())
+        recognised = 0
+        moved: list[list[Floats]] = [[] for _ in people.person]
+
+        def further(part: slice, fit: BodyFit, evidence: ClipEvidence) -> dict[str, NDArray[Any]]:
+            nonlocal recognised
+            seen = np.zeros(fit.joints.shape[:2], dtype=np.bool_)
+            if views is not None:
+                seen = evidence.ray_constraints[-1].seen
+            recognised += int(seen.sum())
+            away = np.linalg.norm(fit.joints - fitted["joints"][part].values, axis=-1)
+            for place, own in enumerate(moved):
+                its = away[:: people.stride, place]
+                own.append(its[np.isfinite(its)])
+            return {"recognised": seen}
+
+        others = FurtherArrays(further, {"pooled": pooled}, {"without_body": {}}, known)
+        publish_fit(store, result, REFITTING, people, before, others)
+        result.figures["recognised"] = float(recognised)
         result.figures["pooled"] = float(pooled.sum())
-        for place, person in enumerate(people.person):
-            if np.isfinite(moved[:, place]).any():
-                figure = float(np.nanmedian(moved[:, place]))
+        for person, own in zip(people.person, moved, strict=True):
+            if any(map(len, own)):
+                figure = float(np.median(np.concatenate(own)))
                 result.figures[f"moved_m.person{person}"] = figure
     return work.key
 
 
 @dataclass(frozen=True, eq=False)
-class _Pictures:
-    """Images of a clip's broadcast camera, one per frame of the clip.
+class _BroadcastViews:
+    """Images of a clip's broadcast camera, one per frame of the clip, and what they show.
 
     Attributes:
         number: (frames,) index of each image in its video.
         camera: batch (frames,); NaN if too uncertain.
         late: clock offset of the images relative to the frames [frame].
+        keypoints: (frames, detections, 17, 2) [px], in the store.
+        joints: (frames, persons, 17, 3) [m], world, fitted bodies' joints, in the store.
+        estimates: monocular estimates; None without any.
     """
 
     number: NDArray[np.int64]
     camera: Camera
     late: float
+    keypoints: xr.DataArray
+    joints: xr.DataArray
+    estimates: MonocularEstimates | None
 
+    @classmethod
+    def open(cls, store: Store, work: Work, fitted: xr.Dataset) -> _BroadcastViews:
+        """Open the images of the clip of `work`, whose bodies are `fitted`."""
+        sources: dict[str, Any] = work.recipe.sources
+        name = f"broadcast_calibration/{work.recipe.unit}"
+        found = open_input(store, work, name)
+        pooled = f"broadcast_pooling/{work.recipe.unit}"
+        best = open_input(store, work, pooled) if pooled in work.recipe.inputs else found
+        camera = camera_from_arrays(best.data_vars)
+        known = found["reprojection_error"].values <= KNOWN
+        offset = float(sources["broadcast_offset_frames"])
+        late = round(offset) - offset
+        stage, unit = name.split("/")
+        key = work.recipe.inputs[name]
+        calibrated = store.manifest(work.recipe.match_id, stage, unit, key).recipe
+        measured = (found.attrs["feed_offset"] or {}).get("frames")
+        if calibrated.settings["feed_offset"] == "correct" and measured is not None:
+            late += measured
+        first, count = sources["first_frame"], sources["frame_count"]
+        frame = np.arange(first, first + count)
+        seen = open_input(store, work, sources["seen_in_broadcast"]).sel(frame=frame)
+        estimates = None
+        if sources["estimates"] is not None:
+            path = Path(work.folder) / sources["estimates"]
+            estimates = read_monocular(path)
+            require_registered(path, sources["estimates_sha256"])
+        return cls(
+            number=frame + sources["offset_frames"],
+            camera=replace(camera, focal=np.where(known[:, None], camera.focal, np.nan)),
+            late=late,
+            keypoints=seen["keypoints"],
+            joints=fitted["joints"],
+            estimates=estimates,
+        )
 
-def _pictures(store: Store, work: Work, frame: NDArray[np.int64]) -> _Pictures:
-    sources: dict[str, Any] = work.recipe.sources
-    name = f"broadcast_calibration/{work.recipe.unit}"
-    found = open_input(store, work, name)
-    pooled = f"broadcast_pooling/{work.recipe.unit}"
-    best = open_input(store, work, pooled) if pooled in work.recipe.inputs else found
-    camera = camera_from_arrays(best.data_vars)
-    known = found["reprojection_error"].values <= KNOWN
-    offset = float(sources["broadcast_offset_frames"])
-    late = round(offset) - offset
-    stage, unit = name.split("/")
-    key = work.recipe.inputs[name]
-    calibrated = store.manifest(work.recipe.match_id, stage, unit, key).recipe
-    measured = (found.attrs["feed_offset"] or {}).get("frames")
-    if calibrated.settings["feed_offset"] == "correct" and measured is not None:
-        late += measured
-    return _Pictures(
-        number=frame + sources["offset_frames"],
-        camera=replace(camera, focal=np.where(known[:, None], camera.focal, np.nan)),
-        late=late,
-    )
-
-
-def _view(store: Store, work: Work, pictures: _Pictures, joints: Floats) -> RayConstraints:
-    """Return the ray constraints of the broadcast camera's 2D poses."""
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    seen = open_input(store, work, sources["seen_in_broadcast"]).sel(
-        frame=np.arange(first, first + count)
-    )
-    then = shift_frames(joints, pictures.late)
-    keypoints = seen["keypoints"].values.astype(np.float64)
-    own = identify_people(pictures.camera, keypoints, then)
-    view = constrain_to_rays(pictures.camera, own, then)
-    return RayConstraints(
-        shift_frames(view.points, -pictures.late), shift_frames(view.across, -pictures.late)
-    )
-
-
-def _read_monocular_poses(work: Work, pictures: _Pictures, joints: Floats) -> MonocularPoses | None:
-    """Return the monocular poses of the images, if there are any."""
-    sources: dict[str, Any] = work.recipe.sources
-    if sources["estimates"] is None:
-        return None
-    path = Path(work.folder) / sources["estimates"]
-    estimates = read_monocular(path)
-    require_registered(path, sources["estimates_sha256"])
-    then = shift_frames(joints, pictures.late)
-    seen = place_monocular_poses(estimates, pictures.camera, pictures.number, then)
-    whole = -round(pictures.late)
-    return MonocularPoses(shift_frames(seen.orient, whole), shift_frames(seen.angles, whole))
+    def __call__(self, frames: slice) -> tuple[RayConstraints, MonocularPoses | None]:
+        """Return the lines of sight and the monocular poses in some frames."""
+        camera = self.camera[frames]
+        then = shift_frames(self.joints[frames].values, self.late)
+        own = identify_people(camera, self.keypoints[frames].values.astype(np.float64), then)
+        view = constrain_to_rays(camera, own, then)
+        rays = RayConstraints(
+            shift_frames(view.points, -self.late), shift_frames(view.across, -self.late)
+        )
+        if self.estimates is None:
+            return rays, None
+        seen = place_monocular_poses(self.estimates, camera, self.number[frames], then)
+        whole = -round(self.late)
+        return rays, MonocularPoses(
+            shift_frames(seen.orient, whole), shift_frames(seen.angles, whole)
+        )
 
 
 def _known_shapes(

@@ -11,11 +11,10 @@ from worldpose.lazy_names import import_on_use
 if TYPE_CHECKING:
     from worldpose.body_fitting.body_fit import (
         BodyFit,
-        BodyFittingReport,
         ClipEvidence,
-        far_offsets,
+        EvidenceSource,
         fit_bodies,
-        report_fit,
+        fit_in_windows,
     )
     from worldpose.body_fitting.bones import (
         BoneLengths,
@@ -25,7 +24,15 @@ if TYPE_CHECKING:
         pool_shapes,
     )
     from worldpose.body_fitting.extra_points import ExtraFit, perceived_points
-    from worldpose.body_fitting.held_out import HeldOutComparison, SeenClip, compare_held_out
+    from worldpose.body_fitting.fit_quality import (
+        BodyFittingReport,
+        FitMetrics,
+        HeldOutComparison,
+        SeenClip,
+        compare_held_out,
+        far_offsets,
+        report_fit,
+    )
     from worldpose.body_fitting.monocular import (
         MonocularEstimates,
         MonocularPoses,
@@ -53,7 +60,9 @@ __all__ = [
     "BodyFittingSettings",
     "BoneLengths",
     "ClipEvidence",
+    "EvidenceSource",
     "ExtraFit",
+    "FitMetrics",
     "Ground",
     "HeldOutComparison",
     "MonocularEstimates",
@@ -69,6 +78,7 @@ __all__ = [
     "find_ray_constraints",
     "fit_bodies",
     "fit_bodies_on_plane",
+    "fit_in_windows",
     "fit_shape",
     "identify_people",
     "measure_bones",
@@ -86,11 +96,10 @@ __getattr__ = import_on_use(
     {
         "worldpose.body_fitting.body_fit": (
             "BodyFit",
-            "BodyFittingReport",
             "ClipEvidence",
-            "far_offsets",
+            "EvidenceSource",
             "fit_bodies",
-            "report_fit",
+            "fit_in_windows",
         ),
         "worldpose.body_fitting.bones": (
             "BoneLengths",
@@ -100,10 +109,14 @@ __getattr__ = import_on_use(
             "pool_shapes",
         ),
         "worldpose.body_fitting.extra_points": ("ExtraFit", "perceived_points"),
-        "worldpose.body_fitting.held_out": (
+        "worldpose.body_fitting.fit_quality": (
+            "BodyFittingReport",
+            "FitMetrics",
             "HeldOutComparison",
             "SeenClip",
             "compare_held_out",
+            "far_offsets",
+            "report_fit",
         ),
         "worldpose.body_fitting.monocular": (
             "MonocularEstimates",

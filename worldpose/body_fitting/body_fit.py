@@ -6,59 +6,57 @@ Quality metrics of a fit need no ground truth.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
-from data_contracts.keypoints import KeypointDetections
-from data_contracts.records import Record
 from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.model import BODY_POSE
-from worldpose.body_fitting.bones import BONES, Shape
-from worldpose.body_fitting.extra_points import ExtraFit, prepare_points
-from worldpose.body_fitting.monocular import (
-    CORRELATION_S,
-    MonocularPoses,
-    MonocularPrior,
-    carry_errors,
-    deviations,
-    learn_precision,
+from worldpose.body_fitting.bones import Shape
+from worldpose.body_fitting.extra_points import (
+    ExtraFit,
+    PointArrays,
+    PointModel,
+    densest_interval,
+    feet_determined,
+    known_points,
+    learn_points,
+    select_points,
 )
+from worldpose.body_fitting.monocular import MonocularPoses, MonocularPrior, monocular_priors
 from worldpose.body_fitting.objective import (
-    ANKLES,
     Evidence,
     Ground,
-    Pose,
-    body_axes,
-    perceived_joints,
 )
-from worldpose.body_fitting.pose_space import GATHER, load_pose_prior, nearest_known
+from worldpose.body_fitting.pose_space import load_pose_prior, nearest_matrices
 from worldpose.body_fitting.ray_constraints import RayConstraints
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import (
+    FittedArrays,
     Shapes,
     Solver,
     fit_shapes,
+    pose_covariance,
+    spread_intervals,
 )
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
 from worldpose.triangulation import ExtraJoints
 
-MAX_DEVIATION: Final = 0.035
-"""Joints are well determined if their median standard deviation per axis is below this [m]: 16
-cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 KEPT_BIAS: Final = 0.01
 """Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets
 model the rest."""
-MAX_OFFSET: Final = 3.0
-"""Offsets beyond this are unusual for any detector [standard deviations]: one in 34."""
+WINDOW_FRAMES: Final = 3000
+"""Frames that are solved together: a person's equations take 60 KB per frame."""
+MARGIN_S: Final = 3.0
+"""Time before and after a window that is solved with it [s]. Motion ties a pose to those within
+some tenths of a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +86,71 @@ class BodyFit:
     guided: NDArray[np.bool_]
     offsets: Floats
     extra: ExtraFit | None = None
+
+    @classmethod
+    def of(cls, arrays: FittedArrays, shapes: Shapes) -> BodyFit:
+        """Return the fit of complete arrays."""
+        betas = np.broadcast_to(arrays.betas, (*arrays.orient.shape[:2], arrays.betas.shape[-1]))
+        return cls(
+            arrays.betas,
+            BodyParameters(betas, arrays.orient, arrays.body_pose, arrays.transl),
+            arrays.betas_covariance,
+            arrays.joints,
+            arrays.covariance,
+            arrays.filled,
+            arrays.guided,
+            shapes.offsets,
+        )
+
+    def __getitem__(self, frames: slice) -> BodyFit:
+        """Return the bodies in some frames."""
+        return self._join([self], frames)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[BodyFit]) -> BodyFit:
+        """Return the bodies of consecutive parts of a clip."""
+        return cls._join(parts, slice(None))
+
+    @staticmethod
+    def _join(parts: Sequence[BodyFit], frames: slice) -> BodyFit:
+        def join(name: str, of: Sequence[object] = parts) -> NDArray[Any]:
+            return np.concatenate([getattr(part, name)[frames] for part in of])
+
+        first = parts[0]
+        moving = [part.parameters for part in parts]
+        names = ("betas", "global_orient", "body_pose", "transl")
+        points = [part.extra for part in parts if part.extra is not None]
+        return replace(
+            first,
+            parameters=BodyParameters(*(join(name, moving) for name in names)),
+            joints=join("joints"),
+            covariance=join("covariance"),
+            filled=join("filled"),
+            guided=join("guided"),
+            extra=replace(
+                points[0], joints=join("joints", points), covariance=join("covariance", points)
+            )
+            if points
+            else None,
+        )
+
+
+class EvidenceSource(Protocol):
+    """Evidence about the bodies of a clip that is read by frames: a long clip exceeds memory."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of frames and of persons."""
+
+    @property
+    def fps(self) -> float:
+        """Frames per second [1/s]."""
+
+    def read_joints(self, frames: slice) -> ClipEvidence:
+        """Return the triangulated joints and points of some frames."""
+
+    def read(self, frames: slice) -> ClipEvidence:
+        """Return all evidence in some frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,19 +197,50 @@ class ClipEvidence:
                 todo="Give triangulated joints with their covariance.",
             )
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of frames and of persons."""
+        frames, persons = self.joints.shape[:2]
+        return frames, persons
+
+    @property
+    def bias(self) -> Floats:
+        """(17,) per axis, error that all views share [m]; 0 where none is known."""
+        return np.zeros(17) if self.common_bias is None else self.common_bias
+
+    @property
+    def joint_seen(self) -> Flags:
+        """(frames, persons, 17), joints with a covariance."""
+        return np.asarray(
+            np.isfinite(self.joints).all(-1) & np.isfinite(self.covariance).all((-1, -2))
+        )
+
+    def read_joints(self, frames: slice) -> ClipEvidence:
+        """Return the evidence in some frames."""
+        return self.read(frames)
+
+    def read(self, frames: slice) -> ClipEvidence:
+        """Return the evidence in some frames."""
+        monocular, shared, extra = self.monocular_poses, self.shared_covariance, self.extra
+        return replace(
+            self,
+            joints=self.joints[frames],
+            covariance=self.covariance[frames],
+            ray_constraints=[view[frames] for view in self.ray_constraints],
+            monocular_poses=None if monocular is None else monocular[frames],
+            shared_covariance=None if shared is None else shared[frames],
+            extra=None if extra is None else extra[frames],
+        )
+
 
 def fit_bodies(
     model: BodyModel,
-    evidence: ClipEvidence,
+    evidence: EvidenceSource,
     settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
     ground: Ground | None = None,
     known_shapes: Mapping[int, Shape] | None = None,
 ) -> BodyFit:
     """Return the bodies that fit the triangulated joints of all persons (S1-S3).
-
-    Shape starts from bone lengths, poses from hips and torso; then betas, coarse poses and the
-    detector's shared offsets are estimated together, and last the poses of all frames with fixed
-    betas and offsets.
 
     Args:
         model: the body.
@@ -155,85 +249,270 @@ def fit_bodies(
         ground: height of the surface under the feet, in a world with z up; None where unknown.
         known_shapes: shapes of people from other clips, by their index in the joints.
     """
-    joints, fps = evidence.joints, evidence.fps
-    bias = np.zeros(17) if evidence.common_bias is None else evidence.common_bias
-    covariance = random_covariance(evidence.covariance, bias)
-    frames, persons = joints.shape[:2]
-    solver = Solver(
-        ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
+    parts = fit_in_windows(model, evidence, settings, ground, known_shapes)
+    return BodyFit.concatenate([fit for _, fit in parts])
+
+
+def fit_in_windows(
+    model: BodyModel,
+    evidence: EvidenceSource,
+    settings: BodyFittingSettings = BodyFittingSettings(),  # noqa: B008
+    ground: Ground | None = None,
+    known_shapes: Mapping[int, Shape] | None = None,
+) -> Iterator[tuple[slice, BodyFit]]:
+    """Yield the bodies of `fit_bodies` for consecutive frames of a clip of any length.
+
+    Shape starts from bone lengths, poses from hips and torso; then betas, coarse poses and the
+    detector's shared offsets are estimated together from some seconds of each person, and last the
+    poses of all frames with fixed betas and offsets. A long clip is solved in overlapping windows,
+    so that memory does not grow with it.
+
+    Args:
+        model: the body.
+        evidence: as of `fit_bodies`.
+        settings: as of `fit_bodies`.
+        ground: as of `fit_bodies`.
+        known_shapes: as of `fit_bodies`.
+
+    Yields:
+        Frames, and the bodies in these frames.
+    """
+    clip = _learn_clip(
+        evidence,
+        Solver(
+            ChainedKeypoints.of(fold_keypoints(model, COCO17)), load_pose_prior(), settings, ground
+        ),
+        known_shapes or {},
     )
-    joint_seen = np.asarray(np.isfinite(joints).all(-1) & np.isfinite(covariance).all((-1, -2)))
-    seen = np.asarray(joint_seen.any(-1))
+    for window, kept in _windows(evidence.size[0], evidence.fps, settings):
+        fit = clip.fit(evidence.read(window), window, kept)
+        yield (
+            kept,
+            fit if kept == window else fit[kept.start - window.start : kept.stop - window.start],
+        )
+
+
+def _windows(
+    frames: int, fps: float, settings: BodyFittingSettings
+) -> Iterator[tuple[slice, slice]]:
+    """Yield frames that are solved together, and those of them that are kept."""
+    margin = math.ceil(max(MARGIN_S, 2.0 * settings.max_filled_gap_s) * fps)
+    size = max(WINDOW_FRAMES, 2 * margin)
+    starts = range(0, frames, size) if frames > size + margin else (0,)
+    for start in starts:
+        stop = start + size if len(starts) > 1 and start + size < frames else frames
+        first, last = max(0, start - margin), min(frames, stop + margin)
+        yield slice(first, last), slice(start, stop)
+
+
+def _learn_clip(
+    evidence: EvidenceSource, solver: Solver, known_shapes: Mapping[int, Shape]
+) -> _ClipBodies:
+    """Return what all frames of a clip share."""
+    (frames, persons), fps = evidence.size, evidence.fps
+    parts = [kept for _, kept in _windows(frames, fps, solver.settings)]
+    seen = np.zeros((frames, persons), dtype=np.bool_)
+    number = np.zeros((frames, persons), dtype=np.int16)
+    points: dict[str, None] = {}
+    for part in parts:
+        some = evidence.read_joints(part)
+        seen[part] = some.joint_seen.any(-1)
+        if some.extra is not None:
+            names = known_points(solver.chained.model, some.extra.points)
+            extra = select_points(some.extra, names)
+            there = np.isfinite(extra.joints[..., 0])
+            number[part] = there.sum(axis=-1)
+            points |= dict.fromkeys(np.array(names)[there.any(axis=(0, 1))].tolist())
     spans = {
         person: slice(int(here[0]), int(here[-1]) + 1)
         for person in range(persons)
         if len(here := np.flatnonzero(seen[:, person]))
     }
-    by_person, present = _gather_evidence(evidence, covariance, seen, spans, settings)
-    shapes = fit_shapes(
-        solver,
-        {
-            person: (joints[span, person], covariance[span, person])
-            for person, span in spans.items()
-        },
-        known_shapes or {},
-        fps,
-    )
-    result = FittedArrays.empty(model, frames, persons)
-    extra = prepare_points(solver, evidence.extra, spans, by_person, shapes, fps)
-    if extra is not None:
-        solver, by_person = extra.solver, extra.people
-
-    def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
-        own, span = by_person[person], spans[person]
-        pose, points, random = solver.solve_windows(
-            own, shapes.people[person], shapes.offsets, fps, prior
-        )
-        spread = random[:, :17] + bias[:, None, None] ** 2 * np.eye(3)
-        determined = None if extra is None else extra.determined[person]
-        own_joints = points[:, :17], spread
-        bodies = result.put(solver, person, span, pose, own_joints, shapes, determined)
-        if extra is not None:
-            extra.put(person, span, bodies, random[:, 17:])
-
-    for _ in map_in_threads(fit_person, spans):
-        pass
-    if evidence.monocular_poses is not None:
-        priors = _monocular_priors(
-            result, joint_seen, covariance, evidence.monocular_poses, spans, fps
-        )
-        for person, prior in priors.items():
-            fit_person(person, prior)
-            result.guided[spans[person], person] = prior.used
+    sampled = {
+        person: [
+            slice(span.start + part.start, span.start + part.stop)
+            for part in spread_intervals(span.stop - span.start, fps, solver.settings)
+        ]
+        for person, span in spans.items()
+    }
+    shapes = fit_shapes(solver, _read_samples(evidence, parts, sampled), known_shapes, fps)
+    if not points or not spans:
+        return _ClipBodies(solver, shapes, spans, fps)
+    samples = {}
     for person, span in spans.items():
-        result.filled[span, person] = ~seen[span, person]
-        gone = _long_gaps(present[span, person], settings.max_filled_gap_s * fps)
-        shared = evidence.shared_covariance
-        for arrays in (result,) if extra is None else (result, extra):
-            arrays.drop(person, span, gone)
-            if shared is not None:
-                arrays.covariance[span, person] += _nearest_known(shared[span, person])[:, None]
-    fit = result.fit(shapes)
-    return fit if extra is None else replace(fit, extra=extra.fit())
+        part = densest_interval(number[span, person], fps)
+        some = evidence.read(slice(span.start + part.start, span.start + part.stop))
+        assert some.extra is not None
+        covariance = random_covariance(some.covariance, some.bias)
+        own, _ = _gather_evidence(some, covariance, {person: slice(None)}, solver.settings)
+        extra = select_points(some.extra, tuple(points))
+        alone = replace(
+            extra,
+            joints=extra.joints[:, [person]],
+            covariance=extra.covariance[:, [person]],
+            views=extra.views[:, [person]],
+        )
+        samples[person] = own[person], alone
+    return _ClipBodies(solver, shapes, spans, fps, learn_points(solver, samples, shapes, fps))
+
+
+def _read_samples(
+    evidence: EvidenceSource, parts: Sequence[slice], sampled: Mapping[int, Sequence[slice]]
+) -> dict[int, list[tuple[Floats, Floats]]]:
+    """Return joints and covariance of each person in some intervals, which parts of a clip hold."""
+    read: dict[int, list[tuple[Floats, Floats]]] = {
+        person: [
+            (
+                np.empty((each.stop - each.start, 17, 3)),
+                np.empty((each.stop - each.start, 17, 3, 3)),
+            )
+            for each in intervals
+        ]
+        for person, intervals in sampled.items()
+    }
+    for part in parts:
+        some = evidence.read_joints(part)
+        for person, intervals in sampled.items():
+            for each, (joints, covariance) in zip(intervals, read[person], strict=True):
+                first, last = max(each.start, part.start), min(each.stop, part.stop)
+                if first < last:
+                    to = slice(first - each.start, last - each.start)
+                    of = slice(first - part.start, last - part.start)
+                    joints[to] = some.joints[of, person]
+                    covariance[to] = random_covariance(some.covariance[of, person], some.bias)
+    return read
+
+
+@dataclass(frozen=True, eq=False)
+class _ClipBodies:
+    """What all frames of a clip share.
+
+    Attributes:
+        solver: solver of the joints.
+        shapes: betas of each person, and the detector's offsets.
+        spans: frames from a person's first joint to the last.
+        fps: [1/s].
+        points: points besides COCO-17; None without evidence about any.
+    """
+
+    solver: Solver
+    shapes: Shapes
+    spans: Mapping[int, slice]
+    fps: float
+    points: PointModel | None = None
+
+    def fit(self, evidence: ClipEvidence, window: slice, kept: slice) -> BodyFit:
+        """Return the bodies in a window of frames.
+
+        Where the window begins or ends without any observation of a person, or the frames to keep
+        have none, the person is missing.
+
+        Args:
+            evidence: evidence in the window.
+            window: its frames in the clip.
+            kept: those of them whose bodies count.
+        """
+        settings, bias, fps = self.solver.settings, evidence.bias, self.fps
+        covariance = random_covariance(evidence.covariance, bias)
+        joint_seen = evidence.joint_seen
+        seen = np.asarray(joint_seen.any(-1))
+        spans = {
+            person: slice(max(span.start, window.start) - window.start, last - window.start)
+            for person, span in self.spans.items()
+            if (last := min(span.stop, window.stop)) > max(span.start, window.start)
+        }
+        people, present = _gather_evidence(evidence, covariance, spans, settings)
+        extra = points = None
+        if self.points is not None and evidence.extra is not None:
+            extra = PointArrays.empty(self.points, *evidence.size)
+            points = select_points(evidence.extra, self.points.points)
+            people = {
+                person: self.points.add(person, own, points[spans[person]], fps)
+                for person, own in people.items()
+            }
+        spans, people = _trim(spans, people, kept.start - window.start, kept.stop - window.start)
+        solver = self.solver if self.points is None else self.points.solver
+        model = self.solver.chained.model
+        result = FittedArrays.empty(model, *evidence.size)
+
+        def fit_person(person: int, prior: MonocularPrior | None = None) -> None:
+            own, span = people[person], spans[person]
+            shape = self.shapes.people[person]
+            pose, track = solver.solve_poses(own, shape, self.shapes.offsets, fps, prior)
+            places, random = pose_covariance(track, pose, self.shapes.offsets)
+            spread = random[:, :17] + bias[:, None, None] ** 2 * np.eye(3)
+            determined = None
+            if self.points is not None:
+                determined = feet_determined(model, self.points.points, own, fps)
+            bodies = result.put(
+                solver, person, span, pose, (places[:, :17], spread), self.shapes, determined
+            )
+            if extra is not None:
+                extra.put(person, span, bodies, random[:, 17:])
+
+        for _ in map_in_threads(fit_person, spans):
+            pass
+        if evidence.monocular_poses is not None:
+            priors = monocular_priors(
+                (result.orient, result.body_pose),
+                joint_seen,
+                covariance,
+                evidence.monocular_poses,
+                spans,
+                fps,
+            )
+            for person, prior in priors.items():
+                fit_person(person, prior)
+                result.guided[spans[person], person] = prior.used
+        for person, span in spans.items():
+            result.filled[span, person] = ~seen[span, person]
+            gone = _long_gaps(present[span, person], settings.max_filled_gap_s * fps)
+            shared = evidence.shared_covariance
+            moving = None if shared is None else nearest_matrices(shared[span, person])[:, None]
+            for arrays in (result,) if extra is None else (result, extra):
+                arrays.drop(person, span, gone)
+                if moving is not None:
+                    arrays.covariance[span, person] += moving
+        for person in self.spans:  # also of people who are not in this window
+            result.betas[person] = self.shapes.people[person].betas
+            result.betas_covariance[person] = self.shapes.people[person].covariance
+        fit = BodyFit.of(result, self.shapes)
+        return fit if extra is None else replace(fit, extra=extra.fit())
+
+
+def _trim(
+    spans: Mapping[int, slice], people: Mapping[int, Evidence], first: int, last: int
+) -> tuple[dict[int, slice], dict[int, Evidence]]:
+    """Return frames and evidence of people from their first observation in a window to the last.
+
+    People without any observation in the frames from `first` to `last` are left out.
+    """
+    trimmed, evidence = {}, {}
+    for person, span in spans.items():
+        here = np.flatnonzero(people[person].known.any(axis=1))
+        if ((here + span.start >= first) & (here + span.start < last)).any():
+            own = slice(int(here[0]), int(here[-1]) + 1)
+            trimmed[person] = slice(span.start + own.start, span.start + own.stop)
+            its = people[person]
+            evidence[person] = Evidence(its.joints[own], its.information[own])
+    return trimmed, evidence
 
 
 def _gather_evidence(
     evidence: ClipEvidence,
     covariance: Floats,
-    seen: NDArray[np.bool_],
     spans: Mapping[int, slice],
     settings: BodyFittingSettings,
-) -> tuple[dict[int, Evidence], NDArray[np.bool_]]:
+) -> tuple[dict[int, Evidence], Flags]:
     """Return each person's joints and lines of sight, and the frames (frames, persons) with any.
 
     Args:
-        evidence: joints and lines of sight of the clip.
+        evidence: joints and lines of sight.
         covariance: (frames, persons, 17, 3, 3) [m^2], of the joints, without modelled bias.
-        seen: (frames, persons), persons with a joint.
         spans: frames of each person.
         settings: scale and correlation time of the noise.
     """
-    fps, present = evidence.fps, seen
+    fps, present = evidence.fps, np.asarray(evidence.joint_seen.any(-1))
     by_person = {
         person: Evidence.of(evidence.joints[span, person], covariance[span, person], fps, settings)
         for person, span in spans.items()
@@ -250,48 +529,11 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """Return the covariance of joints without most of the bias that the shared offsets model.
 
     Args:
-        covariance: (frames, persons, 17, 3, 3) [m^2], of triangulated joints.
+        covariance: (..., 17, 3, 3) [m^2], of triangulated joints.
         common_bias: (17,) per axis [m], included in `covariance`.
     """
     modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
     return covariance - modelled[:, None, None] * np.eye(3)
-
-
-def _nearest_known(matrices: Floats) -> Floats:
-    """Return matrices (frames, 3, 3) with those of the nearest frame where they are NaN."""
-    known = np.flatnonzero(np.isfinite(matrices).all(axis=(-1, -2)))
-    if not len(known):
-        return np.zeros_like(matrices)
-    nearest: Floats = matrices[nearest_known(known, np.arange(len(matrices)))]
-    return nearest
-
-
-def _monocular_priors(
-    result: FittedArrays,
-    joint_seen: NDArray[np.bool_],
-    covariance: Floats,
-    estimates: MonocularPoses,
-    spans: Mapping[int, slice],
-    fps: float,
-) -> dict[int, MonocularPrior]:
-    """Return monocular poses of persons for frames with few well-determined joints."""
-    variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
-    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < MAX_DEVIATION**2
-    correlated_frames = 1.0 + CORRELATION_S * fps
-    angles = result.body_pose @ GATHER.T
-    precision = learn_precision(estimates, result.orient, angles, sure, correlated_frames)
-    there = np.isfinite(estimates.angles[..., 0])
-    guided = {}
-    for person, span in spans.items():
-        used = (there & ~sure)[span, person]
-        if not used.any():
-            continue
-        orient, bend = estimates.orient[span, person], estimates.angles[span, person]
-        off = deviations(orient, bend, result.orient[span, person], angles[span, person])
-        off[~(there & sure)[span, person]] = np.nan
-        orient, bend, left = carry_errors(orient, bend, off, used, CORRELATION_S * fps)
-        guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
-    return guided
 
 
 def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
@@ -302,212 +544,3 @@ def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:
         if last - first - 1 > max_frames:
             long[first + 1 : last] = True
     return long
-
-
-@dataclass(frozen=True, eq=False)
-class FittedArrays:
-    """Arrays of a fit in progress."""
-
-    betas: Floats
-    orient: Floats
-    body_pose: Floats
-    transl: Floats
-    betas_covariance: Floats
-    joints: Floats
-    covariance: Floats
-    filled: NDArray[np.bool_]
-    guided: NDArray[np.bool_]
-
-    @classmethod
-    def empty(cls, model: BodyModel, frames: int, persons: int) -> FittedArrays:
-        """Return arrays without any body."""
-
-        def nan(*shape: int) -> Floats:
-            return np.full(shape, np.nan)
-
-        return cls(
-            nan(persons, model.shapes),
-            nan(frames, persons, 3),
-            nan(frames, persons, BODY_POSE),
-            nan(frames, persons, 3),
-            nan(persons, model.shapes, model.shapes),
-            nan(frames, persons, 17, 3),
-            nan(frames, persons, 17, 3, 3),
-            np.zeros((frames, persons), dtype=bool),
-            np.zeros((frames, persons), dtype=bool),
-        )
-
-    def put(
-        self,
-        solver: Solver,
-        person: int,
-        span: slice,
-        pose: Pose,
-        joints: tuple[Floats, Floats],
-        shapes: Shapes,
-        determined: NDArray[np.bool_] | None = None,
-    ) -> BodyParameters:
-        """Write the result of one person, and return the bodies with their feet.
-
-        `joints` are the keypoints (frames, 17, 3) [m] and their covariance (frames, 17, 3, 3)
-        [m^2]; `determined` is as `seen` of `Solver.plant_feet`.
-
-        The covariance of the detector's offsets and of the person's own is added.
-        """
-        shape = shapes.people[person]
-        keypoints, covariance = joints
-        bodies = solver.plant_feet(pose, determined)
-        self.betas[person] = shape.betas
-        self.betas_covariance[person] = shape.covariance
-        self.orient[span, person] = bodies.global_orient
-        self.body_pose[span, person] = bodies.body_pose
-        self.transl[span, person] = bodies.transl
-        self.joints[span, person] = keypoints
-        axes = body_axes(keypoints)[:, None]
-        # A joint is the detector's joint minus the offset: the offset's covariance adds up.
-        shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
-        own = solver.settings.own_bias_std_m**2 * np.eye(3)
-        self.covariance[span, person] = covariance + shared + own
-        return bodies
-
-    def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
-        """Remove a person from frames of a span."""
-        for array in (self.orient, self.body_pose, self.transl, self.joints, self.covariance):
-            array[span, person][gone] = np.nan
-        self.filled[span, person] &= ~gone
-        self.guided[span, person] &= ~gone
-
-    def fit(self, shapes: Shapes) -> BodyFit:
-        """Return the complete fit."""
-        betas = np.broadcast_to(self.betas, (*self.orient.shape[:2], self.betas.shape[-1]))
-        parameters = BodyParameters(betas, self.orient, self.body_pose, self.transl)
-        return BodyFit(
-            self.betas,
-            parameters,
-            self.betas_covariance,
-            self.joints,
-            self.covariance,
-            self.filled,
-            self.guided,
-            shapes.offsets,
-        )
-
-
-class BodyFittingReport(Record):
-    """Metrics of one clip, and of each person in the order of the persons; None without data."""
-
-    bodies: int
-    """Fitted bodies, one per frame and person [1]."""
-    filled: int
-    """Fitted bodies in frames without any joint of the person [1]."""
-    guided: int
-    """Bodies fitted with a monocular pose [1]."""
-    offset_rms_m: float
-    """Root mean square offset per axis from a body's joint to the detector's [m]."""
-    residual_m: tuple[float | None, ...]
-    """Median distance of triangulated joints, minus those offsets, from the body's [m]."""
-    reprojection_px: tuple[float | None, ...]
-    """Median image distance of seen keypoints, minus those offsets, from the body's [px]; None
-    without cameras."""
-    bone_spread_m: tuple[float | None, ...]
-    """Standard deviation of triangulated limbs' lengths, median over limbs [m]; bodies have 0."""
-    skating_m: tuple[float | None, ...]
-    """Median motion of an ankle per frame while it is slower than 0.5 m/s [m]."""
-    jerk_m_s3: tuple[float | None, ...]
-    """Root mean square third derivative of the body's keypoints [m/s^3]."""
-
-
-def report_fit(
-    fit: BodyFit,
-    joints: Floats,
-    fps: float,
-    seen: tuple[Camera, KeypointDetections] | None = None,
-) -> BodyFittingReport:
-    """Return the metrics of a fit.
-
-    Args:
-        fit: bodies of one clip.
-        joints: (frames, persons, 17, 3) [m], world, input of the fit.
-        fps: [1/s].
-        seen: static cameras (cameras,) and the detections behind the joints, left-right swaps
-            undone.
-    """
-    perceived = perceived_joints(fit.joints, fit.offsets)
-    away = np.linalg.norm(joints - perceived, axis=-1)
-    step = np.linalg.norm(np.diff(fit.joints[:, :, ANKLES], axis=0), axis=-1)
-    jerk = np.linalg.norm(np.diff(fit.joints, n=3, axis=0), axis=-1) * fps**3
-    persons = range(joints.shape[1])
-    ends = np.array(BONES)
-    limbs = np.linalg.norm(joints[:, :, ends[:, 1]] - joints[:, :, ends[:, 0]], axis=-1)
-    return BodyFittingReport(
-        bodies=int(np.isfinite(fit.joints[:, :, 0, 0]).sum()),
-        filled=int(fit.filled.sum()),
-        guided=int(fit.guided.sum()),
-        offset_rms_m=float(np.sqrt(np.mean(fit.offsets**2))),
-        residual_m=tuple(_median(away[:, person]) for person in persons),
-        reprojection_px=tuple(
-            None if seen is None else _median(_reprojection(perceived, seen, person))
-            for person in persons
-        ),
-        bone_spread_m=tuple(_spread(limbs[:, person]) for person in persons),
-        skating_m=tuple(
-            _median(np.where(step[:, person] * fps < 0.5, step[:, person], np.nan))
-            for person in persons
-        ),
-        jerk_m_s3=tuple(_root_mean_square(jerk[:, person]) for person in persons),
-    )
-
-
-def _reprojection(
-    perceived: Floats, seen: tuple[Camera, KeypointDetections], person: int
-) -> Floats:
-    """Return distances of one person's keypoints (frames, cameras, 17) [px]; NaN where not seen."""
-    cameras, detections = seen
-    place = detections.detection_index[:, :, person]
-    frame, camera = np.nonzero(place >= 0)
-    own = np.full((*place.shape, 17, 2), np.nan)
-    own[frame, camera] = detections.keypoints[frame, camera, place[frame, camera]]
-    image = cameras.project(perceived[:, None, person])
-    return np.asarray(np.linalg.norm(image - own, axis=-1))
-
-
-def _median(values: Floats) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else None
-
-
-def _spread(lengths: Floats) -> float | None:
-    spreads = [
-        float(known.std()) for limb in lengths.T if len(known := limb[np.isfinite(limb)]) > 1
-    ]
-    return float(np.median(spreads)) if spreads else None
-
-
-def _root_mean_square(values: Floats) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else None
-
-
-def far_offsets(offsets: Floats, common_bias: Floats) -> dict[str, tuple[float, float]]:
-    """Return the joints of bodies with unusually large offsets.
-
-    Shape and offsets together follow the detector: an offset much larger than a detector's common
-    bias means that either the joints or the bodies are wrong.
-
-    Args:
-        offsets: (17, 3) [m], of joints of bodies.
-        common_bias: (17,) per axis [m]; 0 = not known.
-
-    Returns:
-        By joint, left and right as one: length of the offset and its usual maximum [m].
-    """
-    length = np.linalg.norm(offsets, axis=-1)
-    far = (length > MAX_OFFSET * common_bias) & (common_bias > 0.0)
-    return {
-        COCO17[joint].removeprefix("left_"): (
-            float(length[joint]),
-            MAX_OFFSET * float(common_bias[joint]),
-        )
-        for joint in np.flatnonzero(far)
-        if not COCO17[joint].startswith("right")
-    }

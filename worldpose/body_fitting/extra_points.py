@@ -7,7 +7,7 @@ definition. The offsets are learned from residuals, like those of joints.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -64,16 +64,18 @@ class ExtraFit:
     offsets: Floats
 
 
-def known_points(model: BodyModel, extra: ExtraJoints | None) -> ExtraJoints | None:
-    """Return the points that a body model has; None without any in 3D."""
-    if extra is None or len(model.template) != SMPL_VERTICES:
-        return None
-    there = np.asarray(np.isfinite(extra.joints[..., 0]).any(axis=(0, 1)))
-    kept = [k for k, point in enumerate(extra.points) if point in VERTEX_OF_POINT and there[k]]
-    if not kept:
-        return None
+def known_points(model: BodyModel, points: Sequence[str]) -> tuple[str, ...]:
+    """Return those of a detector's points that a body model has."""
+    if len(model.template) != SMPL_VERTICES:
+        return ()
+    return tuple(point for point in points if point in VERTEX_OF_POINT)
+
+
+def select_points(extra: ExtraJoints, points: tuple[str, ...]) -> ExtraJoints:
+    """Return the triangulated points with these names, in this order."""
+    kept = [extra.points.index(point) for point in points]
     return ExtraJoints(
-        tuple(extra.points[k] for k in kept),
+        points,
         extra.joints[:, :, kept],
         extra.covariance[:, :, kept],
         extra.views[:, :, kept],
@@ -124,19 +126,16 @@ def learn_point_offsets(
     Args:
         solver: result of `with_points`.
         points: names of the points.
-        people: joints and points of each person.
+        people: joints and points of each person in some seconds.
         shapes: betas of each person, and offsets of the joints.
         fps: [1/s].
     """
     model = solver.chained.model
     offsets = np.zeros((len(points), 3))
     variance = np.full(offsets.shape, OFFSET_STD_M**2)
-    sample = {
-        person: _densest(own, max(3, round(SAMPLE_S * fps))) for person, own in people.items()
-    }
 
     def residuals(person: int) -> Floats:
-        part = sample[person]
+        part = people[person]
         pose, _ = moved.solve_poses(part, shapes.people[person], shapes.offsets, fps)
         parameters = pose.parameters()
         places = solver.chained.differentiate(parameters).keypoints[:, len(COCO17) :]
@@ -147,7 +146,7 @@ def learn_point_offsets(
     for _ in range(PASSES):
         moved = move_points(solver, points, offsets)
         medians, spreads = [], []
-        for own in map_in_threads(residuals, sample):
+        for own in map_in_threads(residuals, people):
             seen = np.isfinite(own[..., 0])
             median = np.full(offsets.shape, np.nan)
             spread = np.full(offsets.shape, np.nan)
@@ -203,14 +202,17 @@ def _mirror_place(points: tuple[str, ...], place: int) -> int | None:
     return points.index(other) if other != name and other in points else None
 
 
-def _densest(evidence: Evidence, frames: int) -> Evidence:
-    """Return the interval of so many frames with the most points."""
-    known = evidence.known[:, len(COCO17) :].sum(axis=1)
-    total = np.concatenate([[0], np.cumsum(known)])
-    length = min(frames, len(known))
+def densest_interval(known: NDArray[np.integer], fps: float) -> slice:
+    """Return the interval of `SAMPLE_S` with the most points.
+
+    Args:
+        known: (frames,) number of a person's points in each frame.
+        fps: [1/s].
+    """
+    total = np.concatenate([[0], np.cumsum(known, dtype=np.int64)])
+    length = min(max(3, round(SAMPLE_S * fps)), len(known))
     start = int((total[length:] - total[: len(total) - length]).argmax())
-    part = slice(start, start + length)
-    return Evidence(evidence.joints[part], evidence.information[part])
+    return slice(start, start + length)
 
 
 def feet_determined(
@@ -230,28 +232,49 @@ def feet_determined(
 
 
 @dataclass(frozen=True, eq=False)
-class PointArrays:
-    """Points besides COCO-17 of a fit in progress.
+class PointModel:
+    """What a clip tells of the points besides COCO-17 of its detector.
 
     Attributes:
-        solver: solver of poses that knows the points.
-        people: evidence about each person, with the points.
-        determined: (frames, 2) of each person, as in `feet_determined`.
+        solver: solver of poses that knows the points, where the detector has them.
         points: (points,) names.
-        joints: (frames, persons, points, 3) [m], world.
-        covariance: (frames, persons, points, 3, 3) [m^2].
         offsets: (points, 3) [m], as in `ExtraFit`.
+        modelled: (points, 3) [m^2], part of the triangulated points' variance that the offsets
+            model.
         systematic: (points, 3, 3) [m^2], covariance of the offsets and of the common bias.
     """
 
     solver: Solver
-    people: dict[int, Evidence]
-    determined: dict[int, NDArray[np.bool_]]
     points: tuple[str, ...]
+    offsets: Floats
+    modelled: Floats
+    systematic: Floats
+
+    def add(self, person: int, own: Evidence, extra: ExtraJoints, fps: float) -> Evidence:
+        """Return a person's evidence with the points, in the frames of both."""
+        covariance = extra.covariance[:, person] - self.modelled[..., None] * np.eye(3)
+        return own.add_points(extra.joints[:, person], covariance, fps, self.solver.settings)
+
+
+@dataclass(frozen=True, eq=False)
+class PointArrays:
+    """Points besides COCO-17 of a fit in progress.
+
+    Attributes:
+        model: points of the clip.
+        joints: (frames, persons, points, 3) [m], world.
+        covariance: (frames, persons, points, 3, 3) [m^2].
+    """
+
+    model: PointModel
     joints: Floats
     covariance: Floats
-    offsets: Floats
-    systematic: Floats
+
+    @classmethod
+    def empty(cls, model: PointModel, frames: int, persons: int) -> PointArrays:
+        """Return arrays without any point."""
+        shape = (frames, persons, len(model.points), 3)
+        return cls(model, np.full(shape, np.nan), np.full((*shape, 3), np.nan))
 
     def put(self, person: int, span: slice, bodies: BodyParameters, random: Floats) -> None:
         """Write one person's points.
@@ -262,9 +285,9 @@ class PointArrays:
             bodies: (frames,) with their feet.
             random: (frames, points, 3, 3) [m^2], covariance of the poses.
         """
-        keypoints = fold_keypoints(self.solver.chained.model, self.points)
+        keypoints = fold_keypoints(self.model.solver.chained.model, self.model.points)
         self.joints[span, person] = keypoints(bodies)
-        self.covariance[span, person] = random + self.systematic
+        self.covariance[span, person] = random + self.model.systematic
 
     def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
         """Remove a person from frames of a span."""
@@ -273,63 +296,34 @@ class PointArrays:
 
     def fit(self) -> ExtraFit:
         """Return the complete points."""
-        return ExtraFit(self.points, self.joints, self.covariance, self.offsets)
+        return ExtraFit(self.model.points, self.joints, self.covariance, self.model.offsets)
 
 
-def prepare_points(
+def learn_points(
     solver: Solver,
-    extra: ExtraJoints | None,
-    spans: Mapping[int, slice],
-    people: Mapping[int, Evidence],
+    people: Mapping[int, tuple[Evidence, ExtraJoints]],
     shapes: Shapes,
     fps: float,
-) -> PointArrays | None:
-    """Return solver and evidence with the points; None without any that the body model has.
+) -> PointModel:
+    """Return what some seconds of each person tell of a detector's points.
 
     Args:
         solver: solver of the joints.
-        extra: points in 3D.
-        spans: frames of each person.
-        people: evidence about the joints of each person in these frames.
+        people: joints of each person, and the points that the body model has, (frames, 1, points).
         shapes: betas of each person, and offsets of the joints.
         fps: [1/s].
     """
-    found = known_points(solver.chained.model, extra)
-    if found is None or not people:
-        return None
+    found = next(iter(people.values()))[1]
     points, settings = found.points, solver.settings
     solver = with_points(solver, points)
-
-    def add(covariance: Floats) -> dict[int, Evidence]:
-        return {
-            person: own.add_points(
-                found.joints[spans[person], person],
-                covariance[spans[person], person],
-                fps,
-                settings,
-            )
-            for person, own in people.items()
-        }
-
     # With the bias in their covariance the points hardly move the bodies: residuals show it.
-    offsets, variance, varying = learn_point_offsets(
-        solver, points, add(found.covariance), shapes, fps
-    )
+    whole = {
+        person: own.add_points(extra.joints[:, 0], extra.covariance[:, 0], fps, settings)
+        for person, (own, extra) in people.items()
+    }
+    offsets, variance, varying = learn_point_offsets(solver, points, whole, shapes, fps)
+    common = found.common_bias[:, None] ** 2
     kept = _kept_variance(solver.chained.model, points, varying, found.common_bias)
-    modelled = found.common_bias[:, None] ** 2 - kept
-    whole = add(found.covariance - modelled[..., None] * np.eye(3))
-    model = solver.chained.model
-    shape = found.joints.shape
-    bias = found.common_bias[:, None] ** 2 + variance + settings.own_bias_std_m**2
-    return PointArrays(
-        solver=move_points(solver, points, offsets),
-        people=whole,
-        determined={
-            person: feet_determined(model, points, own, fps) for person, own in whole.items()
-        },
-        points=points,
-        joints=np.full(shape, np.nan),
-        covariance=np.full((*shape, 3), np.nan),
-        offsets=offsets,
-        systematic=bias[..., None] * np.eye(3),
-    )
+    systematic = (common + variance + settings.own_bias_std_m**2)[..., None] * np.eye(3)
+    solver = move_points(solver, points, offsets)
+    return PointModel(solver, points, offsets, common - kept, systematic)

@@ -12,7 +12,7 @@ an inaccurate method gets almost no weight, and an accurate one helps.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,6 +40,9 @@ CROPS: Final = ("box_center", "bbox", "bboxes")
 """Names of crops: centers, or x0 y0 x1 y1. Bodies of crops face the crop's center."""
 PLACES: Final = ("transl", "pred_cam_t_full", "cam_t", "trans")
 """Names of positions in front of a whole image [m], of full perspective."""
+MAX_DEVIATION: Final = 0.035
+"""Joints are well determined if their median standard deviation per axis is below this [m]: 16
+cameras leave 0.02 to 0.03, two 0.04 to 0.1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +165,10 @@ class MonocularPoses:
     angles: Floats
     """(frames, persons, 30) [rad], of `pose_space`; NaN without an estimate."""
 
+    def __getitem__(self, frames: slice) -> MonocularPoses:
+        """Return the poses in some frames."""
+        return MonocularPoses(self.orient[frames], self.angles[frames])
+
 
 def place_monocular_poses(
     estimates: MonocularEstimates, camera: Camera, frame: NDArray[np.int64], joints: Floats
@@ -256,16 +263,6 @@ class MonocularPrior:
     left: Floats | float = 1.0
     """(frames,) share of the variance left after correction by known frames (`carry_errors`)
     [1]."""
-
-    def of(self, part: slice) -> MonocularPrior:
-        """Return the poses of some frames."""
-        return replace(
-            self,
-            orient=self.orient[part],
-            angles=self.angles[part],
-            used=self.used[part],
-            left=self.left if isinstance(self.left, float) else self.left[part],
-        )
 
     def normal_equations(self, orient: Floats, angles: Floats) -> tuple[Floats, Floats, float]:
         """Return matrices (frames, 33, 33), gradient (frames, 33) and cost for a pose.
@@ -369,3 +366,42 @@ def left_jacobian(vectors: Floats) -> Floats:
     outer = axis[:, :, None] * axis[:, None, :]
     jacobian: Floats = first * np.eye(3) + (1.0 - first) * outer + half * cross
     return jacobian
+
+
+def monocular_priors(
+    poses: tuple[Floats, Floats],
+    joint_seen: NDArray[np.bool_],
+    covariance: Floats,
+    estimates: MonocularPoses,
+    spans: Mapping[int, slice],
+    fps: float,
+) -> dict[int, MonocularPrior]:
+    """Return monocular poses of persons for frames with few well-determined joints.
+
+    Args:
+        poses: orientation (frames, persons, 3) [rad] and angles (frames, persons, 69) [rad] of
+            bodies fitted without monocular poses.
+        joint_seen: (frames, persons, 17), triangulated joints.
+        covariance: (frames, persons, 17, 3, 3) [m^2], of these.
+        estimates: monocular poses.
+        spans: frames of each person.
+        fps: [1/s].
+    """
+    variance = np.trace(covariance[:, :, 5:], axis1=-2, axis2=-1) / 3.0
+    sure = np.median(np.where(joint_seen[:, :, 5:], variance, np.inf), axis=-1) < MAX_DEVIATION**2
+    correlated_frames = 1.0 + CORRELATION_S * fps
+    fitted, body_pose = poses
+    angles = body_pose @ GATHER.T
+    precision = learn_precision(estimates, fitted, angles, sure, correlated_frames)
+    there = np.isfinite(estimates.angles[..., 0])
+    guided = {}
+    for person, span in spans.items():
+        used = (there & ~sure)[span, person]
+        if not used.any():
+            continue
+        orient, bend = estimates.orient[span, person], estimates.angles[span, person]
+        off = deviations(orient, bend, fitted[span, person], angles[span, person])
+        off[~(there & sure)[span, person]] = np.nan
+        orient, bend, left = carry_errors(orient, bend, off, used, CORRELATION_S * fps)
+        guided[person] = MonocularPrior(orient, bend, used, precision, correlated_frames, left)
+    return guided

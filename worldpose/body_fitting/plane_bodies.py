@@ -23,7 +23,7 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
 from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting.body_fit import BodyFit, FittedArrays
+from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.bones import DEFINITION_STD_M, shorten_limbs
 from worldpose.body_fitting.monocular import (
     CORRELATION_S,
@@ -47,6 +47,7 @@ from worldpose.body_fitting.pose_space import SIZE, load_pose_prior, nearest_kno
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import (
+    FittedArrays,
     Piece,
     Solver,
     pose_covariance,
@@ -251,7 +252,7 @@ def fit_bodies_on_plane(
     body = np.isfinite(result.joints[..., 0, 0])
     seen = np.isfinite(evidence.keypoints).all(axis=-1) & body[..., None]
     result.filled[:] = body & ~seen.any(axis=-1)
-    fit = result.fit(shapes)
+    fit = BodyFit.of(result, shapes)
     return PlaneBodies(fit, placed, seen.astype(np.int64), tuple(missing), misfit)
 
 

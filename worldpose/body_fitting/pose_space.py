@@ -181,6 +181,15 @@ def nearest_known(known: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArra
     return known[np.where(is_before, before, after)]
 
 
+def nearest_matrices(matrices: Floats) -> Floats:
+    """Return matrices (frames, 3, 3) with those of the nearest frame where they are NaN."""
+    known = np.flatnonzero(np.isfinite(matrices).all(axis=(-1, -2)))
+    if not len(known):
+        return np.zeros_like(matrices)
+    nearest: Floats = matrices[nearest_known(known, np.arange(len(matrices)))]
+    return nearest
+
+
 def align_root(rest: Floats, torso: Floats) -> tuple[Floats, Floats]:
     """Return orientation (frames, 3, 3) and position of `rest`'s mean (frames, 3) [m] (S2).
 

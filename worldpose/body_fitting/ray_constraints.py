@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
-from data_contracts.keypoints import KeypointDetections
+from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from worldpose.body_fitting.pose_space import interpolate_gaps
 from worldpose.geometry import Camera
+
+BLOCK: Final = 256
+"""Frames of detections in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,10 @@ class RayConstraints:
     """(frames, persons, 17, 3, 3) [1], projection that removes the part along the person's lines
     from a vector."""
 
+    def __getitem__(self, frames: slice) -> RayConstraints:
+        """Return the lines of sight in some frames."""
+        return RayConstraints(self.points[frames], self.across[frames])
+
     @property
     def seen(self) -> NDArray[np.bool_]:
         """(frames, persons), persons with at least one line."""
@@ -39,7 +46,7 @@ class RayConstraints:
 
 
 def find_ray_constraints(
-    cameras: Camera, detections: KeypointDetections, joints: Floats
+    cameras: Camera, detections: TrackedFrames, joints: Floats
 ) -> RayConstraints:
     """Return the lines of sight of joints that exactly one camera sees.
 
@@ -51,6 +58,19 @@ def find_ray_constraints(
         detections: detections of tracked people, left-right swaps undone.
         joints: (frames, persons, 17, 3) [m], world, triangulated.
     """
+    origins = np.full(joints.shape, np.nan)
+    directions = np.full(joints.shape, np.nan)
+    for first in range(0, len(joints), BLOCK):
+        rows = slice(first, min(first + BLOCK, len(joints)))
+        origins[rows], directions[rows] = _lone_rays(cameras, detections[rows], joints[rows])
+    alone = np.isfinite(directions).any()
+    return lines_of_sight(origins, directions, expected_joints(joints) if alone else joints)
+
+
+def _lone_rays(
+    cameras: Camera, detections: KeypointDetections, joints: Floats
+) -> tuple[Floats, Floats]:
+    """Return origins and directions (frames, persons, 17, 3) of joints that one camera sees."""
     index = detections.detection_index
     frames, count, persons = index.shape
     origins = np.full(joints.shape, np.nan)
@@ -70,7 +90,7 @@ def find_ray_constraints(
         at = frame[mine], person[mine], joint[mine]
         rays = cameras[each].unproject(own[at[0], each, at[1], at[2]])
         origins[at], directions[at] = rays.origins, rays.directions
-    return lines_of_sight(origins, directions, expected_joints(joints) if alone.any() else joints)
+    return origins, directions
 
 
 def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> RayConstraints:

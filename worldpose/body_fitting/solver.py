@@ -11,8 +11,7 @@ seconds of each person are used.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body import BodyParameters
+from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body.model import BODY_POSE
 from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
@@ -55,11 +54,6 @@ accelerates as one: the search may count them all, the covariance of its poses m
 DAMPING: Final = 0.01
 """Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
 direction that uncertain."""
-WINDOW_FRAMES: Final = 3000
-"""Frames of a person that are solved together: their equations take 60 KB per frame."""
-MARGIN_S: Final = 3.0
-"""Time before and after a window that is solved with it [s]. Motion ties a pose to those within
-some tenths of a second."""
 UNRELATED_ACCELERATION: Final = 1e9
 """Acceleration of a body whose frames say nothing of each other [m/s^2]."""
 
@@ -114,51 +108,6 @@ class Solver:
             searched = guided if costs[1] < costs[0] else searched
         return searched
 
-    def solve_windows(
-        self,
-        evidence: Evidence,
-        shape: Shape,
-        offsets: Floats,
-        fps: float,
-        monocular_prior: MonocularPrior | None = None,
-    ) -> tuple[Pose, Floats, Floats]:
-        """Return one person's poses, and their points and covariance as in `pose_covariance`.
-
-        A long track is solved in overlapping windows, so that the memory of its equations does not
-        grow with it. Where a window begins or ends without any observation, or its kept frames
-        have none, bodies mean nothing.
-        """
-        frames = len(evidence.joints)
-        pose = Pose(
-            np.zeros((frames, 3)),
-            np.zeros((frames, 3)),
-            np.tile(self.prior.mean, (frames, 1)),
-            shape.betas,
-        )
-        alone = Pose(pose.transl[:1], pose.orient[:1], pose.angles[:1], shape.betas)
-        still = self.chained.differentiate(alone.parameters()).keypoints
-        points = np.tile(still, (frames, 1, 1))
-        spread = np.zeros((*points.shape, 3))
-        known = np.asarray(evidence.known.any(axis=1))
-        for part, kept in _windows(frames, fps, self.settings):
-            seen = part.start + np.flatnonzero(known[part])
-            if not ((seen >= kept.start) & (seen < kept.stop)).any():
-                continue
-            own = slice(int(seen[0]), int(seen[-1]) + 1)
-            solved, track = self.solve_poses(
-                Evidence(evidence.joints[own], evidence.information[own]),
-                shape,
-                offsets,
-                fps,
-                None if monocular_prior is None else monocular_prior.of(own),
-            )
-            found, errors = pose_covariance(track, solved, offsets)
-            to = slice(max(kept.start, own.start), min(kept.stop, own.stop))
-            of = slice(to.start - own.start, to.stop - own.start)
-            pose.transl[to], pose.orient[to] = solved.transl[of], solved.orient[of]
-            pose.angles[to], points[to], spread[to] = solved.angles[of], found[of], errors[of]
-        return pose, points, spread
-
     def search(self, track: Track, pose: Pose, offsets: Floats) -> tuple[Pose, Track]:
         """Return the pose after Gauss-Newton steps, and the track with standing ankles."""
         for step in range(self.settings.steps):
@@ -199,19 +148,6 @@ class Solver:
             level = slice(None) if seen is None else ~seen[:, foot - 7]
             angles[level, foot - 1] = Rigid(turned[level], np.zeros(3)).rotvec
         return replace(parameters, body_pose=angles.reshape(-1, BODY_POSE))
-
-
-def _windows(
-    frames: int, fps: float, settings: BodyFittingSettings
-) -> Iterator[tuple[slice, slice]]:
-    """Yield frames that are solved together, and those of them that are kept."""
-    margin = math.ceil(max(MARGIN_S, 2.0 * settings.max_filled_gap_s) * fps)
-    size = max(WINDOW_FRAMES, 2 * margin)
-    starts = range(0, frames, size) if frames > size + margin else (0,)
-    for start in starts:
-        stop = start + size if len(starts) > 1 and start + size < frames else frames
-        first, last = max(0, start - margin), min(frames, stop + margin)
-        yield slice(first, last), slice(start, stop)
 
 
 def _take_step(track: Track, pose: Pose, offsets: Floats) -> Pose:
@@ -314,19 +250,23 @@ class Piece:
 
 
 def fit_shapes(
-    solver: Solver, people: Mapping[int, Joints], known: Mapping[int, Shape], fps: float
+    solver: Solver,
+    people: Mapping[int, Sequence[Joints]],
+    known: Mapping[int, Shape],
+    fps: float,
 ) -> Shapes:
     """Return betas and the detector's offsets of people with triangulated joints.
 
     Args:
         solver: body, prior, settings and ground.
-        people: joints (frames, 17, 3) [m] and covariance (frames, 17, 3, 3) [m^2] of each.
+        people: joints (frames, 17, 3) [m] and covariance (frames, 17, 3, 3) [m^2] of each, in
+            intervals as `spread_intervals` chooses.
         known: shapes of some persons from other clips; the others start from the prior.
         fps: [1/s].
     """
 
     def sample(person: int) -> Piece | None:
-        return _sample_piece(solver, person, *people[person], fps)
+        return _sample_piece(solver, person, people[person], fps)
 
     pieces = [piece for piece in map_in_threads(sample, people) if piece is not None]
     return solve_shapes(solver, people, pieces, known)
@@ -443,7 +383,7 @@ def _eliminate_poses(
 
 
 def _sample_piece(
-    solver: Solver, person: int, joints: Floats, covariance: Floats, fps: float
+    solver: Solver, person: int, intervals: Sequence[Joints], fps: float
 ) -> Piece | None:
     """Return intervals of a person's track for shape estimation, with initial bodies.
 
@@ -453,11 +393,12 @@ def _sample_piece(
     stride = max(1, int(fps / settings.shape_rate_hz))
     rate = fps / stride
     scale = (settings.noise_scale * JOINT_SPREAD[:, None, None]) ** 2
+    joints, covariance = (np.concatenate(column) for column in zip(*intervals, strict=True))
     bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
     evidence, poses, starts, frames = [], [], [], 0
-    for part in spread_intervals(len(joints), fps, settings):
-        some, sure = joints[part][::stride], covariance[part][::stride]
+    for interval in intervals:
+        some, sure = (each[::stride] for each in interval)
         if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
             continue
         some = shorten_limbs(some, scale * sure)
@@ -489,3 +430,77 @@ def spread_intervals(frames: int, fps: float, settings: BodyFittingSettings) -> 
     count = max(1, round(settings.shape_time_s / PIECE_S))
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return [slice(int(start), int(start) + length) for start in starts]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedArrays:
+    """Arrays of a fit in progress."""
+
+    betas: Floats
+    orient: Floats
+    body_pose: Floats
+    transl: Floats
+    betas_covariance: Floats
+    joints: Floats
+    covariance: Floats
+    filled: NDArray[np.bool_]
+    guided: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, model: BodyModel, frames: int, persons: int) -> FittedArrays:
+        """Return arrays without any body."""
+
+        def nan(*shape: int) -> Floats:
+            return np.full(shape, np.nan)
+
+        return cls(
+            nan(persons, model.shapes),
+            nan(frames, persons, 3),
+            nan(frames, persons, BODY_POSE),
+            nan(frames, persons, 3),
+            nan(persons, model.shapes, model.shapes),
+            nan(frames, persons, 17, 3),
+            nan(frames, persons, 17, 3, 3),
+            np.zeros((frames, persons), dtype=bool),
+            np.zeros((frames, persons), dtype=bool),
+        )
+
+    def put(
+        self,
+        solver: Solver,
+        person: int,
+        span: slice,
+        pose: Pose,
+        joints: tuple[Floats, Floats],
+        shapes: Shapes,
+        determined: NDArray[np.bool_] | None = None,
+    ) -> BodyParameters:
+        """Write the result of one person, and return the bodies with their feet.
+
+        `joints` are the keypoints (frames, 17, 3) [m] and their covariance (frames, 17, 3, 3)
+        [m^2]; `determined` is as `seen` of `Solver.plant_feet`.
+
+        The covariance of the detector's offsets and of the person's own is added.
+        """
+        shape = shapes.people[person]
+        keypoints, covariance = joints
+        bodies = solver.plant_feet(pose, determined)
+        self.betas[person] = shape.betas
+        self.betas_covariance[person] = shape.covariance
+        self.orient[span, person] = bodies.global_orient
+        self.body_pose[span, person] = bodies.body_pose
+        self.transl[span, person] = bodies.transl
+        self.joints[span, person] = keypoints
+        axes = body_axes(keypoints)[:, None]
+        # A joint is the detector's joint minus the offset: the offset's covariance adds up.
+        shared = axes @ shapes.offsets_covariance @ axes.swapaxes(-1, -2)
+        own = solver.settings.own_bias_std_m**2 * np.eye(3)
+        self.covariance[span, person] = covariance + shared + own
+        return bodies
+
+    def drop(self, person: int, span: slice, gone: NDArray[np.bool_]) -> None:
+        """Remove a person from frames of a span."""
+        for array in (self.orient, self.body_pose, self.transl, self.joints, self.covariance):
+            array[span, person][gone] = np.nan
+        self.filled[span, person] &= ~gone
+        self.guided[span, person] &= ~gone

@@ -95,6 +95,13 @@ class ExtraJoints:
         }
         return replace(parts[0], **arrays)
 
+    def __getitem__(self, frames: slice) -> ExtraJoints:
+        """Return the points in some frames."""
+        arrays: dict[str, Any] = {
+            name: getattr(self, name)[frames] for name in ("joints", "covariance", "views")
+        }
+        return replace(self, **arrays)
+
 
 @dataclass(frozen=True)
 class Triangulation:

@@ -8,9 +8,9 @@ from worldpose.body import BodyParameters
 from worldpose.body_fitting import (
     BodyFittingSettings,
     ClipEvidence,
+    body_fit,
     fit_bodies,
     report_fit,
-    solver,
 )
 from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
 from worldpose.errors import InputError
@@ -92,7 +92,7 @@ def test_long_tracks_are_solved_in_windows_with_the_same_result(monkeypatch, los
     joints[1200:1230, 0, :9] = np.nan
     evidence = ClipEvidence(joints, covariance, 50.0)
     whole = fit_bodies(MODEL, evidence, SETTINGS)
-    monkeypatch.setattr(solver, "WINDOW_FRAMES", 300)
+    monkeypatch.setattr(body_fit, "WINDOW_FRAMES", 300)
     fit = fit_bodies(MODEL, evidence, SETTINGS)
     gone = np.isnan(fit.joints[:, 0, 0, 0])
     np.testing.assert_array_equal(gone, np.isnan(whole.joints[:, 0, 0, 0]))

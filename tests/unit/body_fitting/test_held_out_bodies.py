@@ -9,7 +9,7 @@ from walking_bodies import KEYPOINTS, MODEL, walker
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, SeenClip, fit_bodies
-from worldpose.body_fitting.held_out import _clustered_variance, compare_held_out
+from worldpose.body_fitting.fit_quality import _clustered_variance, compare_held_out
 from worldpose.geometry import Camera, Rigid
 from worldpose.simulation.scene import look_at
 from worldpose.triangulation import TriangulationSettings, triangulate_joints

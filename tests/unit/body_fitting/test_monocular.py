@@ -274,11 +274,6 @@ def test_the_pull_is_the_gradient_of_its_cost():
     ]
     assert (gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-6)
     np.testing.assert_array_equal(gradient[2], 0.0)
-    some = guidance.of(slice(1, 3)).normal_equations(orient[1:3], angles[1:3])
-    np.testing.assert_array_equal(some[1], gradient[1:3])
-    alike = replace(guidance, left=1.0)
-    some = alike.of(slice(1, 3)).normal_equations(orient[1:3], angles[1:3])
-    np.testing.assert_array_equal(some[0], alike.normal_equations(orient, angles)[0][1:3])
 
 
 @pytest.mark.parametrize("error", [0.05, 0.6])
