@@ -143,6 +143,7 @@ class ClipPeople:
     def read_joints(self, frames: slice) -> ClipEvidence:
         """Return the triangulated joints and points of some frames."""
         if self._last is None or not _holds(self._last[0], frames):
+            self._last = self._whole = None  # else both windows would be in memory
             placed = self._placed.isel(frame=frames)
             self._last = (
                 frames,
@@ -276,19 +277,21 @@ def publish_fit(
         further: what a result has besides bodies.
 
     Returns:
-        Bodies of the last window, with the shapes and offsets of the clip.
+        Shapes and offsets of the clip, without bodies of any frame.
     """
     model, settings, ground = _fitting_basis(people, recipe)
     known = {} if further is None else further.known_shapes
     metrics = FitMetrics(people.fps, people.stride)
     windows = fit_in_windows(model, people, settings, ground, known)
     with open_spool(store) as spool:
-        for part, fit in windows:
-            spool.add(_part_arrays(fit))
+        for part, bodies in windows:
+            spool.add(_part_arrays(bodies))
             evidence = people.read(part)
             if further is not None:
-                spool.add(further.of_part(part, fit, evidence))
-            metrics.add(fit, evidence.joints, (people.clip.cameras, _Frames(people, part)))
+                spool.add(further.of_part(part, bodies, evidence))
+            metrics.add(bodies, evidence.joints, (people.clip.cameras, _Frames(people, part)))
+            fit = bodies[:0]
+            del bodies, evidence  # while the next window is fitted
         whole = {
             "betas": fit.betas,
             "betas_covariance": fit.betas_covariance,

@@ -56,7 +56,7 @@ def filtering(work: Work) -> str:
         views, motion, suspects = case.at(chosen)
         systematic = learn_systematic_errors(
             case.clip.cameras,
-            case.joints[chosen],
+            case.bodies.read(chosen)[0],
             views,
             motion,
             suspects,
@@ -100,7 +100,7 @@ def filtering(work: Work) -> str:
             FILTERING,
             arrays=spool.arrays()
             | {"view_bias": systematic.view_bias.coefficient, "clock_late": systematic.late},
-            coordinates={"frame": case.clip.detections.frame, "person": case.person},
+            coordinates={"frame": case.clip.detections.frame, "person": case.bodies.person},
             attributes={"camera": list(case.clip.camera_ids)},
         )
         names = ("judged", "keypoints_rejected", "boxes_dropped", "boxes_of_others", "boxes_found")
@@ -113,16 +113,56 @@ def filtering(work: Work) -> str:
     return work.key
 
 
+class _Bodies:
+    """Fitted bodies of a clip, read by frames.
+
+    Attributes:
+        person: (persons,) ids.
+    """
+
+    def __init__(self, fitted: xr.Dataset, common_bias: Floats) -> None:
+        self.person: NDArray[np.integer] = fitted["person"].values
+        self._fitted = fitted
+        self._offsets: Floats = fitted["joint_offsets"].values
+        self._common_bias = common_bias
+
+    def read(self, frames: _Frames) -> tuple[Floats, Floats, Floats]:
+        """Return joints, motion and covariance in some frames.
+
+        Returns:
+            Body joints by the detector's definition (frames, persons, 17, 3) [m], world; their
+            motion per frame (frames, persons, 17, 3) [m], NaN if unknown; the covariance of the
+            joints (frames, persons, 17, 3, 3) [m^2].
+        """
+        last = self._fitted.sizes["frame"] - 1
+        rows = np.arange(last + 1)[frames]
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, last)
+        read = np.unique(np.concatenate([before, rows, after]))
+        joints = perceived_joints(_read_rows(self._fitted["joints"], read), self._offsets)
+        step = joints[np.searchsorted(read, after)] - joints[np.searchsorted(read, before)]
+        step /= np.maximum(after - before, 1)[:, None, None, None]
+        covariance = _read_rows(self._fitted["covariance"], rows)
+        return (
+            joints[np.searchsorted(read, rows)],
+            step,
+            perceived_covariance(covariance, self._common_bias),
+        )
+
+
+def _read_rows(array: xr.DataArray, rows: NDArray[np.int64]) -> NDArray[Any]:
+    """Return some rising rows of an array; consecutive ones are read as a slice."""
+    if len(rows) == rows[-1] - rows[0] + 1:
+        return np.asarray(array[int(rows[0]) : int(rows[-1]) + 1].values)
+    return np.asarray(array[rows].values)
+
+
 @dataclass(frozen=True, eq=False)
 class _Case:
     """A clip with its fitted bodies, read in chunks.
 
     Attributes:
         clip: all detections, without earlier rejections, of tracked people.
-        person: (persons,) ids.
-        joints: (frames, persons, 17, 3) [m], world, body joints by the detector's definition.
-        step: (frames, persons, 17, 3) [m], motion per frame; NaN if unknown.
-        covariance: (frames, persons, 17, 3, 3) [m^2].
+        bodies: the bodies.
         placed: result of `retriangulation`.
         dropped: (frames, cameras, detections), boxes that the previous iteration dropped; None in
             the first.
@@ -130,10 +170,7 @@ class _Case:
     """
 
     clip: ClipInputs
-    person: NDArray[np.integer]
-    joints: NDArray[np.float64]
-    step: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    bodies: _Bodies
     placed: xr.Dataset
     dropped: NDArray[np.bool_] | None
     triangulation: TriangulationSettings
@@ -158,8 +195,9 @@ class _Case:
 
     def project(self, frames: _Frames) -> tuple[BodyViews, BodyMotion]:
         """Return the bodies, and their motion, in all images."""
-        motion = watch_motion(self.clip.cameras, self.joints[frames], self.step[frames])
-        return view_bodies(self.clip.cameras, self.joints[frames], self.covariance[frames]), motion
+        joints, step, covariance = self.bodies.read(frames)
+        motion = watch_motion(self.clip.cameras, joints, step)
+        return view_bodies(self.clip.cameras, joints, covariance), motion
 
     def read(
         self, frames: _Frames, offsets: NDArray[Any], exchanged: NDArray[Any]
@@ -186,15 +224,11 @@ def _open(store: Store, work: Work) -> _Case:
         if name in work.recipe.inputs
     )
     placed = open_input(store, work, f"retriangulation/{unit}")
-    joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
     return _Case(
         clip=open_clip(store, work, filtered=False, shifted=False).assign_people(
             tracks["detection_index"].values
         ),
-        person=tracks["person"].values,
-        joints=joints,
-        step=np.gradient(joints, axis=0) if len(joints) > 1 else np.zeros_like(joints),
-        covariance=perceived_covariance(bodies["covariance"].values, placed["common_bias"].values),
+        bodies=_Bodies(bodies, placed["common_bias"].values),
         placed=placed,
         dropped=load_dropped_boxes(store, work),
         triangulation=load_triangulation_settings(store, work.recipe, unit),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -86,10 +87,10 @@ def _ground_arrays(store: Store, work: Work, people: Identities) -> dict[str, ND
     index = np.where(people.on_plane[:, None], people.detection_index, -1)
     # Without triangulated people, all feet tell the clocks.
     is_placed = np.isfinite(people.joints).any()
-    positions = _locate_feet(clip, pitch, _mark(index, clip) if is_placed else None)
+    feet = _locate_feet(clip, pitch, _mark(index, clip) if is_placed else None)
     middle = triangulated_places(people.joints)
-    clocks = _estimate_clocks(positions, clip, pitch, people.joints)
-    tracks = locate_tracks(positions, index, clip.fps, clocks.seconds, middle)
+    clocks = _estimate_clocks(feet.positions, clip, pitch, people.joints)
+    tracks = locate_tracks(feet.positions, feet.places_of(index), clip.fps, clocks.seconds, middle)
     arrays = {
         "ground": tracks.xy,
         "ground_velocity": tracks.velocity,
@@ -186,23 +187,63 @@ def _mark(detection_index: NDArray[np.integer], clip: ClipInputs) -> NDArray[np.
     return mask
 
 
-def _locate_feet(
-    clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None
-) -> GroundPositions:
+@dataclass(frozen=True, eq=False)
+class _Feet:
+    """Foot positions of some detections of a clip.
+
+    Attributes:
+        positions: (frames, cameras, places), in the order of the detections. There are as many
+            places as one camera has such detections in one frame: where most people are
+            triangulated, far fewer than detections.
+        detection: (frames, cameras, places) int16, the detection at each place; -1 = none.
+    """
+
+    positions: GroundPositions
+    detection: NDArray[np.int16]
+
+    def detections_of(self, place: NDArray[np.integer]) -> NDArray[np.int16]:
+        """Return the detections at places (frames, cameras, people); -1 = none."""
+        found = np.take_along_axis(self.detection, np.maximum(place, 0).astype(np.int64), axis=2)
+        return np.where(place >= 0, found, -1).astype(np.int16)
+
+    def places_of(self, detection: NDArray[np.integer]) -> NDArray[np.int16]:
+        """Return the places of detections (frames, cameras, people); -1 = none."""
+        place = np.full(detection.shape, -1, dtype=np.int16)
+        for number in range(self.detection.shape[2]):
+            own = self.detection[:, :, number, None]
+            place[(detection == own) & (own >= 0)] = number
+        return place
+
+
+def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None) -> _Feet:
     """Return foot positions by camera of chosen detections; None = all."""
     pitch = clip.raise_pitch(pitch)
-    blocks = [slice(n, n + BLOCK) for n in range(0, len(clip.detections.frame), BLOCK)]
-    return GroundPositions.concatenate(
-        [
-            locate_feet(
-                clip.cameras,
-                clip.detections[rows],
-                pitch,
-                camera_covariance=clip.camera_covariance,
-                chosen=None if chosen is None else chosen[rows],
-            )
-            for rows in blocks
-        ]
+    parts = []
+    for first in range(0, len(clip.detections.frame), BLOCK):
+        rows = slice(first, first + BLOCK)
+        detections = clip.detections[rows]
+        there = np.isfinite(detections.confidence).any(-1) | np.isfinite(detections.boxes).all(-1)
+        own = np.asarray(there if chosen is None else there & chosen[rows])
+        located = locate_feet(
+            clip.cameras,
+            detections,
+            pitch,
+            camera_covariance=clip.camera_covariance,
+            chosen=own,
+        )
+        order = np.argsort(~own, axis=2, kind="stable")[:, :, : max(1, int(own.sum(axis=2).max()))]
+        found = np.where(np.take_along_axis(own, order, axis=2), order, -1).astype(np.int16)
+        parts.append((located.select(order), found))
+    places = max(found.shape[2] for _, found in parts)
+    wider = [(0, 0), (0, 0)]
+    return _Feet(
+        GroundPositions.concatenate([located.widen(places) for located, _ in parts]),
+        np.concatenate(
+            [
+                np.pad(found, [*wider, (0, places - found.shape[2])], constant_values=-1)
+                for _, found in parts
+            ]
+        ),
     )
 
 
@@ -229,9 +270,11 @@ def _track_on_plane(
         The people, metrics, and a sentence on clocks; None without any of them.
     """
     is_triangulated = _mark(found.detection_index, clip)
-    positions = _locate_feet(clip, pitch, ~is_triangulated)
+    feet = _locate_feet(clip, pitch, ~is_triangulated)
+    positions = feet.positions
     clocks = _estimate_clocks(positions, clip, pitch, found.joints)
-    detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]) | is_triangulated)
+    detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]))
+    detections += np.count_nonzero(is_triangulated)
     if not np.isfinite(positions.xy).any():
         return None
     tracks = track_on_plane(
@@ -247,7 +290,8 @@ def _track_on_plane(
     if not tracks.detection_index.shape[2]:
         return None
     is_placed = np.asarray(np.isfinite(tracks.xy).all(axis=-1))
-    added = add_plane_tracks(found, tracks.detection_index, is_placed, tracks.continues)
+    index = feet.detections_of(tracks.detection_index)
+    added = add_plane_tracks(found, index, is_placed, tracks.continues)
     variance = np.trace(tracks.covariance, axis1=-2, axis2=-1)
     figures = {
         "people": float(len(added.person)),

@@ -50,7 +50,7 @@ def test_legs_that_triangulation_exchanged_are_exchanged_for_bodies_too(monkeypa
     monkeypatch.setattr(body_fitting, "open_clip", lambda *_: clip)
     monkeypatch.setattr(body_fitting, "open_input", lambda store, work, name: results[name])
     people = body_fitting.open_people(None, SimpleNamespace(recipe=SimpleNamespace(unit="clip")))
-    np.testing.assert_array_equal(people.detections.keypoints, truth)
+    np.testing.assert_array_equal(people[:].keypoints, truth)
 
 
 @pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
@@ -97,6 +97,10 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
     monkeypatch, feed_offset, late
 ):
     arrays = camera_arrays(beside(3))
+    seen = xr.Dataset(
+        {"keypoints": (("frame", "detection", "joint", "axis"), np.zeros((3, 1, 17, 2)))},
+        coords={"frame": [100, 101, 102]},
+    )
     found = xr.Dataset(
         {
             name: ([f"{name}_{axis}" for axis in range(values.ndim)], values)
@@ -104,11 +108,18 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
         },
         attrs={"feed_offset": {"frames": 1.5}},
     )
-    monkeypatch.setattr(refitting, "open_input", lambda *_: found)
+    inputs = {"broadcast_calibration/clip": found, "ingest/clip": seen}
+    monkeypatch.setattr(refitting, "open_input", lambda store, work, name: inputs[name])
     calibrated = SimpleNamespace(recipe=SimpleNamespace(settings={"feed_offset": feed_offset}))
     store = SimpleNamespace(manifest=lambda *_: calibrated)
-    work = of_clip(offset_frames=4, broadcast_offset_frames=4.25)
-    pictures = refitting._pictures(store, work, np.arange(100, 103))
+    work = of_clip(
+        frame_count=3,
+        offset_frames=4,
+        broadcast_offset_frames=4.25,
+        seen_in_broadcast="ingest/clip",
+        estimates=None,
+    )
+    pictures = refitting._BroadcastViews.open(store, work, {"joints": None})
     # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
     # feed was measured to show what static cameras show one and a half frames on.
     assert pictures.late == late
@@ -117,16 +128,13 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
 
 
 @pytest.mark.parametrize("late", [1.0, -2.0, 0.5])
-def test_lines_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, late):
+def test_lines_of_pictures_that_are_late_are_those_of_the_frames(late):
     frame, camera = np.arange(12), beside(12)
     keypoints = camera.project(runner(frame + late)[:, 0])[:, None]
-    seen = xr.Dataset(
-        {"keypoints": (("frame", "detection", "joint", "axis"), keypoints)},
-        coords={"frame": 100 + frame},
-    )
-    monkeypatch.setattr(refitting, "open_input", lambda *_: seen)
-    pictures = refitting._Pictures(frame, camera, late)
-    view = refitting._view(None, of_clip(seen_in_broadcast="ingest/clip"), pictures, runner(frame))
+    seen, joints = xr.DataArray(keypoints), xr.DataArray(runner(frame))
+    views = refitting._BroadcastViews(frame, camera, late, seen, joints, None)
+    view, without = views(slice(0, 12))
+    assert without is None
     there = view.seen[:, 0]
     assert there.sum() >= 10
     # He runs straight on, so that the middle of two of his places is one.
@@ -138,7 +146,7 @@ def test_lines_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, la
 
 
 @pytest.mark.parametrize("late", [1.0, -2.0])
-def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, late):
+def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(late):
     frame, camera = np.arange(12), beside(12)
 
     def turned(time):
@@ -149,11 +157,9 @@ def test_bodies_of_pictures_that_are_late_are_those_of_the_frames(monkeypatch, l
     image = camera.project(runner(frame + late)[:, 0])
     middle = 0.5 * (image.min(axis=1) + image.max(axis=1))
     estimates = MonocularEstimates(104 + frame, rotations, middle, False)
-    monkeypatch.setattr(refitting, "read_monocular", lambda path: estimates)
-    monkeypatch.setattr(refitting, "require_registered", lambda *_: None)
-    work = of_clip(estimates="bodies.npz", estimates_sha256="")
-    pictures = refitting._Pictures(104 + frame, camera, late)
-    found = refitting._read_monocular_poses(work, pictures, runner(frame))
+    nobody, joints = xr.DataArray(np.full((12, 1, 17, 2), np.nan)), xr.DataArray(runner(frame))
+    views = refitting._BroadcastViews(104 + frame, camera, late, nobody, joints, estimates)
+    _, found = views(slice(0, 12))
     there = np.isfinite(found.orient).all(axis=(-2, -1))[:, 0]
     assert there.sum() >= 10
     np.testing.assert_allclose(found.orient[there, 0], turned(frame[there]), atol=1e-9)

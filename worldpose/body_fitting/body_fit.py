@@ -285,11 +285,8 @@ def fit_in_windows(
         known_shapes or {},
     )
     for window, kept in _windows(evidence.size[0], evidence.fps, settings):
-        fit = clip.fit(evidence.read(window), window, kept)
-        yield (
-            kept,
-            fit if kept == window else fit[kept.start - window.start : kept.stop - window.start],
-        )
+        # Not bound here, so that its memory is free while the next window is fitted.
+        yield kept, clip.fit(evidence.read(window), window, kept)
 
 
 def _windows(
@@ -402,7 +399,7 @@ class _ClipBodies:
     points: PointModel | None = None
 
     def fit(self, evidence: ClipEvidence, window: slice, kept: slice) -> BodyFit:
-        """Return the bodies in a window of frames.
+        """Return the bodies in some frames, fitted in a window around them.
 
         Where the window begins or ends without any observation of a person, or the frames to keep
         have none, the person is missing.
@@ -477,7 +474,10 @@ class _ClipBodies:
             result.betas[person] = self.shapes.people[person].betas
             result.betas_covariance[person] = self.shapes.people[person].covariance
         fit = BodyFit.of(result, self.shapes)
-        return fit if extra is None else replace(fit, extra=extra.fit())
+        fit = fit if extra is None else replace(fit, extra=extra.fit())
+        if kept == window:
+            return fit
+        return fit[kept.start - window.start : kept.stop - window.start]
 
 
 def _trim(

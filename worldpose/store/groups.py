@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import mmap
 import os
 import warnings
 from collections.abc import AsyncIterator, Iterable, Mapping
@@ -97,6 +98,15 @@ def array_parts(array: ArrayLayout, shape: tuple[int, ...]) -> list[tuple[slice,
     ]
 
 
+def release_memory(values: NDArray[Any]) -> None:
+    """Give back the memory of an array that lies in a file; its parts are read again on access."""
+    base: Any = values
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
 def normalize_nans(values: NDArray[Any]) -> NDArray[Any]:
     """Return the values with one bit pattern for every NaN.
 
@@ -169,6 +179,7 @@ def _check_values(where: str, array: ArrayLayout, values: NDArray[Any]) -> None:
     number, first, value = 0, (), None
     for part in array_parts(array, values.shape):
         wrong = _wrong_values(array, values[part])
+        release_memory(values)
         if not wrong.any():
             continue
         if not number:
@@ -368,6 +379,7 @@ def write_group(
                 files[path] = ()
             else:
                 files[path] = _write_shard(folder / path, array, values[part], values.shape)
+            release_memory(values)
     # If another process has removed files meanwhile, their number reveals it.
     with suppress(FileNotFoundError), warnings.catch_warnings():
         # Zarr warns that other readers may ignore it, as the format allows.

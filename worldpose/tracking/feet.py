@@ -7,13 +7,13 @@ sight, and short across.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
@@ -82,12 +82,33 @@ class GroundPositions:
     @classmethod
     def concatenate(cls, parts: Sequence[GroundPositions]) -> GroundPositions:
         """Return the frames of several parts, one after the other."""
-        names = ["xy", "noise", "calibration", "height"]
-        if all(part.boxes is not None for part in parts):
-            names += ["is_whole", "boxes"]
-        if all(part.shirts is not None for part in parts):
-            names.append("shirts")
+        names = set.intersection(*({*part.known()} for part in parts))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+    def known(self) -> dict[str, Any]:
+        """Return the arrays by name, without those that are not known."""
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: array for name, array in arrays.items() if array is not None}
+
+    def select(self, detections: Integers) -> GroundPositions:
+        """Return some detections of every frame and camera (frames, cameras, places), by index."""
+        rows, cameras = np.ogrid[: len(detections), : detections.shape[1]]
+        at = rows[..., None], cameras[..., None], detections
+        return GroundPositions(**{name: array[at] for name, array in self.known().items()})
+
+    def widen(self, places: int) -> GroundPositions:
+        """Return as many detections of every frame and camera, with missing ones at the end."""
+        more = [(0, 0), (0, 0), (0, places - self.height.shape[2])]
+        return GroundPositions(
+            **{
+                name: np.pad(
+                    array,
+                    more + [(0, 0)] * (array.ndim - 3),
+                    constant_values=False if array.dtype == np.bool_ else np.nan,
+                )
+                for name, array in self.known().items()
+            }
+        )
 
 
 def locate_feet(

@@ -8,6 +8,7 @@ from worldpose.body import BodyParameters
 from worldpose.body_fitting import (
     BodyFittingSettings,
     ClipEvidence,
+    FitMetrics,
     body_fit,
     fit_bodies,
     report_fit,
@@ -233,3 +234,48 @@ def test_what_moves_all_joints_together_is_no_smaller_for_bodies():
         np.broadcast_to(np.diag([0.04, 0.01, 0.0]) ** 2, moved.covariance.shape),
         atol=1e-12,
     )
+
+
+def test_a_long_clip_is_read_by_windows(monkeypatch):
+    rng = np.random.default_rng(12)
+    joints, covariance = seen(walker(1300, rng), 0.03, rng)
+    evidence = ClipEvidence(joints, covariance, 50.0)
+    read = []
+
+    class Source:
+        size, fps = (1300, 1), 50.0
+
+        def read_joints(self, frames):
+            read.append(frames.stop - frames.start)
+            return evidence.read(frames)
+
+        read = read_joints
+
+    monkeypatch.setattr(body_fit, "WINDOW_FRAMES", 300)
+    parts = list(body_fit.fit_in_windows(MODEL, Source(), SETTINGS))
+    assert [part.start for part, _ in parts] == [0, 300, 600, 900, 1200]
+    assert [part.stop for part, _ in parts] == [300, 600, 900, 1200, 1300]
+    # A window with three seconds before and after it.
+    assert max(read) == 600
+    fit = fit_bodies(MODEL, evidence, SETTINGS)
+    for name in ("joints", "covariance", "filled"):
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(each, name) for _, each in parts]), getattr(fit, name)
+        )
+
+
+def test_metrics_of_parts_are_those_of_the_clip():
+    rng = np.random.default_rng(13)
+    joints, covariance = seen(walker(120, rng), 0.02, rng)
+    fit = fit_bodies(MODEL, ClipEvidence(joints, covariance, 50.0), SETTINGS)
+    whole = report_fit(fit, joints, 50.0)
+    metrics = FitMetrics(50.0)
+    for part in (slice(0, 50), slice(50, 120)):
+        metrics.add(fit[part], joints[part])
+    parts = metrics.report()
+    assert (parts.bodies, parts.filled, parts.guided) == (120, 0, 0)
+    assert parts.residual_m == whole.residual_m
+    assert parts.bone_spread_m == pytest.approx(whole.bone_spread_m, rel=1e-12)
+    # Without the differences across the two parts.
+    assert parts.jerk_m_s3 == pytest.approx(whole.jerk_m_s3, rel=0.1)
+    assert parts.skating_m == pytest.approx(whole.skating_m, rel=0.1)

@@ -16,7 +16,7 @@ from store_samples import ATTRIBUTES, LAYOUT, all_sample_arrays, sample_coordina
 
 from data_contracts.arrays import ArrayLayout, GroupLayout
 from worldpose.errors import InternalError
-from worldpose.store.groups import write_group
+from worldpose.store.groups import release_memory, write_group
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -25,6 +25,12 @@ def contents(folder: Path) -> dict[str, bytes]:
         for path in folder.rglob("*")
         if path.is_file()
     }
+
+
+def file_memory() -> float:
+    """Resident memory of this process that files back [byte]."""
+    status = Path("/proc/self/status").read_text()
+    return 1024.0 * float(status.partition("RssFile:")[2].split()[0])
 
 
 def write(folder: Path, **changes: Any) -> dict[str, bytes]:
@@ -42,6 +48,25 @@ def test_equal_arrays_give_equal_files(tmp_path: Path) -> None:
     attributes["camera"] = tuple(attributes["camera"])
     write_group(tmp_path / "two", LAYOUT, arrays, sample_coordinates(), attributes)
     assert contents(tmp_path / "two") == one
+
+
+def test_arrays_on_disk_give_the_same_files_and_leave_memory(tmp_path: Path) -> None:
+    one = write(tmp_path / "one")
+    joints = all_sample_arrays()["joints"]
+    joints.tofile(tmp_path / "joints")
+    stored = np.memmap(tmp_path / "joints", joints.dtype, "r", shape=joints.shape)
+    assert write(tmp_path / "two", joints=stored) == one
+    np.testing.assert_array_equal(stored, joints)  # read again
+
+    large = np.arange(1 << 22, dtype=np.float64)
+    large.tofile(tmp_path / "large")
+    mapped = np.memmap(tmp_path / "large", np.float64, "r")
+    assert mapped.sum() == large.sum()
+    before = file_memory()
+    release_memory(np.asarray(mapped).reshape(2, -1)[1])
+    assert file_memory() < before - 30e6
+    release_memory(large)  # not in a file
+    np.testing.assert_array_equal(mapped, large)
 
 
 def test_threads_do_not_change_the_files(tmp_path: Path) -> None:

@@ -323,3 +323,18 @@ def test_parts_of_a_person_continue_the_track_and_start_none(ring):
     assert tracks.xy.shape[1] == 2
     everything = replace(found, is_whole=None)
     assert track_on_plane(everything, FPS, pitch_size=SIZE).xy.shape[1] >= 2
+
+
+def test_chosen_places_of_a_frame_stand_beside_each_other_and_widen_with_missing_ones():
+    places = np.arange(24.0).reshape(2, 2, 3, 2)
+    chosen = np.array([[[2, 0], [1, 2]], [[0, 1], [2, 1]]])
+    some = replace(positions_at(places), is_whole=np.ones((2, 2, 3), dtype=bool)).select(chosen)
+    np.testing.assert_array_equal(some.xy[0, 0], places[0, 0, [2, 0]])
+    np.testing.assert_array_equal(some.xy[1, 1], places[1, 1, [2, 1]])
+    wide = some.widen(4)
+    np.testing.assert_array_equal(wide.xy[:, :, :2], some.xy)
+    assert np.isnan(wide.xy[:, :, 2:]).all() and np.isnan(wide.height[:, :, 2:]).all()
+    assert wide.is_whole[:, :, :2].all() and not wide.is_whole[:, :, 2:].any()
+    assert wide.boxes is None
+    joined = GroundPositions.concatenate([some, some])
+    assert joined.xy.shape == (4, 2, 2, 2) and joined.is_whole.shape == (4, 2, 2)
