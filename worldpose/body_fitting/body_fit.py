@@ -305,7 +305,7 @@ def _windows(
 def _learn_clip(
     evidence: EvidenceSource, solver: Solver, known_shapes: Mapping[int, Shape]
 ) -> _ClipBodies:
-    """Return what all frames of a clip share."""
+    """Return the shapes and offsets of a clip."""
     (frames, persons), fps = evidence.size, evidence.fps
     parts = [kept for _, kept in _windows(frames, fps, solver.settings)]
     seen = np.zeros((frames, persons), dtype=np.bool_)
@@ -382,7 +382,7 @@ def _read_samples(
 
 @dataclass(frozen=True, eq=False)
 class _ClipBodies:
-    """What all frames of a clip share.
+    """Shapes, offsets and spans, which all frames of a clip share.
 
     Attributes:
         solver: solver of the joints.

@@ -233,7 +233,7 @@ def feet_determined(
 
 @dataclass(frozen=True, eq=False)
 class PointModel:
-    """What a clip tells of the points besides COCO-17 of its detector.
+    """Points besides COCO-17 of a detector: where it sees them, and how surely.
 
     Attributes:
         solver: solver of poses that knows the points, where the detector has them.
@@ -305,7 +305,7 @@ def learn_points(
     shapes: Shapes,
     fps: float,
 ) -> PointModel:
-    """Return what some seconds of each person tell of a detector's points.
+    """Return the model of a detector's points, learned from some seconds of each person.
 
     Args:
         solver: solver of the joints.

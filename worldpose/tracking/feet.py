@@ -82,10 +82,10 @@ class GroundPositions:
     @classmethod
     def concatenate(cls, parts: Sequence[GroundPositions]) -> GroundPositions:
         """Return the frames of several parts, one after the other."""
-        names = set.intersection(*({*part.known()} for part in parts))
+        names = set.intersection(*({*part.arrays()} for part in parts))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
-    def known(self) -> dict[str, Any]:
+    def arrays(self) -> dict[str, Any]:
         """Return the arrays by name, without those that are not known."""
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: array for name, array in arrays.items() if array is not None}
@@ -94,7 +94,7 @@ class GroundPositions:
         """Return some detections of every frame and camera (frames, cameras, places), by index."""
         rows, cameras = np.ogrid[: len(detections), : detections.shape[1]]
         at = rows[..., None], cameras[..., None], detections
-        return GroundPositions(**{name: array[at] for name, array in self.known().items()})
+        return GroundPositions(**{name: array[at] for name, array in self.arrays().items()})
 
     def widen(self, places: int) -> GroundPositions:
         """Return as many detections of every frame and camera, with missing ones at the end."""
@@ -106,7 +106,7 @@ class GroundPositions:
                     more + [(0, 0)] * (array.ndim - 3),
                     constant_values=False if array.dtype == np.bool_ else np.nan,
                 )
-                for name, array in self.known().items()
+                for name, array in self.arrays().items()
             }
         )
 
