@@ -25,6 +25,7 @@ from worldpose.review.identities import (
 )
 from worldpose.store import Store
 from worldpose.tracking import (
+    FrameBlocks,
     GroundPositions,
     PlaneClocks,
     TrackingSettings,
@@ -192,33 +193,39 @@ class _Feet:
     """Foot positions of some detections of a clip.
 
     Attributes:
-        positions: (frames, cameras, places), in the order of the detections. There are as many
-            places as one camera has such detections in one frame: where most people are
-            triangulated, far fewer than detections.
+        positions: (frames, cameras, places), in the order of the detections: as many places in a
+            block of frames as one camera has such detections in one of its frames.
         detection: (frames, cameras, places) int16, the detection at each place; -1 = none.
     """
 
     positions: GroundPositions
-    detection: NDArray[np.int16]
+    detection: FrameBlocks
 
     def detections_of(self, place: NDArray[np.integer]) -> NDArray[np.int16]:
         """Return the detections at places (frames, cameras, people); -1 = none."""
-        found = np.take_along_axis(self.detection, np.maximum(place, 0).astype(np.int64), axis=2)
-        return np.where(place >= 0, found, -1).astype(np.int16)
+        out = np.full(place.shape, -1, dtype=np.int16)
+        for number, detection in enumerate(self.detection.parts):
+            rows = slice(number * BLOCK, number * BLOCK + len(detection))
+            at = np.maximum(place[rows], 0).astype(np.int64)
+            found = np.take_along_axis(detection, at, axis=2)
+            out[rows] = np.where(place[rows] >= 0, found, -1)
+        return out
 
     def places_of(self, detection: NDArray[np.integer]) -> NDArray[np.int16]:
         """Return the places of detections (frames, cameras, people); -1 = none."""
         place = np.full(detection.shape, -1, dtype=np.int16)
-        for number in range(self.detection.shape[2]):
-            own = self.detection[:, :, number, None]
-            place[(detection == own) & (own >= 0)] = number
+        for number, known in enumerate(self.detection.parts):
+            rows = slice(number * BLOCK, number * BLOCK + len(known))
+            for column in range(known.shape[2]):
+                own = known[:, :, column, None]
+                place[rows][(detection[rows] == own) & (own >= 0)] = column
         return place
 
 
 def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None) -> _Feet:
     """Return foot positions by camera of chosen detections; None = all."""
     pitch = clip.raise_pitch(pitch)
-    parts = []
+    positions, indices = [], []
     for first in range(0, len(clip.detections.frame), BLOCK):
         rows = slice(first, first + BLOCK)
         detections = clip.detections[rows]
@@ -232,19 +239,9 @@ def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool
             chosen=own,
         )
         order = np.argsort(~own, axis=2, kind="stable")[:, :, : max(1, int(own.sum(axis=2).max()))]
-        found = np.where(np.take_along_axis(own, order, axis=2), order, -1).astype(np.int16)
-        parts.append((located.select(order), found))
-    places = max(found.shape[2] for _, found in parts)
-    wider = [(0, 0), (0, 0)]
-    return _Feet(
-        GroundPositions.concatenate([located.widen(places) for located, _ in parts]),
-        np.concatenate(
-            [
-                np.pad(found, [*wider, (0, places - found.shape[2])], constant_values=-1)
-                for _, found in parts
-            ]
-        ),
-    )
+        positions.append(located.select(order))
+        indices.append(np.where(np.take_along_axis(own, order, axis=2), order, -1).astype(np.int16))
+    return _Feet(GroundPositions.join(positions, BLOCK), FrameBlocks(indices, BLOCK))
 
 
 def _estimate_clocks(
@@ -273,9 +270,9 @@ def _track_on_plane(
     feet = _locate_feet(clip, pitch, ~is_triangulated)
     positions = feet.positions
     clocks = _estimate_clocks(positions, clip, pitch, found.joints)
-    detections = np.count_nonzero(np.isfinite(positions.xy[..., 0]))
-    detections += np.count_nonzero(is_triangulated)
-    if not np.isfinite(positions.xy).any():
+    located = int(positions.number_seen().sum())
+    detections = located + np.count_nonzero(is_triangulated)
+    if not located:
         return None
     tracks = track_on_plane(
         positions,

@@ -1,14 +1,16 @@
-"""Foot positions of the detections that nobody has triangulated."""
+"""Foot positions of detections of people who are not triangulated."""
 
 import numpy as np
 
-from tasks.tracking import _Feet
-from worldpose.tracking import GroundPositions
+from tasks.tracking import BLOCK, _Feet
+from worldpose.tracking import FrameBlocks, GroundPositions
 
 # Two frames of one camera with five detections; 1 and 4, then 0 alone, are not triangulated.
 DETECTION = np.array([[[1, 4]], [[0, -1]]], dtype=np.int16)
-NOTHING = np.full((2, 1, 2), np.nan)
-FEET = _Feet(GroundPositions(np.full((2, 1, 2, 2), np.nan), NOTHING, NOTHING, NOTHING), DETECTION)
+FEET = _Feet(
+    GroundPositions(*(np.full((2, 1, 2, *shape), np.nan) for shape in ((2,), (2, 2), (2, 2), ()))),
+    FrameBlocks([DETECTION], BLOCK),
+)
 
 
 def test_places_are_those_of_their_detections():

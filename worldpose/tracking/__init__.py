@@ -10,7 +10,12 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.tracking.diagnosis import NoPeople, diagnose_no_people
-    from worldpose.tracking.feet import GroundPositions, count_covering_cameras, locate_feet
+    from worldpose.tracking.feet import (
+        FrameBlocks,
+        GroundPositions,
+        count_covering_cameras,
+        locate_feet,
+    )
     from worldpose.tracking.ground_tracks import (
         GroundTracks,
         TriangulatedPeople,
@@ -25,6 +30,7 @@ if TYPE_CHECKING:
     from worldpose.tracking.tracker import Tracking, TrackingReport, track_people
 
 __all__ = [
+    "FrameBlocks",
     "GroundPositions",
     "GroundTracks",
     "NoPeople",
@@ -53,6 +59,7 @@ __getattr__ = import_on_use(
             "diagnose_no_people",
         ),
         "worldpose.tracking.feet": (
+            "FrameBlocks",
             "GroundPositions",
             "count_covering_cameras",
             "locate_feet",

@@ -6,7 +6,7 @@ sight, and short across.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
@@ -53,6 +53,48 @@ PIXEL_SHARE: Final = 0.02
 """The same per height of the person in the image [1]."""
 
 
+class FrameBlocks:
+    """An array (frames, cameras, detections, ...) of parts with their own number of detections.
+
+    In one frame, hundreds of detections may lack what few lack in others.
+
+    Attributes:
+        parts: frames of each part, `length` of them but in the last.
+        shape: shape of the array with the largest number of detections.
+    """
+
+    def __init__(self, parts: Sequence[NDArray[Any]], length: int) -> None:
+        self.parts = tuple(parts)
+        self._length = length
+        first = self.parts[0].shape
+        most = max(part.shape[2] for part in self.parts)
+        self.shape = (sum(map(len, self.parts)), first[1], most, *first[3:])
+
+    def __getitem__(self, at: tuple[Any, ...]) -> NDArray[Any]:
+        """Return values of one frame, the first index; or of all frames as in `whole`."""
+        frame, *rest = at
+        if isinstance(frame, slice):
+            whole: NDArray[Any] = self.whole()[at]
+            return whole
+        part, row = divmod(int(frame), self._length)
+        values: NDArray[Any] = self.parts[part][(row, *rest)]
+        return values
+
+    def apply(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> FrameBlocks:
+        """Return the array of the function's results for each part."""
+        return FrameBlocks([function(part) for part in self.parts], self._length)
+
+    def whole(self) -> NDArray[Any]:
+        """Return the array in one piece, whose missing detections are NaN, -1 or False."""
+        dtype = self.parts[0].dtype
+        missing = {"b": False, "i": -1}.get(dtype.kind, np.nan)
+        whole = np.full(self.shape, missing, dtype=dtype)
+        for number, part in enumerate(self.parts):
+            first = number * self._length
+            whole[first : first + len(part), :, : part.shape[2]] = part
+        return whole
+
+
 @dataclass(frozen=True, eq=False)
 class GroundPositions:
     """Places on the pitch of detected people.
@@ -71,17 +113,17 @@ class GroundPositions:
             None = not known.
     """
 
-    xy: Floats
-    noise: Floats
-    calibration: Floats
-    height: Floats
-    is_whole: Flags | None = None
-    boxes: Floats | None = None
-    shirts: Floats | None = None
+    xy: Floats | FrameBlocks
+    noise: Floats | FrameBlocks
+    calibration: Floats | FrameBlocks
+    height: Floats | FrameBlocks
+    is_whole: Flags | FrameBlocks | None = None
+    boxes: Floats | FrameBlocks | None = None
+    shirts: Floats | FrameBlocks | None = None
 
     @classmethod
     def concatenate(cls, parts: Sequence[GroundPositions]) -> GroundPositions:
-        """Return the frames of several parts, one after the other."""
+        """Return the frames of several parts with the same number of detections."""
         names = set.intersection(*({*part.arrays()} for part in parts))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
@@ -90,25 +132,32 @@ class GroundPositions:
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: array for name, array in arrays.items() if array is not None}
 
+    @classmethod
+    def join(cls, parts: Sequence[GroundPositions], length: int) -> GroundPositions:
+        """Return the frames of several parts of `length` frames, the last of which may be shorter.
+
+        Each part keeps its own number of detections.
+        """
+        names = set.intersection(*({*part.arrays()} for part in parts))
+        return cls(
+            **{name: FrameBlocks([getattr(p, name) for p in parts], length) for name in names}
+        )
+
     def select(self, detections: Integers) -> GroundPositions:
         """Return some detections of every frame and camera (frames, cameras, places), by index."""
         rows, cameras = np.ogrid[: len(detections), : detections.shape[1]]
         at = rows[..., None], cameras[..., None], detections
         return GroundPositions(**{name: array[at] for name, array in self.arrays().items()})
 
-    def widen(self, places: int) -> GroundPositions:
-        """Return as many detections of every frame and camera, with missing ones at the end."""
-        more = [(0, 0), (0, 0), (0, places - self.height.shape[2])]
-        return GroundPositions(
-            **{
-                name: np.pad(
-                    array,
-                    more + [(0, 0)] * (array.ndim - 3),
-                    constant_values=False if array.dtype == np.bool_ else np.nan,
-                )
-                for name, array in self.arrays().items()
-            }
+    def number_seen(self) -> NDArray[np.int64]:
+        """Return how many detections have a place (frames, cameras)."""
+        return np.concatenate(
+            [np.isfinite(part[..., 0]).sum(axis=2, dtype=np.int64) for part in self.parts_xy()]
         )
+
+    def parts_xy(self) -> Sequence[Floats]:
+        """Return `xy` of consecutive frames."""
+        return self.xy.parts if isinstance(self.xy, FrameBlocks) else (self.xy,)
 
 
 def locate_feet(
@@ -223,7 +272,9 @@ def _are_parts(boxes: AnyFloats, confidence: AnyFloats, chosen: Flags) -> Flags:
     return np.asarray((overlap & surer).any(axis=1))
 
 
-def count_covering_cameras(cameras: Camera, positions: GroundPositions) -> NDArray[np.int64]:
+def count_covering_cameras(
+    cameras: Camera, positions: GroundPositions
+) -> NDArray[np.int64] | FrameBlocks:
     """Return how many cameras should see the person of each detection, the own one included.
 
     A camera should if the whole person is in its image, and not much smaller than in the camera
@@ -233,15 +284,22 @@ def count_covering_cameras(cameras: Camera, positions: GroundPositions) -> NDArr
         cameras: batch (cameras,).
         positions: places (frames, cameras, detections).
     """
-    found = np.nonzero(np.isfinite(positions.xy[..., 0]))
-    xy = positions.xy[found]
+    if isinstance(positions.xy, FrameBlocks):
+        return positions.xy.apply(lambda part: _count_covering(cameras, part))
+    return _count_covering(cameras, positions.xy)
+
+
+def _count_covering(cameras: Camera, places: Floats) -> NDArray[np.int64]:
+    """Return the cameras that should see people at places (frames, cameras, detections, 2) [m]."""
+    found = np.nonzero(np.isfinite(places[..., 0]))
+    xy = places[found]
     ends = np.stack([np.insert(xy, 2, z, axis=1) for z in (0.0, COVER_HEIGHT_M)])
     pixels = cameras[:, None].project(ends)  # (cameras, ends, detections, 2)
     size = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0.0) & (pixels <= cameras.image_size[:, None, None] - 1.0)
         large = size >= MIN_COVER_SIZE * size[found[1], np.arange(len(xy))]
-    count = np.zeros(positions.xy.shape[:3], dtype=np.int64)
+    count = np.zeros(places.shape[:3], dtype=np.int64)
     count[found] = np.maximum(1, np.count_nonzero(inside.all(axis=(1, -1)) & large, axis=0))
     return count
 

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compile_kernel
-from worldpose.tracking.feet import GroundPositions
+from worldpose.tracking.feet import FrameBlocks, GroundPositions
 from worldpose.tracking.plane_paths import (
     MIN_TRACK_S,
     PlanePath,
@@ -115,6 +115,11 @@ class _Sight:
         return cls(place, TRIANGULATED_NOISE)
 
 
+_Step = tuple[Floats, Floats, Floats, Floats]
+PACKED_STEPS: Final = 256
+"""Frames of a track that are packed together."""
+
+
 @dataclass(eq=False)
 class _Track:
     """One person while the filter runs."""
@@ -128,8 +133,10 @@ class _Track:
     """Frames with a whole detection."""
     person: int = -1
     """Triangulated person; -1 = none."""
-    steps: list[tuple[Floats, Floats, Floats, Floats]] = field(default_factory=list)
-    """By frame: predicted state and covariance, updated state and covariance."""
+    steps: list[_Step] = field(default_factory=list)
+    """Of the last frames: predicted state and covariance, updated state and covariance."""
+    packed: list[_Step] = field(default_factory=list)
+    """The same of the frames before, as arrays of some frames: single ones take thrice as much."""
     index: dict[int, dict[int, int]] = field(default_factory=dict)
     """Frame to camera to detection."""
     shirts: dict[int, ShirtMemory] = field(default_factory=dict)
@@ -148,6 +155,9 @@ class _Track:
     def predict(self, move: Floats, drift: Floats) -> None:
         """Go to the next frame."""
         self.state, self.covariance = _predict(self.state, self.covariance, move, drift)
+        if len(self.steps) >= PACKED_STEPS:
+            self.packed.append(_pack(self.steps))
+            self.steps.clear()
         self.steps.append((self.state, self.covariance, self.state, self.covariance))
 
     def correct(self, sight: _Sight, clock: float) -> None:
@@ -243,7 +253,7 @@ def track_on_plane(
     pitch_size: tuple[float, float],
     margin_m: float = BYSTANDER_M,
     triangulated: TriangulatedPeople | None = None,
-    covering: NDArray[np.integer] | None = None,
+    covering: NDArray[np.integer] | FrameBlocks | None = None,
 ) -> GroundTracks:
     """Return the tracks of people by their feet (T1, without triangulation).
 
@@ -272,7 +282,7 @@ def track_on_plane(
     dt = 1.0 / fps
     move, drift, inflation = _motion(fps)
     shirts = _learn_shirts(positions)
-    is_seen = np.asarray(np.isfinite(positions.xy[..., 0]).any(axis=2))
+    is_seen = positions.number_seen() > 0
     running: list[_Track] = []
     ended: list[_Track] = []
     for frame in range(frames):
@@ -533,10 +543,19 @@ def _follow_triangulated(tracks: list[_Track], places: Floats, frame: int) -> No
             tracks.append(track)
 
 
+def _pack(steps: Sequence[_Step]) -> _Step:
+    """Return steps as arrays whose first dimension is the frame."""
+    expected, expected_covariance, state, covariance = map(np.array, zip(*steps, strict=True))
+    return expected, expected_covariance, state, covariance
+
+
 def _smooth(track: _Track, move: Floats) -> PlanePath:
     """Return the track up to its last sighting, smoothed backwards."""
-    steps = track.steps[: track.last_seen - track.first + 1]
-    expected, expected_covariance, state, covariance = map(np.array, zip(*steps, strict=True))
+    parts = [*track.packed, _pack(track.steps)]
+    count = track.last_seen - track.first + 1
+    expected, expected_covariance, state, covariance = (
+        np.concatenate(column)[:count] for column in zip(*parts, strict=True)
+    )
     _smooth_backwards(move, expected, expected_covariance, state, covariance)
     return PlanePath(track.first, state, covariance, track.index, track.person)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.tracking.feet import PART_OVERLAP, GroundPositions
+from worldpose.tracking.feet import PART_OVERLAP, FrameBlocks, GroundPositions
 
 MIN_TRACK_S: Final = 0.4
 """Least time with detections of a track [s]."""
@@ -67,7 +67,9 @@ class PlanePath:
         return self.first + len(self.state) - 1
 
 
-def merge_paths(paths: list[PlanePath], fps: float, boxes: Floats | None) -> list[PlanePath]:
+def merge_paths(
+    paths: list[PlanePath], fps: float, boxes: Floats | FrameBlocks | None
+) -> list[PlanePath]:
     """Join paths that are one person's."""
     merged = True
     while merged:
@@ -90,7 +92,9 @@ def _common(a: PlanePath, b: PlanePath) -> tuple[slice, slice]:
     )
 
 
-def _is_same_person(a: PlanePath, b: PlanePath, fps: float, boxes: Floats | None) -> bool:
+def _is_same_person(
+    a: PlanePath, b: PlanePath, fps: float, boxes: Floats | FrameBlocks | None
+) -> bool:
     """Return whether two paths are one person's.
 
     Either they stay near each other and no camera sees both in one frame, or they lie so close for
@@ -193,7 +197,7 @@ def has_odd_height(path: PlanePath, positions: GroundPositions) -> bool:
     return bool(np.isfinite(height)) and not HEIGHTS[0] <= height <= HEIGHTS[1]
 
 
-def is_contradicted(path: PlanePath, covering: NDArray[np.integer] | None) -> bool:
+def is_contradicted(path: PlanePath, covering: NDArray[np.integer] | FrameBlocks | None) -> bool:
     """Return whether most cameras that cover the path's places do not see the person."""
     if covering is None:
         return False

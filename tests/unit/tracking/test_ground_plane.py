@@ -331,10 +331,32 @@ def test_chosen_places_of_a_frame_stand_beside_each_other_and_widen_with_missing
     some = replace(positions_at(places), is_whole=np.ones((2, 2, 3), dtype=bool)).select(chosen)
     np.testing.assert_array_equal(some.xy[0, 0], places[0, 0, [2, 0]])
     np.testing.assert_array_equal(some.xy[1, 1], places[1, 1, [2, 1]])
-    wide = some.widen(4)
-    np.testing.assert_array_equal(wide.xy[:, :, :2], some.xy)
-    assert np.isnan(wide.xy[:, :, 2:]).all() and np.isnan(wide.height[:, :, 2:]).all()
-    assert wide.is_whole[:, :, :2].all() and not wide.is_whole[:, :, 2:].any()
-    assert wide.boxes is None
+    assert some.boxes is None
     joined = GroundPositions.concatenate([some, some])
     assert joined.xy.shape == (4, 2, 2, 2) and joined.is_whole.shape == (4, 2, 2)
+
+
+def test_parts_with_few_detections_take_no_room_and_give_the_same_tracks():
+    places = walkers(
+        100, [[0.0, 0.0], [4.0, 1.0], [-9.0, 3.0]], [[3.0, 0.0], [-1.0, 1.0], [0.0, 2.0]]
+    )
+    places[40:, 2] = np.nan
+    whole = positions_at(
+        places[:, None] + 0.02 * np.random.default_rng(5).normal(size=(100, 1, 3, 2))
+    )
+    parts = [
+        whole.select(np.tile(np.arange(count), (len(rows), 1, 1)))
+        for count, rows in ((3, range(64)), (2, range(36)))
+    ]
+    parts[1] = replace(
+        parts[1], **{name: array[64:, :, :2] for name, array in whole.arrays().items()}
+    )
+    joined = GroundPositions.join(parts, 64)
+    assert joined.xy.shape == whole.xy.shape and joined.xy.parts[1].shape == (36, 1, 2, 2)
+    np.testing.assert_array_equal(joined.xy.whole(), whole.xy)
+    np.testing.assert_array_equal(joined.xy[70, 0, :, 0], whole.xy[70, 0, :2, 0])
+    np.testing.assert_array_equal(joined.number_seen(), whole.number_seen())
+    one, two = (track_on_plane(each, FPS, pitch_size=SIZE) for each in (whole, joined))
+    for name in ("detection_index", "xy", "covariance", "height"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert one.detection_index.shape[2] == 3
