@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         ClipEvidence,
         far_offsets,
         fit_bodies,
+        random_covariance,
         report_fit,
     )
     from worldpose.body_fitting.bones import (
@@ -76,6 +77,7 @@ __all__ = [
     "perceived_points",
     "place_monocular_poses",
     "pool_shapes",
+    "random_covariance",
     "read_monocular",
     "report_fit",
     "shift_frames",
@@ -90,6 +92,7 @@ __getattr__ = import_on_use(
             "ClipEvidence",
             "far_offsets",
             "fit_bodies",
+            "random_covariance",
             "report_fit",
         ),
         "worldpose.body_fitting.bones": (
