@@ -7,7 +7,7 @@
 Every match is simulated, run with default settings and scored in a separate process, one after the
 other; stages are called in the flow's order, without Prefect or Dask. Its row goes to
 DIR/rows.jsonl, and existing rows are not recomputed. With --recordings every second match replays
-recordings. --iterations N runs N passes over the stages.
+recordings. --iterations N runs N passes over the stages. --calibrated gives the exact cameras.
 
 Seen: people in the detections of two cameras or more in at least half of the frames. With a body:
 those of them with a body in at least half of these frames, within 1 m. Of joints seen by two
@@ -140,15 +140,22 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
     begun = time.monotonic()
     if name in FOREIGN_SCENARIOS:
         recordings = None if plan["recordings"] is None else Path(plan["recordings"])
-        given = {"duration": plan["duration"], "recordings": recordings}
-        simulate_foreign_match(FOREIGN_SCENARIOS[name], seed, out, **given)
+        simulate_foreign_match(
+            FOREIGN_SCENARIOS[name],
+            seed,
+            out,
+            duration=plan["duration"],
+            recordings=recordings,
+            calibrated=plan.get("calibrated", False),
+        )
         record = json.loads((out / "reference" / "world.json").read_text())
         row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
         row["detector"] = record["detector"]["name"]
     else:
-        simulate_match(
-            SCENARIOS[name], seed, out, MatchOptions(duration=plan["duration"], video=False)
+        options = MatchOptions(
+            duration=plan["duration"], video=False, calibrated=plan.get("calibrated", False)
         )
+        simulate_match(SCENARIOS[name], seed, out, options)
     row["simulated_s"] = round(time.monotonic() - begun, 1)
     spec = read_match(out).spec
     truth = read_joints(out / "reference" / "joints.npz")
@@ -311,8 +318,10 @@ def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
     else:
         numbers = [(MIX[k % len(MIX)], options.seed + k) for k in range(options.matches)]
     recordings = None if options.recordings is None else str(options.recordings)
+    further = {"calibrated": True} if options.calibrated else {}
     return [
-        {
+        further
+        | {
             "scenario": name,
             "seed": seed,
             "duration": options.duration,
@@ -332,6 +341,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the first match")
     parser.add_argument("--iterations", type=int, default=1)
     parser.add_argument("--recordings", type=Path, help="folder for every second match")
+    parser.add_argument("--calibrated", action="store_true", help="exact cameras")
     parser.add_argument("--limit", type=float, default=3600.0, help="for one match [s]")
     parser.add_argument("--resume", type=Path, default=Path("second_world"), metavar="DIR")
     parser.add_argument("--keep", action="store_true", help="keep match folders and projects")
