@@ -146,14 +146,14 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
             out,
             duration=plan["duration"],
             recordings=recordings,
-            calibrated=plan.get("calibrated", False),
+            calibrated=plan["calibrated"],
         )
         record = json.loads((out / "reference" / "world.json").read_text())
         row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
         row["detector"] = record["detector"]["name"]
     else:
         options = MatchOptions(
-            duration=plan["duration"], video=False, calibrated=plan.get("calibrated", False)
+            duration=plan["duration"], video=False, calibrated=plan["calibrated"]
         )
         simulate_match(SCENARIOS[name], seed, out, options)
     row["simulated_s"] = round(time.monotonic() - begun, 1)
@@ -318,14 +318,13 @@ def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
     else:
         numbers = [(MIX[k % len(MIX)], options.seed + k) for k in range(options.matches)]
     recordings = None if options.recordings is None else str(options.recordings)
-    further = {"calibrated": True} if options.calibrated else {}
     return [
-        further
-        | {
+        {
             "scenario": name,
             "seed": seed,
             "duration": options.duration,
             "iterations": options.iterations,
+            "calibrated": options.calibrated,
             "recordings": recordings if k % 2 and name in FOREIGN_SCENARIOS else None,
         }
         for k, (name, seed) in enumerate(numbers)
