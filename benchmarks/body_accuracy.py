@@ -1,7 +1,7 @@
 """Prints the accuracy of fitted bodies on simulated people, and gains in chunks with few cameras.
 
     python benchmarks/body_accuracy.py [--seeds 601 602 603] [--duration 4]
-    python benchmarks/body_accuracy.py --thin [--seeds 411 412 413 414 415 416]
+    python benchmarks/body_accuracy.py --thin [--foreign] [--seeds 411 412 413 414 415 416]
 
 Scenario `match`, cameras as surveyed. Standing: feet with a true speed below 0.1 m/s within 12 cm
 of the ground; height is that of their keypoints over the true ones'. Shape: of betas, height of the
@@ -10,19 +10,24 @@ body and six limbs, median over people.
 With `--thin` 14 people for 3 s; for 0.6 to 1.2 s, each keeps one or two of the cameras that see the
 person. Refitted as `refitting` does: with the broadcast camera's keypoints (S4), with bodies from a
 simulated monocular method, with errors of 80 mm after alignment, and with both. Errors are of
-people in the broadcast image, in those chunks.
+people in the broadcast image, in those chunks. With --foreign, people, detector and cameras are
+those of `foreign-match`, which has no moving camera: the static camera with most detections gives
+the further view, and estimates are drawn from bodies fitted to the true joints.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from worldpose.body import BodyParameters, load_open_body
 from worldpose.body_fitting import (
     BodyFit,
@@ -41,8 +46,10 @@ from worldpose.evaluation import evaluate_joints
 from worldpose.formats import JointTracks
 from worldpose.geometry import Camera
 from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, Scene, simulate_scene
+from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
+from worldpose.simulation.foreign import FOREIGN_SCENARIOS
+from worldpose.simulation.foreign.matches import simulate_foreign_scene
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, reconstruct_joints, undo_swaps
 
@@ -122,14 +129,14 @@ def whole(seed: int, duration: float) -> dict[str, float]:
     return figures
 
 
-def thin_out(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> NDArray[np.bool_]:
+def thin_out(fps: float, index: NDArray[np.int16], left: int, seed: int) -> NDArray[np.bool_]:
     """Remove all but some cameras' detections for a while; return (frames, persons) when."""
     rng = np.random.default_rng(seed)
     frames, cameras, persons = index.shape
     dark = np.zeros((frames, persons), np.bool_)
     for person in range(persons):
-        first = int(rng.integers(20, 60))
-        last = first + int(rng.integers(30, 60))
+        first = round(fps / 50.0 * int(rng.integers(20, 60)))
+        last = first + round(fps / 50.0 * int(rng.integers(30, 60)))
         order = rng.permutation(cameras)
         dark[first:last, person] = True
         for frame in range(first, min(last, frames)):
@@ -138,47 +145,102 @@ def thin_out(scene: Scene, index: NDArray[np.int16], left: int, seed: int) -> ND
     return dark
 
 
-def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
-    """Return the number of bodies in chunks with few cameras, and their errors [mm]."""
+@dataclass(frozen=True, eq=False)
+class ThinScene:
+    """A match with a further view.
+
+    Attributes:
+        fps: [1/s].
+        cameras: true static cameras, a batch (cameras,).
+        detections: (frames, cameras, detections).
+        further: camera of the further view, a batch (frames,).
+        keypoints: (frames, detections, 17, 2) [px] of the further view.
+        truth: (frames, persons, 17, 3) [m].
+        bodies: bodies (frames, persons) that the estimates show.
+        ground: height of the pitch.
+    """
+
+    fps: float
+    cameras: Camera
+    detections: KeypointDetections
+    further: Camera
+    keypoints: Floats
+    truth: Floats
+    bodies: BodyParameters
+    ground: Callable[[Floats, Floats], Floats]
+
+
+def own_scene(seed: int) -> ThinScene:
+    """Return 3 s of `match` with 14 people and its broadcast camera."""
     scenario = SCENARIOS["match"]
     crowd = scenario.crowd.model_copy(update={"people": 14})
     scene = simulate_scene(scenario.model_copy(update={"duration": 3.0, "crowd": crowd}), seed)
     assert scene.broadcast is not None
-    fps, frames = scenario.fps, scene.truth.frames
-    seen = scene.static_views()
-    cameras = Camera.stack(list(scene.cameras.values()))
-    index = track_people(cameras, seen.detections, fps, TrackingSettings()).detection_index
+    names = ("betas", "global_orient", "body_pose", "transl")
+    return ThinScene(
+        scenario.fps,
+        Camera.stack(list(scene.cameras.values())),
+        scene.static_views().detections,
+        scene.broadcast,
+        np.asarray(scene.observations["clip"].keypoints, np.float64),
+        scene.truth.joints,
+        BodyParameters(*(np.swapaxes(getattr(scene.poses, name), 0, 1) for name in names)),
+        PitchTemplate.from_spec(scene.surveyed).height,
+    )
+
+
+def foreign_scene(seed: int) -> ThinScene:
+    """Return 3 s of `foreign-match` with 14 people and one of its cameras as the further view."""
+    scenario = FOREIGN_SCENARIOS["foreign-match"].model_copy(update={"unsynchronised": 0.0})
+    scene = simulate_foreign_scene(scenario, seed, duration=3.0, people=14, calibrated=True)
+    assert scene.pitch is not None
+    seen = {name: report.observations for name, report in scene.reports.items()}
+    aside = max(seen, key=lambda name: int(np.isfinite(seen[name].score).sum()))
+    kept = [name for name in seen if name != aside]
+    joints, ground = scene.truth.joints, PitchTemplate.from_spec(scene.pitch.painted).height
+    covariance = np.array(np.broadcast_to(1e-4 * np.eye(3), (*joints.shape, 3)))
+    evidence = ClipEvidence(joints, covariance, scene.fps)
+    return ThinScene(
+        scene.fps,
+        Camera.stack([scene.cameras[name].camera for name in kept]),
+        KeypointDetections.stack([seen[name] for name in kept]),
+        Camera.stack([scene.cameras[aside].camera] * len(joints)),
+        np.asarray(seen[aside].keypoints, np.float64),
+        joints,
+        fit_bodies(BODY, evidence, SETTINGS, ground).parameters,
+        ground,
+    )
+
+
+def thin(scene: ThinScene, seed: int, left: int) -> tuple[int, dict[str, float]]:
+    """Return the number of bodies in chunks with few cameras, and their errors [mm]."""
+    fps, cameras, ground = scene.fps, scene.cameras, scene.ground
+    index = track_people(cameras, scene.detections, fps, TrackingSettings()).detection_index
     full = reconstruct_joints(
-        cameras, seen.detections.assign_people(index), fps, TRIANGULATION
+        cameras, scene.detections.assign_people(index), fps, TRIANGULATION
     ).triangulation.joints
-    who, away = nearest(full, scene.truth.joints)
+    who, away = nearest(full, scene.truth)
     index = index[:, :, away < 0.5].copy()
     who = who[away < 0.5]
-    dark = thin_out(scene, index, left, seed)
-    detections = seen.detections.assign_people(index)
+    dark = thin_out(fps, index, left, seed)
+    detections = scene.detections.assign_people(index)
     placed = reconstruct_joints(cameras, detections, fps, TRIANGULATION).triangulation
     joints, covariance = placed.joints, placed.covariance
     unswapped = undo_swaps(detections, placed.exchanged)
     static = find_ray_constraints(cameras, unswapped, joints)
-    ground = PitchTemplate.from_spec(scene.surveyed).height
 
     def fit(views: list[RayConstraints], monocular: MonocularPoses | None = None) -> BodyFit:
         evidence = ClipEvidence(joints, covariance, fps, placed.common_bias, views, monocular)
         return fit_bodies(BODY, evidence, SETTINGS, ground)
 
     first = fit([static])
-    own = identify_people(scene.broadcast, scene.observations["clip"].keypoints, first.joints)
-    moving = constrain_to_rays(scene.broadcast, own, first.joints)
-    bodies = BodyParameters(
-        *(
-            np.swapaxes(getattr(scene.poses, name), 0, 1)
-            for name in ("betas", "global_orient", "body_pose", "transl")
-        )
-    )
+    own = identify_people(scene.further, scene.keypoints, first.joints)
+    moving = constrain_to_rays(scene.further, own, first.joints)
     rng = np.random.default_rng(seed)
-    drawn = estimate_bodies(BODY, bodies, scene.broadcast, fps, MonocularErrors(), rng)
+    drawn = estimate_bodies(BODY, scene.bodies, scene.further, fps, MonocularErrors(), rng)
     estimates = parse_monocular(drawn, Path("estimates"))
-    monocular = place_monocular_poses(estimates, scene.broadcast, frames, first.joints)
+    frames = np.arange(len(joints))
+    monocular = place_monocular_poses(estimates, scene.further, frames, first.joints)
     fits = {
         "static cameras alone": first,
         "+ estimates": fit([static], monocular),
@@ -186,7 +248,7 @@ def thin(seed: int, left: int) -> tuple[int, dict[str, float]]:
         "+ both": fit([static, moving], monocular),
     }
     counted = dark & np.isfinite(own[..., 0]).any(axis=-1) & np.isfinite(first.joints[..., 0, 0])
-    truth = scene.truth.joints[:, who]
+    truth = scene.truth[:, who]
     errors = {
         label: 1e3 * float(np.nanmean(np.linalg.norm(fit.joints - truth, axis=-1)[counted]))
         for label, fit in fits.items()
@@ -200,6 +262,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--duration", type=float, default=4.0)
     parser.add_argument("--thin", action="store_true", help="where few cameras see people")
+    parser.add_argument("--foreign", action="store_true", help="in the second world, with --thin")
     options = parser.parse_args()
     if not options.thin:
         seeds = options.seeds or [601, 602, 603]
@@ -209,8 +272,9 @@ def main() -> None:
             print(f"  {label:38s} {np.mean([row[label] for row in rows]):8.2f}")
         return
     seeds = options.seeds or [411, 412, 413, 414, 415, 416]
+    scene_of = foreign_scene if options.foreign else own_scene
     for left in (1, 2):
-        found = [thin(seed, left) for seed in seeds]
+        found = [thin(scene_of(seed), seed, left) for seed in seeds]
         counts = [count for count, _ in found]
         print(f"{left} static camera(s), {sum(counts)} bodies, seeds {seeds}")
         base = np.average([row["static cameras alone"] for _, row in found], weights=counts)

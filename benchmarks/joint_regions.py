@@ -1,16 +1,96 @@
-"""Calibration of stated covariances: true joints inside predicted confidence regions."""
+"""Errors of joints by group, lengths of segments, and true joints inside stated regions."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.special import chdtri
 
-from data_contracts.arrays import Flags
+from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
 from worldpose.evaluation import EvaluationSettings
 from worldpose.evaluation.matching import joint_distances, match_people, select_frames, take_matched
 from worldpose.formats import JointTracks
+
+SEGMENTS = {
+    "shoulders": ((5, 6),),
+    "upper arms": ((5, 7), (6, 8)),
+    "forearms": ((7, 9), (8, 10)),
+    "trunk": ((5, 11), (6, 12)),
+    "hips": ((11, 12),),
+    "thighs": ((11, 13), (12, 14)),
+    "shanks": ((13, 15), (14, 16)),
+}
+"""Joints at both ends, left before right; shoulders and hips are across the body."""
+
+
+def group_joints(group: str) -> list[int]:
+    """Return the indices of a group's joints in COCO-17."""
+    parts = JOINT_GROUPS[group]
+    return [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
+
+
+def _match(
+    prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings
+) -> tuple[Floats, Floats | None, Flags]:
+    """Return matched joints, their covariance, and which of them count, as the true people."""
+    joints = select_frames(prediction.joints, prediction.frames, reference.frames)
+    match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
+    covariance = None
+    if prediction.covariance is not None:
+        stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
+        flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
+        covariance = flat.reshape(*flat.shape[:3], 3, 3)
+    found = take_matched(joints, match)
+    counts: Flags = np.asarray(np.isfinite(found - reference.joints).all(axis=-1))
+    if reference.views is not None:
+        counts &= reference.views >= settings.min_views
+    return found, covariance, counts
+
+
+def group_errors(
+    prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings | None = None
+) -> dict[str, tuple[float, int]]:
+    """Return the sum of distances [mm] and the number of joints per group.
+
+    Args:
+        prediction: estimated joints.
+        reference: true joints; with `views`, only joints seen by enough cameras count.
+        settings: gate and views; the defaults if None.
+    """
+    found, _, counts = _match(prediction, reference, settings or EvaluationSettings())
+    away = np.where(counts, 1e3 * np.linalg.norm(found - reference.joints, axis=-1), 0.0)
+    groups = {name: group_joints(name) for name in JOINT_GROUPS}
+    return {
+        name: (float(away[..., some].sum()), int(counts[..., some].sum()))
+        for name, some in groups.items()
+    }
+
+
+def segment_errors(prediction: JointTracks, reference: JointTracks) -> dict[str, list[float]]:
+    """Return the relative errors of segments' lengths [1], one per true person and side.
+
+    Lengths are medians over frames in which both ends are known in both.
+
+    Args:
+        prediction: estimated joints.
+        reference: true joints; with `views`, only joints seen by enough cameras count.
+    """
+    found, _, counts = _match(prediction, reference, EvaluationSettings())
+    errors: dict[str, list[float]] = {}
+    for name, bones in SEGMENTS.items():
+        errors[name] = []
+        for bone in bones:
+            both: Flags = np.asarray(counts[..., list(bone)].all(axis=-1))
+            ours, true = (
+                np.linalg.norm(np.diff(each[..., list(bone), :], axis=-2)[..., 0, :], axis=-1)
+                for each in (found, reference.joints)
+            )
+            for person in np.flatnonzero(both.any(axis=0)):
+                rows = both[:, person]
+                ratio = np.median(ours[rows, person]) / np.median(true[rows, person])
+                errors[name].append(float(ratio - 1.0))
+    return errors
 
 
 def region_counts(
@@ -42,22 +122,15 @@ def region_counts(
             found="joints without covariance",
             todo="Export the joints of a run, or evaluate without confidence regions.",
         )
-    joints = select_frames(prediction.joints, prediction.frames, reference.frames)
-    stated = select_frames(prediction.covariance, prediction.frames, reference.frames)
-    match = match_people(joint_distances(joints, reference.joints), settings.match_gate_m)
-    error = take_matched(joints, match) - reference.joints
-    flat = take_matched(stated.reshape(*stated.shape[:3], 9), match)
-    covariance = flat.reshape(*flat.shape[:3], 3, 3)
-    known = np.isfinite(error).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
-    counts: Flags = np.asarray(known)
-    if reference.views is not None:
-        counts &= reference.views >= settings.min_views
-    error = np.where(counts[..., None], error, 0.0)
+    found, covariance, counts = _match(prediction, reference, settings)
+    assert covariance is not None
+    counts &= np.isfinite(covariance).all(axis=(-1, -2))
+    error = np.where(counts[..., None], found - reference.joints, 0.0)
     covariance = np.where(counts[..., None, None], covariance, np.eye(3))
     squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
     inside: Flags = np.asarray(counts & (squared <= chdtri(3, 1.0 - level)))
-    found = {}
-    for group, parts in JOINT_GROUPS.items():
-        some = [index for index, name in enumerate(COCO17) if any(part in name for part in parts)]
-        found[group] = (int(inside[..., some].sum()), int(counts[..., some].sum()))
-    return found
+    groups = {name: group_joints(name) for name in JOINT_GROUPS}
+    return {
+        name: (int(inside[..., some].sum()), int(counts[..., some].sum()))
+        for name, some in groups.items()
+    }

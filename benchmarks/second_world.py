@@ -7,12 +7,14 @@
 Every match is simulated, run with default settings and scored in a separate process, one after the
 other; stages are called in the flow's order, without Prefect or Dask. Its row goes to
 DIR/rows.jsonl, and existing rows are not recomputed. With --recordings every second match replays
-recordings. --iterations N runs N passes over the stages.
+recordings. --iterations N runs N passes over the stages. --calibrated gives the exact cameras.
 
 Seen: people in the detections of two cameras or more in at least half of the frames. With a body:
-those of them with a body in at least half of these frames, within 1 m. Regions: share of joints,
-seen by two cameras, whose true place is in the stated 95 % region, by joint group; in brackets
-against the detector's joint definition, where the reference has it.
+those of them with a body in at least half of these frames, within 1 m. Of joints seen by two
+cameras: mean error by joint group; median error of segments' lengths over people and sides, and its
+signed median; and the share whose true place is in the stated 95 % region, by joint group. Regions
+by the body model's definition are compared with the true joints, those by the detector's
+definition with what the detector takes for joints.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joint_regions import region_counts
+from joint_regions import SEGMENTS, group_errors, region_counts, segment_errors
 from numpy.typing import NDArray
 
 from data_contracts.conventions import JOINT_GROUPS
@@ -53,7 +55,7 @@ from worldpose.formats import JointTracks, read_joints
 from worldpose.ingest import read_match
 from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
 from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
-from worldpose.store import Store, open_run
+from worldpose.store import Run, Store, open_run
 
 MIX = (
     *("foreign-match", "foreign-lab", "foreign-mixed", "foreign-two", "foreign-match"),
@@ -98,12 +100,20 @@ def views_of_detections(folder: Path, truth: JointTracks) -> NDArray[np.int64]:
     return count
 
 
-def score_stage(tracks: JointTracks, truth: JointTracks, fps: float) -> dict[str, Any]:
-    """Return the scores of one stage's joints, and the region coverage by group."""
+def score_stage(run: Run, stage: str, reference: Path, fps: float) -> dict[str, Any]:
+    """Return the scores of one stage's joints, in all and by joint group."""
+    tracks, truth = joint_tracks(run, "clip", stage), read_joints(reference / "joints.npz")
     scores, _ = evaluate_joints(tracks, truth, fps=fps)
     found: dict[str, Any] = {name: getattr(scores, name) for name in SCORES}
-    found["regions"] = {name: list(n) for name, n in region_counts(tracks, truth).items()}
-    return found
+    seen = joint_tracks(run, "clip", stage, "detector")
+    defined = read_joints(reference / "defined_joints.npz")
+    return found | {
+        "regions": region_counts(tracks, truth),
+        "regions_defined": region_counts(seen, defined),
+        "errors_mm": group_errors(tracks, truth),
+        "errors_defined_mm": group_errors(seen, defined),
+        "segments": segment_errors(tracks, truth),
+    }
 
 
 def people_with_bodies(
@@ -130,20 +140,25 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
     begun = time.monotonic()
     if name in FOREIGN_SCENARIOS:
         recordings = None if plan["recordings"] is None else Path(plan["recordings"])
-        given = {"duration": plan["duration"], "recordings": recordings}
-        simulate_foreign_match(FOREIGN_SCENARIOS[name], seed, out, **given)
+        simulate_foreign_match(
+            FOREIGN_SCENARIOS[name],
+            seed,
+            out,
+            duration=plan["duration"],
+            recordings=recordings,
+            calibrated=plan["calibrated"],
+        )
         record = json.loads((out / "reference" / "world.json").read_text())
         row |= {key: record[key] for key in ("layout", "pitch", "calibration")}
         row["detector"] = record["detector"]["name"]
     else:
-        simulate_match(
-            SCENARIOS[name], seed, out, MatchOptions(duration=plan["duration"], video=False)
+        options = MatchOptions(
+            duration=plan["duration"], video=False, calibrated=plan["calibrated"]
         )
+        simulate_match(SCENARIOS[name], seed, out, options)
     row["simulated_s"] = round(time.monotonic() - begun, 1)
     spec = read_match(out).spec
     truth = read_joints(out / "reference" / "joints.npz")
-    file = out / "reference" / "defined_joints.npz"
-    defined = read_joints(file) if file.is_file() else None
     row |= {"fps": spec.fps, "cameras": len(spec.static_cameras), "people": truth.joints.shape[1]}
     runs: list[RunRecord] = []
     for iteration in range(1, plan["iterations"] + 1):
@@ -164,12 +179,9 @@ def measure(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
         run, scored = open_run(str(project), spec.match_id, record.run_id), {}
         for stage in STAGES:
             if f"{stage}/clip" in run:
-                tracks = joint_tracks(run, "clip", stage)
-                scored[stage] = score_stage(tracks, truth, spec.fps)
-                if defined is not None:
-                    counts = np.array(list(region_counts(tracks, defined).values())).sum(axis=0)
-                    scored[stage]["regions_defined"] = counts.tolist()
-                bodies = tracks if stage == "body_fitting" else bodies
+                scored[stage] = score_stage(run, stage, out / "reference", spec.fps)
+                if stage == "body_fitting":
+                    bodies = joint_tracks(run, "clip", stage)
         row["stages"].append(scored)
     return row | people_with_bodies(bodies, truth, views_of_detections(out, truth))
 
@@ -237,41 +249,66 @@ def print_report(rows: list[dict[str, Any]]) -> None:
     names = list(dict.fromkeys(row["scenario"] for row in rows))
     foreign = [name for name in names if name in FOREIGN_SCENARIOS]
     groups = {name: [name] for name in names} | ({"second world": foreign} if foreign else {})
-    print("\nmean MPJPE / G-MPJPE / PA-MPJPE [mm], identity switches, and share of joints in their")
-    print("95 % regions [%]: " + ", ".join(JOINT_GROUPS) + "; all")
-    for title, members in groups.items():
-        some = [row for row in rows if row["scenario"] in members]
-        for iteration in range(max((len(row.get("stages", [])) for row in some), default=0)):
-            for stage in STAGES:
-                scored = [
-                    row["stages"][iteration][stage]
-                    for row in some
-                    if len(row.get("stages", [])) > iteration and stage in row["stages"][iteration]
-                ]
-                if scored:
-                    print(_stage_line(title, iteration + 1, stage, scored))
+    for heading, line in (
+        ("mean MPJPE / G-MPJPE / PA-MPJPE [mm], identity switches", _error_line),
+        (f"mean error [mm]: {', '.join(JOINT_GROUPS)}; all", _group_line),
+        (
+            f"segments' lengths [%]: {', '.join(SEGMENTS)}; all, median error (signed)",
+            _segment_line,
+        ),
+        (f"in 95 % regions, true joints [%]: {', '.join(JOINT_GROUPS)}; all", _region_line),
+        ("in 95 % regions, joints as the detector takes them [%]", _defined_line),
+    ):
+        print(f"\n{heading}")
+        for title, members in groups.items():
+            some = [row["stages"] for row in rows if row["scenario"] in members and "stages" in row]
+            for iteration in range(max(map(len, some), default=0)):
+                for stage in STAGES:
+                    scored = [
+                        passes[iteration][stage]
+                        for passes in some
+                        if len(passes) > iteration and stage in passes[iteration]
+                    ]
+                    if scored:
+                        text = f"{title:15s} {iteration + 1} {stage:15s} {len(scored):2d}  "
+                        print(text + line(scored))
 
 
-def _stage_line(title: str, iteration: int, stage: str, scored: list[dict[str, Any]]) -> str:
+def _error_line(scored: list[dict[str, Any]]) -> str:
     errors = [
         np.mean([one[name] for one in scored if one[name] is not None] or [np.nan])
         for name in ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm")
     ]
-    counts = np.array([[one["regions"][group] for group in JOINT_GROUPS] for one in scored]).sum(
-        axis=0
-    )
-    inside = np.append(counts, [counts.sum(axis=0)], axis=0)
-    brackets = [one["regions_defined"] for one in scored if "regions_defined" in one]
-    known = np.sum(brackets, axis=0) if brackets else None
-    shares = 100.0 * inside[:, 0] / np.maximum(inside[:, 1], 1)
-    return (
-        f"{title:15s} {iteration} {stage:15s} {len(scored):2d} "
-        + " / ".join(f"{error:6.1f}" for error in errors)
-        + f"  {sum(one['switches'] or 0 for one in scored):3d}   "
-        + " ".join(f"{share:5.1f}" for share in shares[:-1])
-        + f"; {shares[-1]:5.1f}"
-        + (f" ({100.0 * known[0] / max(known[1], 1):5.1f})" if known is not None else "")
-    )
+    switches = sum(one["switches"] or 0 for one in scored)
+    return " / ".join(f"{error:6.1f}" for error in errors) + f"  {switches:3d}"
+
+
+def _ratios(scored: list[dict[str, Any]], name: str) -> str:
+    """Return the ratio of both numbers of each joint group, summed over matches, and of all."""
+    sums = np.array([[one[name][group] for group in JOINT_GROUPS] for one in scored]).sum(axis=0)
+    sums = np.append(sums, [sums.sum(axis=0)], axis=0)
+    ratios = sums[:, 0] / np.maximum(sums[:, 1], 1)
+    ratios = 100.0 * ratios if name.startswith("regions") else ratios
+    return " ".join(f"{ratio:5.1f}" for ratio in ratios[:-1]) + f"; {ratios[-1]:5.1f}"
+
+
+def _group_line(scored: list[dict[str, Any]]) -> str:
+    return f"{_ratios(scored, 'errors_mm')}   detector's: {_ratios(scored, 'errors_defined_mm')}"
+
+
+def _segment_line(scored: list[dict[str, Any]]) -> str:
+    found = {name: [e for one in scored for e in one["segments"][name]] for name in SEGMENTS}
+    parts = [*found.values(), [error for errors in found.values() for error in errors]]
+    shown = [100.0 * np.array([np.median(np.abs(p)), np.median(p)]) for p in parts if p]
+    return "  ".join(f"{size:4.1f} ({signed:+5.1f})" for size, signed in shown)
+
+
+def _region_line(scored: list[dict[str, Any]]) -> str:
+    return _ratios(scored, "regions")
+
+
+def _defined_line(scored: list[dict[str, Any]]) -> str:
+    return _ratios(scored, "regions_defined")
 
 
 def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
@@ -287,6 +324,7 @@ def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
             "seed": seed,
             "duration": options.duration,
             "iterations": options.iterations,
+            "calibrated": options.calibrated,
             "recordings": recordings if k % 2 and name in FOREIGN_SCENARIOS else None,
         }
         for k, (name, seed) in enumerate(numbers)
@@ -302,6 +340,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the first match")
     parser.add_argument("--iterations", type=int, default=1)
     parser.add_argument("--recordings", type=Path, help="folder for every second match")
+    parser.add_argument("--calibrated", action="store_true", help="exact cameras")
     parser.add_argument("--limit", type=float, default=3600.0, help="for one match [s]")
     parser.add_argument("--resume", type=Path, default=Path("second_world"), metavar="DIR")
     parser.add_argument("--keep", action="store_true", help="keep match folders and projects")

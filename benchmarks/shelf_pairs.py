@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from shelf_subsets import FPS, write_case
+from shelf import FPS, write_case
 
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections

@@ -1,62 +1,37 @@
 """Prints each stage's score on the Shelf sequence with few cameras and in short windows.
 
     python benchmarks/shelf_subsets.py DATA [--windows 211 121 60 30] [--cameras 2 3 4 5]
-        [--iterations 2] [--until body_fitting] [--keep FOLDER] [--set STAGE.SETTING=JSON ...]
+        [--first 421] [--iterations 2] [--until body_fitting] [--keep FOLDER]
+        [--set STAGE.SETTING=JSON ...]
 
 DATA holds `shelf_dev`, see `shelf.py`. Every subset of so many cameras is a separate match, and so
-is every window of so many frames, in sequence from the first frame on. The stages run in this
-process; with --keep, results already in the folder are not recomputed. Scored are joints of
-`triangulation` (T), `retriangulation` (R), and bodies in the definition of the body model (B) and
-of the detector (D), to which labels drawn by hand are closer: PCP3D at alpha 0.5 and mean error
-[mm]. The last lines count the cases in which a stage is worse than its input by more than 0.3
-points or 1 mm.
+is every window of so many frames, in sequence from the first frame on (--first, or that of the
+labels). The stages run in this process; with --keep, results already in the folder are not
+recomputed. Scored are joints of `triangulation` (T), `retriangulation` (R), and bodies in the
+definition of the body model (B) and of the detector (D), to which labels drawn by hand are closer:
+PCP3D at alpha 0.5 and mean error [mm]. The last lines count the cases in which a stage is worse
+than its input by more than 0.3 points or 1 mm.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
-import re
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import run_in_process
-from shelf import load_scorer
+from shelf import load_scorer, read_settings, write_case
 
 from worldpose.body_fitting import perceived_joints
 from worldpose.errors import WorldposeError
-from worldpose.ingest import import_match
 from worldpose.store import Store
 
-FPS = 25.0
 POINTS, MILLIMETERS = 0.3, 1.0
 """Loss through a stage that counts as worse."""
 LETTERS = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}
-
-
-def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Path) -> Path:
-    """Return the match folder of some cameras and frames."""
-    name = "-".join(camera.removeprefix("cam") for camera in cameras)
-    match = folder / "matches" / f"shelf-{name}-{frames.start}-{frames.stop - 1}"
-    if match.exists():
-        return match
-    with tempfile.TemporaryDirectory() as temporary:
-        detections = Path(temporary) / "detections"
-        detections.mkdir()
-        for camera in cameras:
-            people = json.loads((given / "detections" / f"{camera}.json").read_text())
-            kept = [person for person in people if person["image_id"] in frames]
-            (detections / f"{camera}.json").write_text(json.dumps(kept))
-        parts = re.split(r"(?m)^(?=\[)", (given / "calibration.toml").read_text())
-        calibration = Path(temporary) / "calibration.toml"
-        calibration.write_text(
-            "".join(p for p in parts if any(f'name = "{camera}"' in p for camera in cameras))
-        )
-        import_match(calibration, detections, FPS, match)
-    return match
 
 
 def score(
@@ -84,6 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--windows", type=int, nargs="+", default=[211, 121, 60, 30])
+    parser.add_argument("--first", type=int, help="first frame; that of the labels if not given")
     parser.add_argument("--cameras", type=int, nargs="+", default=[5, 4, 3, 2])
     parser.add_argument("--without", nargs="*", default=[], help="subsets of these alone")
     parser.add_argument("--iterations", type=int, default=1)
@@ -92,14 +68,11 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], dest="settings")
     options = parser.parse_args()
     data = options.data / "shelf_dev"
-    overrides: dict[str, dict[str, Any]] = {}
-    for each in options.settings:
-        name, _, value = each.partition("=")
-        stage, _, setting = name.partition(".")
-        overrides.setdefault(stage, {})[setting] = json.loads(value)
+    overrides = read_settings(options.settings)
     scorer, truth = load_scorer(data), np.load(data / "gt.npz")
     every = sorted(file.stem for file in (data / "import" / "detections").glob("*.json"))
     first, last = int(truth["frames"][0]), int(truth["frames"][-1])
+    first = options.first or first
     stages = ["triangulation", "retriangulation", "body_fitting"]
     stages = (
         stages[: 1 + max(1, stages.index(options.until))] if options.until in stages else stages

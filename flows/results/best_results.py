@@ -14,9 +14,8 @@ from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
 from data_contracts.tracking import Track
 from flows.stage import Match
 from worldpose.body import BodyModel, BodyParameters, find_body
-from worldpose.body_fitting import perceived_joints, perceived_points
+from worldpose.body_fitting import perceived_joints, perceived_points, random_covariance
 from worldpose.errors import InputError, UsageError, WorldposeError
-from worldpose.filtering import perceived_covariance
 from worldpose.formats import JointTracks
 from worldpose.formats.joints_file import ExtraTracks, fill_gaps
 from worldpose.formats.tables import Positions
@@ -98,7 +97,7 @@ def joint_tracks(
     if stages[0] in BODY_STAGES and definition == "detector":
         joints = perceived_joints(joints, result["joint_offsets"].values)
     if fitted and definition == "detector":
-        covariance = perceived_covariance(covariance, seen["common_bias"].values)
+        covariance = random_covariance(covariance, seen["common_bias"].values)
     return JointTracks(
         frames=result["frame"].values,
         person_ids=result["person"].values.astype(np.int64),

@@ -18,15 +18,15 @@ def two_trials(monkeypatch):
     monkeypatch.setattr(ablation, "ablation", lambda seeds, progress: {"few clicks": scores})
 
 
-def test_rows_have_mean_and_spread_and_the_paper_beside_them(two_trials, capsys):
+def test_rows_have_mean_and_spread_and_the_paper_is_apart(two_trials, capsys):
     print_ablation(2, as_json=False)
-    said = capsys.readouterr().out
-    base = next(line for line in said.splitlines() if line.startswith("base"))
+    trials, paper = capsys.readouterr().out.split("the paper's trial, real people")
+    base = next(line for line in trials.splitlines() if line.startswith("base"))
     assert "72.0 ± 2.0" in base
-    assert "83.5 / 70.8" in base
-    # A row that nothing computes yet contains the paper's numbers alone.
-    body = next(line for line in said.splitlines() if line.startswith("+ BA + SMPL"))
-    assert body.split()[-3:] == ["80.0", "/", "66.3"]
+    assert base.split()[-1] == "0.50"
+    told = {line.split("  ")[0]: line.split()[-2:] for line in paper.splitlines() if line}
+    assert told["base"] == ["83.5", "70.8"]
+    assert told["+ BA + SMPL"] == ["80.0", "66.3"]
 
 
 def test_machines_get_every_trial(two_trials, capsys):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         EvidenceSource,
         fit_bodies,
         fit_in_windows,
+        random_covariance,
     )
     from worldpose.body_fitting.bones import (
         BoneLengths,
@@ -86,6 +87,7 @@ __all__ = [
     "perceived_points",
     "place_monocular_poses",
     "pool_shapes",
+    "random_covariance",
     "read_monocular",
     "report_fit",
     "shift_frames",
@@ -100,6 +102,7 @@ __getattr__ = import_on_use(
             "EvidenceSource",
             "fit_bodies",
             "fit_in_windows",
+            "random_covariance",
         ),
         "worldpose.body_fitting.bones": (
             "BoneLengths",

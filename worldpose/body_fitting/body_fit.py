@@ -528,8 +528,10 @@ def _gather_evidence(
 def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
     """Return the covariance of joints without most of the bias that the shared offsets model.
 
+    It is that of joints where the detector sees them.
+
     Args:
-        covariance: (..., 17, 3, 3) [m^2], of triangulated joints.
+        covariance: (..., 17, 3, 3) [m^2], of triangulated joints or of bodies.
         common_bias: (17,) per axis [m], included in `covariance`.
     """
     modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -321,7 +321,8 @@ def simulate_match(
     In addition to the files of a match folder to be calibrated (match.yaml, pitch.json,
     detections/, annotations/, stills/) it holds, under reference/:
 
-    - joints.npz (`worldpose.formats.write_joints`);
+    - joints.npz (`worldpose.formats.write_joints`), and defined_joints.npz, the same joints where
+      the detector takes them to be;
     - poses/clip.npz, the bodies that these joints are keypoints of, in the WorldPose release's
       format: betas (N, 10), global_orient (N, T, 3), body_pose (N, T, 69), transl (N, T, 3) in
       single precision, and the name of the `body_model`;
@@ -493,6 +494,8 @@ def write_references(
         detected: whether the match includes the scene's detections.
     """
     write_joints(folder / "joints.npz", scene.truth)
+    if detected:
+        write_joints(folder / "defined_joints.npz", replace(scene.truth, joints=scene.defined))
     write_poses(folder / "poses" / f"{CLIP_ID}.npz", scene.poses, OPEN_BODY)
     for name, camera in scene.cameras.items():
         write_static_camera(folder / "cameras" / f"{name}.npz", camera.to_calibration(name))

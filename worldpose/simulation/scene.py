@@ -241,6 +241,8 @@ class Scene:
     Attributes:
         truth: `views` counts the static cameras that have the joint in their image without an
             occluding person.
+        defined: (frames, persons, 17, 3) [m], world, joints where the detector takes them to be,
+            the same for all views.
         crowd: the people, at any time.
         poses: the bodies (persons, frames) whose keypoints the truth's joints are.
         cameras: the true static cameras by id, in the order of the rig.
@@ -254,6 +256,7 @@ class Scene:
     """
 
     truth: JointTracks
+    defined: Floats
     crowd: Crowd
     poses: BodyParameters
     cameras: dict[str, Camera]
@@ -454,6 +457,7 @@ def simulate_scene(
         )
     return Scene(
         truth=JointTracks(np.arange(len(times)), np.arange(persons), bodies.joints, views=views),
+        defined=bodies.joints if bodies.bias is None else bodies.joints + bodies.bias,
         crowd=crowd,
         poses=crowd.poses(times),
         cameras=cameras,

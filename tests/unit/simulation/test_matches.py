@@ -119,6 +119,9 @@ def test_the_truth_is_beside_it(match, scene):
     np.testing.assert_array_equal(truth.joints, scene.truth.joints)
     np.testing.assert_array_equal(truth.views, scene.truth.views)
     assert truth.person_ids.tolist() == [0, 1, 2, 3, 4]
+    defined = read_joints(match / "reference" / "defined_joints.npz")
+    np.testing.assert_array_equal(defined.joints, scene.defined)
+    np.testing.assert_array_equal(defined.views, truth.views)
     for name, camera in scene.cameras.items():
         with np.load(match / "reference" / "cameras" / f"{name}.npz") as file:
             np.testing.assert_array_equal(file["R"][0], camera.cam_from_world.rotation)

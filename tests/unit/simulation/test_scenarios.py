@@ -212,3 +212,8 @@ def test_all_bias_and_no_noise_is_the_same_in_all_frames_for_who_stands():
     assert np.ptp(steady, axis=0).max() < 2e-4
     truth = scene.cameras["cam00"].project(scene.truth.joints[0, 0, 5:])
     assert 0.5 < np.abs(steady[0] - truth).max() < 12.0  # 3 cm at 64 px per metre and 3 sigma
+    # It is the detector's definition of joints, the same for all views.
+    for name, camera in scene.cameras.items():
+        taken = camera.project(scene.defined[0, 0, 5:])
+        seen = scene.observations[name].keypoints[0, 0, 5:]
+        np.testing.assert_allclose(seen, taken, atol=1e-3)
