@@ -278,4 +278,4 @@ def test_metrics_of_parts_are_those_of_the_clip():
     assert parts.bone_spread_m == pytest.approx(whole.bone_spread_m, rel=1e-12)
     # Without the differences across the two parts.
     assert parts.jerk_m_s3 == pytest.approx(whole.jerk_m_s3, rel=0.1)
-    assert parts.skating_m == pytest.approx(whole.skating_m, rel=0.1)
+    assert parts.skating_m == whole.skating_m == (None,)  # no ankle is slow
