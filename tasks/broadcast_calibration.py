@@ -13,7 +13,7 @@ from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
-from tasks.clip_inputs import ADJUSTED
+from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import (
@@ -129,7 +129,7 @@ def _people(
         return None, None, None
     first, count, fps = (sources[name] for name in ("first_frame", "frame_count", "fps"))
     offset = float(sources["broadcast_offset_frames"])
-    stored = open_input(store, work, names[0]).sel(frame=np.arange(first, first + count))
+    stored = select_frames(open_input(store, work, names[0]), np.arange(first, first + count))
     seen = KeypointDetections.from_arrays(stored)
     if f"body_fitting/{unit}" not in work.recipe.inputs:
         return None, seen, seen.boxes.astype(np.float64)

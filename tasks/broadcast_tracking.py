@@ -17,6 +17,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import Track
 from data_contracts.work import Work
+from tasks.clip_inputs import select_frames
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
 from worldpose.broadcast_calibration.pitch_errors import SIZES
@@ -107,7 +108,7 @@ def open_broadcast(store: Store, work: Work) -> BroadcastInputs:
     camera = inputs.get("broadcast_pooling")
     moving = calibrated if camera is None else open_input(store, work, camera)
     detected = next(name for stage, name in inputs.items() if stage in ("ingest", "detection"))
-    detections = open_input(store, work, detected).sel(frame=np.arange(first, first + count))
+    detections = select_frames(open_input(store, work, detected), np.arange(first, first + count))
     # The surface that the calibration found: people stand on it as the markings lie on it.
     surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SIZES}
     known = {name: value for name, value in surface.items() if value is not None}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
-from tasks.clip_inputs import ClipInputs, open_frames, open_venue
+from tasks.clip_inputs import ClipInputs, open_frames, open_venue, select_frames
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
 from worldpose.bundle_adjustment import (
@@ -79,11 +79,11 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
         for clip, every in sorted(whole.items(), key=lambda item: item[1][0])
     }
     tracked = [
-        select_triangulated(open_input(store, work, f"tracking/{clip}").sel(frame=frame))
+        select_triangulated(select_frames(open_input(store, work, f"tracking/{clip}"), frame))
         for clip, frame in frames.items()
     ]
     placed = [
-        open_input(store, work, f"triangulation/{clip}").sel(frame=frame)
+        select_frames(open_input(store, work, f"triangulation/{clip}"), frame)
         for clip, frame in frames.items()
     ]
     person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))

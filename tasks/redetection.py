@@ -153,7 +153,7 @@ def _open(store: Store, work: Work) -> _Case:
         for stage in ("refitting", "body_fitting")
         if f"{stage}/{clip}" in inputs
     )
-    placed = open_input(store, work, f"retriangulation/{clip}").isel(camera=[place])
+    placed = open_input(store, work, f"retriangulation/{clip}").isel(camera=slice(place, place + 1))
     said = open_input(store, work, f"filtering/{clip}")
     joints = perceived_joints(bodies["joints"].values, bodies["joint_offsets"].values)
     sure = perceived_covariance(bodies["covariance"].values, placed["common_bias"].values)

@@ -17,6 +17,7 @@ from data_contracts.arrays import Floats
 from data_contracts.refitting import REFITTING
 from data_contracts.work import Work
 from tasks.body_fitting import FurtherArrays, open_people, publish_fit
+from tasks.clip_inputs import select_frames
 from tasks.plane_bodies import publish_plane_bodies
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.body_fitting import (
@@ -130,7 +131,7 @@ class _BroadcastViews:
             late += measured
         first, count = sources["first_frame"], sources["frame_count"]
         frame = np.arange(first, first + count)
-        seen = open_input(store, work, sources["seen_in_broadcast"]).sel(frame=frame)
+        seen = select_frames(open_input(store, work, sources["seen_in_broadcast"]), frame)
         estimates = None
         if sources["estimates"] is not None:
             path = Path(work.folder) / sources["estimates"]

@@ -120,10 +120,12 @@ def select_triangulated(tracks: xr.Dataset) -> xr.Dataset:
     if "ground" not in tracks:
         return tracks
     kinds = [Track.model_validate(track).kind for track in tracks.attrs["tracks"]]
-    chosen = tracks.isel(person=[k for k, kind in enumerate(kinds) if kind != "plane"])
-    index = chosen["detection_index"]
-    values = np.where(find_plane_frames(chosen)[:, None], np.int16(-1), index.values)
-    return chosen.assign(detection_index=(index.dims, values))
+    kept = [k for k, kind in enumerate(kinds) if kind != "plane"]
+    on_plane = find_plane_frames(tracks)[:, kept]
+    index = tracks["detection_index"]
+    # Read whole: a list of people in a store would be read number by number.
+    values = np.where(on_plane[:, None], np.int16(-1), index.values[:, :, kept])
+    return tracks.isel(person=kept).assign(detection_index=(index.dims, values))
 
 
 def add_plane_tracks(
