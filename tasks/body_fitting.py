@@ -15,7 +15,7 @@ from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.work import Recipe, Work
-from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip
+from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
 from tasks.spool import open_spool
 from tasks.triangulation import camera_errors, load_triangulation_settings
 from tasks.unit import figures_of, open_input, unit_task
@@ -137,7 +137,7 @@ class ClipPeople:
         if isinstance(frames, slice):
             exchanged = self._exchanged[slice(int(rows[0]), int(rows[-1]) + 1)]
         else:
-            exchanged = self._placed["exchanged"].isel(frame=rows).values
+            exchanged = read_rows(self._placed["exchanged"], rows)
         return undo_swaps(self.clip.detections[rows], exchanged)
 
     def read_joints(self, frames: slice) -> ClipEvidence:

@@ -59,6 +59,20 @@ class ChunkedRows:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
+def read_rows(array: xr.DataArray, rows: NDArray[np.int64]) -> NDArray[Any]:
+    """Return some rising rows of a stored array, one read for each run of consecutive ones.
+
+    Zarr finds numbers at a list of indices one by one, which takes a microsecond and a hundred
+    bytes for each.
+    """
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1) if len(rows) else [rows]
+    parts = [
+        array[int(run[0]) : int(run[-1]) + 1].values if len(run) else array[:0].values
+        for run in runs
+    ]
+    return np.concatenate(parts)
+
+
 class StoredArray:
     """One array of all cameras' detections in a store, padded to the same number, read in pages.
 
@@ -231,8 +245,7 @@ def open_clip(
 def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
     """Return some rising match frames of a result, read on access.
 
-    Evenly spaced frames are a slice: Zarr finds numbers at a list of indices one by one, which
-    takes a hundred bytes and a microsecond for each.
+    Evenly spaced frames are a slice, which is read faster than a list (`read_rows`).
     """
     places = stored.get_index("frame").get_indexer(frame)
     steps = np.unique(np.diff(places))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.filtering import FILTERING
 from data_contracts.work import Work
-from tasks.clip_inputs import ChunkedRows, ClipInputs, load_dropped_boxes, open_clip
+from tasks.clip_inputs import ChunkedRows, ClipInputs, load_dropped_boxes, open_clip, read_rows
 from tasks.spool import open_spool
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
@@ -138,22 +138,15 @@ class _Bodies:
         rows = np.arange(last + 1)[frames]
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, last)
         read = np.unique(np.concatenate([before, rows, after]))
-        joints = perceived_joints(_read_rows(self._fitted["joints"], read), self._offsets)
+        joints = perceived_joints(read_rows(self._fitted["joints"], read), self._offsets)
         step = joints[np.searchsorted(read, after)] - joints[np.searchsorted(read, before)]
         step /= np.maximum(after - before, 1)[:, None, None, None]
-        covariance = _read_rows(self._fitted["covariance"], rows)
+        covariance = read_rows(self._fitted["covariance"], rows)
         return (
             joints[np.searchsorted(read, rows)],
             step,
             perceived_covariance(covariance, self._common_bias),
         )
-
-
-def _read_rows(array: xr.DataArray, rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Return some rising rows of an array; consecutive ones are read as a slice."""
-    if len(rows) == rows[-1] - rows[0] + 1:
-        return np.asarray(array[int(rows[0]) : int(rows[-1]) + 1].values)
-    return np.asarray(array[rows].values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +175,8 @@ class _Case:
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
         """Project the bodies into all images; return views, motion, and the detections to test."""
-        placed = self.placed.isel(frame=frames)
-        return *self.project(frames), self.read(frames, *(placed[name].values for name in PLACED))
+        placed = (read_rows(self.placed[name], frames) for name in PLACED)
+        return *self.project(frames), self.read(frames, *placed)
 
     def parts(self) -> Iterator[_Part]:
         """Yield all frames, `PART` at a time, with their detections."""
