@@ -175,8 +175,9 @@ class _Case:
 
     def at(self, frames: NDArray[np.int64]) -> tuple[BodyViews, BodyMotion, TriangulatedDetections]:
         """Project the bodies into all images; return views, motion, and the detections to test."""
-        placed = (read_rows(self.placed[name], frames) for name in PLACED)
-        return *self.project(frames), self.read(frames, *placed)
+        offsets, exchanged = (read_rows(self.placed[name], frames) for name in PLACED)
+        views, motion = self.project(frames)
+        return views, motion, self.read(frames, offsets, exchanged)
 
     def parts(self) -> Iterator[_Part]:
         """Yield all frames, `PART` at a time, with their detections."""
