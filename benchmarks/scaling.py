@@ -111,7 +111,7 @@ def measure(
             if reports is not None:
                 stack.enter_context(Client(address))
                 page = reports / f"{workers}_workers.html"
-                stack.enter_context(performance_report(filename=str(page)))
+                stack.enter_context(performance_report(filename=str(page), mode="inline"))
             command = [*run, "--dask", address, "--until", "detection"]
             code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode
         if code != 0:
