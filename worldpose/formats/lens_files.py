@@ -181,6 +181,10 @@ def read_file_storage(file: Path) -> dict[str, Any]:
                     part.string() if part.isString() else f"{part.real():g}" for part in parts
                 ]
         storage.release()
+    except UnicodeDecodeError as error:
+        raise calibration_error(
+            str(file), "a file of OpenCV's FileStorage", "names or text that are not UTF-8"
+        ) from error
     except (cv2.error, SystemError) as error:
         said = str(error.__cause__ or error).strip().splitlines()[0][:200]
         raise calibration_error(str(file), "a file of OpenCV's FileStorage", said) from error

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -599,6 +599,7 @@ def test_an_empty_or_binary_file_is_refused_once(tmp_path, form, content, capfd)
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(sorted(WRITERS)), st.floats(0, 1), st.integers(0, 30), st.binary(max_size=6))
+@example("EasyMocap", 0.75, 0, b"\x80")  # a name that is no text
 def test_a_spoilt_file_is_read_or_refused(tmp_path_factory, form, share, length, insert):
     folder = Path(tmp_path_factory.mktemp("spoilt"))
     path = WRITERS[form](folder, rig())
