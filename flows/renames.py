@@ -113,7 +113,6 @@ SETTINGS: Final[Mapping[str, Mapping[str, str]]] = {
         "clock_error": "max_clock_error_frames",
     },
     "bundle_adjustment": {
-        "candidates": "max_candidates",
         "frames": "max_frames",
         "frame_gap": "min_frame_gap_s",
         "survey_error": "survey_error_m",

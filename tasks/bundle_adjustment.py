@@ -23,6 +23,7 @@ from worldpose.bundle_adjustment import (
     adjust_cameras,
     adjustment_arrays,
 )
+from worldpose.errors import UsageError
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import select_triangulated
 from worldpose.store import Store
@@ -68,22 +69,31 @@ class _People:
 
 
 def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -> _People:
-    """Read tracks and joints in evenly spaced frames, and in frames chosen by a person."""
+    """Read tracks and joints in the frames that the first triangulation computed.
+
+    Raises:
+        UsageError: a chosen frame of a clip is not one of them.
+    """
     sources: dict[str, Any] = work.recipe.sources
-    whole = {
-        clip: np.arange(first, first + count) for clip, (first, count) in sources["clips"].items()
-    }
-    stride = -(-sum(map(len, whole.values())) // settings.max_candidates)
-    frames = {
-        clip: every[(np.arange(len(every)) % stride == 0) | np.isin(every, settings.chosen_frames)]
-        for clip, every in sorted(whole.items(), key=lambda item: item[1][0])
-    }
+    clips = sorted(sources["clips"], key=lambda clip: sources["clips"][clip][0])
+    placed = {clip: open_input(store, work, f"triangulation/{clip}") for clip in clips}
+    frames = {clip: placed[clip]["frame"].values for clip in clips}
+    total = sum(count for _, count in sources["clips"].values())
+    stride = load_triangulation_settings(store, work.recipe, clips[0]).stride(total)
+    for clip in clips:
+        start, count = sources["clips"][clip]
+        inside = [frame for frame in settings.chosen_frames if 0 <= frame - start < count]
+        between = np.setdiff1d(inside, frames[clip])
+        if len(between):
+            raise UsageError(
+                "bundle_adjustment.chosen_frames",
+                expected=f"frames of clip {clip} that the first triangulation computed: "
+                f"{start}, {start + stride}, {start + 2 * stride} ...",
+                found=f"{between[0]:.0f}",
+                todo=f"Choose from these, or set triangulation.max_frames={total}.",
+            )
     tracked = [
         select_triangulated(select_frames(open_input(store, work, f"tracking/{clip}"), frame))
-        for clip, frame in frames.items()
-    ]
-    placed = [
-        select_frames(open_input(store, work, f"triangulation/{clip}"), frame)
         for clip, frame in frames.items()
     ]
     person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))
@@ -98,14 +108,14 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
         views=np.zeros((number, len(person), 17), dtype=np.int64),
     )
     last = 0
-    for tracks, joints in zip(tracked, placed, strict=True):
+    for tracks, found in zip(tracked, placed.values(), strict=True):
         rows = np.arange(last, last := last + tracks.sizes["frame"])[:, None]
         columns = np.searchsorted(person, tracks["person"].values)
         people.detection_index[rows, :, columns] = (
             tracks["detection_index"].transpose("frame", "person", "camera").values
         )
-        people.joints[rows, columns] = joints["joints"].values
-        people.views[rows, columns] = joints["views"].values
+        people.joints[rows, columns] = found["joints"].values
+        people.views[rows, columns] = found["views"].values
     return people
 
 

@@ -34,7 +34,9 @@ def triangulation(work: Work) -> str:
     store = Store.open(work.project)
     with store.publish(work) as result:
         settings = TriangulationSettings.model_validate(work.recipe.settings)
-        write_joints(store, work, settings, result, TRIANGULATION)
+        sources: dict[str, Any] = work.recipe.sources
+        stride = settings.stride(sources["match_frames"])
+        write_joints(store, work, settings, result, TRIANGULATION, stride)
     return work.key
 
 
@@ -51,8 +53,9 @@ def write_joints(
     settings: TriangulationSettings,
     result: ResultWriter,
     layout: GroupLayout,
+    stride: int = 1,
 ) -> None:
-    """Triangulate the clip of `work` in chunks of frames, and write the joints."""
+    """Triangulate every `stride`-th frame of `work`'s clip in chunks, and write the joints."""
     tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
     index = tracks["detection_index"].values
     clip = open_clip(store, work).assign_people(index)
@@ -60,7 +63,9 @@ def write_joints(
     model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
     with open_spool(store) as spool:
-        chunks = reconstruct_chunks(clip.cameras, detections, model, clip.fps, settings, covariance)
+        chunks = reconstruct_chunks(
+            clip.cameras, detections, model, clip.fps, settings, covariance, stride=stride
+        )
         for part in chunks:
             spool.add(part_arrays(part.triangulation, part.smoothing))
             agreements.append(part.triangulation.agreement)
@@ -70,7 +75,7 @@ def write_joints(
             arrays=spool.arrays()
             | clock_arrays(model.clocks)
             | bias_arrays(model.detector, clip.detections.points, settings),
-            coordinates={"frame": clip.detections.frame, "person": tracks["person"].values},
+            coordinates={"frame": detections.frame[::stride], "person": tracks["person"].values},
             attributes={"camera": list(clip.camera_ids), **clip.detections.labels()},
         )
     agreement = reduce(add, agreements).report(model.detector.noise[-1].factor)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import JsonValue
+
 from flows.stage import Match, Stage
 from flows.stages import tracking
 from worldpose.triangulation import TriangulationSettings
@@ -12,13 +14,19 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
     return (*tracking.inputs(match, unit), f"tracking/{unit}")
 
 
+def sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return those of tracking's clip, and the frames of all clips, which share the maximum."""
+    frames = sum(clip.frame_count for clip in match.folder.spec.clips)
+    return {**tracking.clip_sources(match, unit), "match_frames": frames}
+
+
 STAGE = Stage(
     name="triangulation",
     about="place every joint from the cameras that agree",
     settings=TriangulationSettings,
     units=tracking.units,
     inputs=inputs,
-    sources=tracking.clip_sources,
+    sources=sources,
     previous_pass_inputs=tracking.again,
     late_inputs=tracking.found_again,
     needs_static_cameras=True,

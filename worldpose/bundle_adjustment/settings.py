@@ -48,9 +48,6 @@ class BundleAdjustmentSettings(Record):
     evidence: Literal["markings_and_players", "markings"] = "markings_and_players"
     """Observations in the adjustment. `markings` alone, with every parameter of the lens free and
     no prior, is the case that the paper warns of; it exists for measurements."""
-    max_candidates: int = Field(default=3000, ge=1, le=1_000_000)
-    """Maximum candidate frames of all clips [1], evenly spread: a minute at 50 frames per second,
-    and 0.3 GB of detections from 16 cameras."""
     max_frames: int = Field(default=40, ge=1, le=10000)
     """Maximum frames in the adjustment [frame]; more add seconds and little information."""
     min_frame_gap_s: float = Field(default=0.1, ge=0, le=10)

@@ -68,7 +68,7 @@ class Chunk:
     """Joints of one chunk of frames.
 
     Attributes:
-        frames: its frames in the clip.
+        frames: its place among the computed frames of the clip.
         triangulation: joints of each frame on its own.
         smoothing: joints as parts of whole tracks.
     """
@@ -133,6 +133,7 @@ def reconstruct_chunks(
     settings: TriangulationSettings,
     camera_covariance: Floats | None = None,
     length: int = CHUNK,
+    stride: int = 1,
 ) -> Iterator[Chunk]:
     """Yield a clip's joints, one chunk of `length` frames at a time.
 
@@ -146,8 +147,11 @@ def reconstruct_chunks(
         settings: settings of the stage.
         camera_covariance: (cameras, 12, 12) covariance as in `triangulate_joints`.
         length: frames per chunk; rounded up to the margin and whole tiles of the solver.
+        stride: only every such frame is computed; a chunk's `frames` count those.
     """
-    frames, margin = detections.confidence.shape[0], round(MARGIN * fps)
+    every = np.arange(0, detections.confidence.shape[0], stride)
+    frames, fps = len(every), fps / stride
+    margin = round(MARGIN * fps)
     # Joints of a tile share their number of steps: equal tiles give bit-identical joints.
     length = LANES * -(-max(1, length, margin) // LANES)
     parts = [
@@ -161,21 +165,21 @@ def reconstruct_chunks(
         for first in range(part.start, max(part.stop, part.start + 1), half)
     ]
 
-    def read_halves() -> Iterator[KeypointDetections]:
-        for some in halves:
-            yield read_frames(detections, some, model.corrected)
+    def read(some: slice) -> KeypointDetections:
+        chosen = some if stride == 1 else every[some]
+        return read_frames(detections, chosen, model.corrected)
 
     def triangulate(some: KeypointDetections) -> Triangulation:
         return triangulate_joints(cameras, some, settings, camera_covariance, model.detector)
 
-    triangulated = _join_halves(parts, halves, map_in_threads(triangulate, read_halves()))
+    triangulated = _join_halves(parts, halves, map_in_threads(triangulate, map(read, halves)))
     before, here = None, next(triangulated)
     for part in parts:
         after = next(triangulated, None)
         first, last = max(0, part.start - margin), min(frames, part.stop + margin)
         smooth = smooth_joints(
             cameras,
-            read_frames(detections, slice(first, last), model.corrected),
+            read(slice(first, last)),
             _add_margins(before, here, after, margin),
             fps,
             settings,

@@ -60,6 +60,14 @@ class TriangulationSettings(Record):
     correct_clocks: bool = False
     """Shift every camera's observations in time by the clock offset estimated from tracks."""
 
+    max_frames: int = Field(default=1000, ge=1, le=10_000_000)
+    """Maximum frames of a match that the first triangulation computes, evenly spread over its clips
+    [frame]. Bundle adjustment reads no others; retriangulation then computes every frame."""
+
+    def stride(self, frames: int) -> int:
+        """Return the step between frames of the first triangulation of a match of `frames`."""
+        return -(-frames // self.max_frames)
+
     @property
     def noise(self) -> tuple[float, float]:
         """The stated noise [px], [m]."""

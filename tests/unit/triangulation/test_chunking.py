@@ -69,6 +69,27 @@ def test_parts_give_what_the_whole_clip_gives(clip):
     assert filled.sum() == 15 * 17
 
 
+def test_every_third_frame_alone(clip):
+    camera, arrays = clip
+    seen = KeypointDetections.from_keypoints(*arrays)
+    model = learn_clip(camera, seen, FPS, SETTINGS)
+    every = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS))
+    third = list(reconstruct_chunks(camera, seen, model, FPS, SETTINGS, length=64, stride=3))
+    assert len(third) == 2 and third[-1].frames.stop == len(range(0, FRAMES, 3))
+    for name in ("joints", "covariance", "views", "inliers", "exchanged", "offsets"):
+        whole = np.concatenate([getattr(part.triangulation, name) for part in every])
+        found = np.concatenate([getattr(part.triangulation, name) for part in third])
+        # Joints of a tile of the solver share their number of steps.
+        np.testing.assert_allclose(found, whole[::3], rtol=1e-6, atol=1e-8)
+    late = [part.smoothing.filled.sum() for part in third]
+    assert sum(late) == 5 * 17  # the gap of 0.3 s, and not that of 0.8 s
+
+
+def test_frames_of_a_match_share_the_maximum():
+    settings = TriangulationSettings(max_frames=1000)
+    assert [settings.stride(frames) for frames in (1, 1000, 1001, 3000, 30_000)] == [1, 1, 2, 3, 30]
+
+
 def test_reports_of_parts_add_up_to_the_clip_s(clip):
     camera, arrays = clip
     whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
