@@ -90,7 +90,7 @@ def joint_tracks(
             found=", ".join(run) or "an empty run",
             todo="Run the match to the end first.",
         )
-    result = run[f"{stages[0]}/{clip}"]
+    result = _stage_joints(run, clip, stages[0])
     fitted = stages[0] in BODY_STAGES and not on_plane
     seen = placed_joints(run, clip) if fitted else result
     joints, covariance = result["joints"].values, result["covariance"].values
@@ -295,6 +295,18 @@ def require_result(run: Run, unit: str, todo: str) -> str:
     return unit
 
 
+def _stage_joints(run: Run, clip: str, stage: str) -> xr.Dataset:
+    """Return a stage's joints in every frame; missing where the first triangulation skipped one."""
+    result, frame = run[f"{stage}/{clip}"], run[f"tracking/{clip}"]["frame"]
+    if result.sizes["frame"] == frame.sizes["frame"]:
+        return result
+    unknown = {
+        str(name): np.nan if array.dtype.kind == "f" else np.zeros((), array.dtype)
+        for name, array in result.data_vars.items()
+    }
+    return result.reindex(frame=frame, fill_value=unknown)
+
+
 def placed_joints(run: Run, clip: str) -> xr.Dataset:
     """Return the best triangulated joints of one clip, with their contributing views.
 
@@ -303,7 +315,7 @@ def placed_joints(run: Run, clip: str) -> xr.Dataset:
     """
     for stage in ("retriangulation", "triangulation"):
         if f"{stage}/{clip}" in run:
-            return run[f"{stage}/{clip}"]
+            return _stage_joints(run, clip, stage)
     raise UsageError(
         f"clip {clip}",
         expected="triangulated joints",

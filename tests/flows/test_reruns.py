@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 
+from flows.results.best_results import joint_tracks
 from worldpose import open_run
 from worldpose.store import Store, verify
 
@@ -88,6 +89,27 @@ def test_more_views_leave_fewer_joints(stricter_run):
     strict = open_run(str(stricter_run), TINY, "0002")["triangulation/clip"]
     assert int((strict.views > 0).sum()) <= int((loose.views > 0).sum())
     assert int(strict.views.where(strict.views > 0).min()) >= 3
+
+
+def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy):
+    few = ("--set", "triangulation.max_frames=10", "--until", "bundle_adjustment")
+    run_json(tiny, "--project", project_copy, *few)
+    run = open_run(str(project_copy), TINY)
+    before = open_run(str(project_copy), TINY, "0001")["triangulation/clip"]
+    every, placed = before["frame"].values, run["triangulation/clip"]
+    np.testing.assert_array_equal(placed["frame"], every[::3])
+    np.testing.assert_allclose(placed["joints"], before["joints"][::3], atol=1e-6)
+    used = run["bundle_adjustment/cameras"].attrs["used_frames"]
+    assert used and set(used) <= set(every[::3].tolist())
+    seen = joint_tracks(run, "clip", "triangulation")
+    np.testing.assert_array_equal(seen.frames, every)
+    assert np.isnan(seen.joints[1]).all() and not seen.views[1].any()
+    np.testing.assert_array_equal(seen.joints[::3], placed["joints"])
+
+    between = (*few, "--set", "bundle_adjustment.chosen_frames=[0,4]")
+    answer = worldpose("run", tiny, "--project", project_copy, *between)
+    assert answer.code == 1
+    assert "found 4" in answer.err and "triangulation.max_frames=30" in answer.err
 
 
 def test_an_edited_detection_file_is_another_match(tiny, project_copy, tmp_path):
