@@ -152,7 +152,7 @@ def compare_groups(data: Path, folder: Path, overrides: dict[str, Any]) -> None:
         match, (keys,) = run_in_process(store, case, "body_fitting", 1, overrides)
         run: Any = {
             f"{stage}/clip": store.open_result(match, stage, "clip", keys[f"{stage}/clip"])
-            for stage in STAGES
+            for stage in ("tracking", *STAGES)
         }
         labels = truth["gt"][np.isin(truth["frames"], frames)]
         print(f"frames {frames.start} to {frames.stop - 1}: {', '.join(GROUPS)}")

@@ -297,7 +297,10 @@ def require_result(run: Run, unit: str, todo: str) -> str:
 
 def _stage_joints(run: Run, clip: str, stage: str) -> xr.Dataset:
     """Return a stage's joints in every frame; missing where the first triangulation skipped one."""
-    result, frame = run[f"{stage}/{clip}"], run[f"tracking/{clip}"]["frame"]
+    result = run[f"{stage}/{clip}"]
+    if stage != "triangulation":
+        return result
+    frame = run[f"tracking/{clip}"]["frame"]
     if result.sizes["frame"] == frame.sizes["frame"]:
         return result
     unknown = {
