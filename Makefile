@@ -14,7 +14,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@# Bytecode is written when a module is first imported: most of the 30,000 modules never are.
+	$(BIN)/pip install --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	@echo "Compiling the kernels by reconstructing half a second: once, about a minute"
 	@rm -rf .venv/first
 	@$(BIN)/worldpose simulate --scenario tiny --duration 0.5 --out .venv/first/tiny
