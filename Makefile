@@ -14,7 +14,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	@# Bytecode is written when a module is first imported: most of the 30,000 modules never are.
+	@# Bytecode is written when a module is first imported: most of the 23,000 modules never are.
 	$(BIN)/pip install --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	@echo "Compiling the kernels by reconstructing half a second: once, about a minute"
 	@rm -rf .venv/first
