@@ -356,6 +356,14 @@ def calibrate_proposal(
         kept = (each for each in proposal.drawn.drawn if each.name not in names)
         calibration = calibrate(ClickedMarkings(drawn=(*kept, *thin)))
     lines = calibration.report.lines  # each camera has its own ground
+    if lines is not None and not lines.refined:
+        # The proposal is made of painted lines: a right one leads the search to them.
+        raise InputError(
+            where,
+            expected="painted lines where the proposed camera projects the markings",
+            found=lines.reason,
+            todo=_TO_CLICK,
+        )
     surfaced = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
     pixels, calibrated_pixels = (
         camera.project(ground.sample_lines(_FINE[0]).points_world)
@@ -408,14 +416,32 @@ def _rank_under_lenses(
 ) -> tuple[PaintMap, Candidates, Floats] | None:
     """Return the paint under the lens that explains it best, its cameras and their scores."""
     best: tuple[PaintMap, Candidates, Floats] | None = None
+    samples = sample_markings(pitch, _FINE[0])
     for paint in paints:
         focals = _FOCALS if lens is None else np.array([paint.focal / paint.size[0]])
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        if best is not None and best[2][0] - _runner_up(best[2]) >= MIN_MARGIN:
+        # Under a wrong lens two thirds of the markings of a bent image may still meet paint.
+        if best is not None and _ends_search(best[0], samples, best[1], best[2]):
             break
     return best
+
+
+def _ends_search(paint: PaintMap, samples: LineSamples, ranked: Candidates, scores: Floats) -> bool:
+    """Return whether the first camera is clear, and explains so much that no other can be better.
+
+    Args:
+        paint: paint of the image.
+        samples: of the markings.
+        ranked: different cameras, the best first.
+        scores: of these (k,).
+    """
+    if not len(scores) or scores[0] - _runner_up(scores) < MIN_MARGIN:
+        return False
+    seen = project_markings(paint, samples, ranked[:1])
+    shares = _share_on_paint(seen), explained_share(paint, seen)
+    return bool(np.greater_equal(shares, _CLEAR_SHARES).any())
 
 
 def _share_on_paint(seen: SeenMarkings) -> float:
@@ -442,11 +468,8 @@ def rank_cameras(
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
     samples = sample_markings(pitch, _FINE[0])
-    if len(scores) and scores[0] - _runner_up(scores) >= MIN_MARGIN:
-        seen = project_markings(paint, samples, best[:1])
-        shares = _share_on_paint(seen), explained_share(paint, seen)
-        if np.greater_equal(shares, _CLEAR_SHARES).any():
-            return best, scores
+    if _ends_search(paint, samples, best, scores):
+        return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
     return _rank(paint, samples, join_candidates(best, rolled), np.append(scores, others))
 
