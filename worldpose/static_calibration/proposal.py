@@ -58,7 +58,8 @@ MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
 _CLEAR_SHARES: Final = (0.75, 0.6)
-"""Both shares; a clear camera that reaches neither of these does not end the search [1]."""
+"""Both shares; a clear camera that reaches neither of these does not end the search for rolls, and
+one that does not reach the first does not end that for lenses [1]."""
 _MAX_DISPLACEMENT: Final = 0.01
 """Maximum median displacement of markings by the calibration, in image widths [1]."""
 _TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
@@ -422,14 +423,20 @@ def _rank_under_lenses(
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        # Under a wrong lens two thirds of the markings of a bent image may still meet paint.
-        if best is not None and _ends_search(best[0], samples, best[1], best[2]):
-            break
+        # Under a wrong lens a camera may be clear though a third of its markings misses the paint.
+        if best is not None:
+            found, _ = _shares_if_clear(best[0], samples, best[1], best[2])
+            if found >= _CLEAR_SHARES[0]:
+                break
     return best
 
 
-def _ends_search(paint: PaintMap, samples: LineSamples, ranked: Candidates, scores: Floats) -> bool:
-    """Return whether the first camera is clear, and explains so much that no other can be better.
+def _shares_if_clear(
+    paint: PaintMap, samples: LineSamples, ranked: Candidates, scores: Floats
+) -> tuple[float, float]:
+    """Return the first camera's shares of markings on paint, and of paint on markings [1].
+
+    Both are 0 if another camera explains the paint nearly as well.
 
     Args:
         paint: paint of the image.
@@ -438,10 +445,9 @@ def _ends_search(paint: PaintMap, samples: LineSamples, ranked: Candidates, scor
         scores: of these (k,).
     """
     if not len(scores) or scores[0] - _runner_up(scores) < MIN_MARGIN:
-        return False
+        return 0.0, 0.0
     seen = project_markings(paint, samples, ranked[:1])
-    shares = _share_on_paint(seen), explained_share(paint, seen)
-    return bool(np.greater_equal(shares, _CLEAR_SHARES).any())
+    return _share_on_paint(seen), explained_share(paint, seen)
 
 
 def _share_on_paint(seen: SeenMarkings) -> float:
@@ -468,7 +474,8 @@ def rank_cameras(
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
     samples = sample_markings(pitch, _FINE[0])
-    if _ends_search(paint, samples, best, scores):
+    shares = _shares_if_clear(paint, samples, best, scores)
+    if np.greater_equal(shares, _CLEAR_SHARES).any():
         return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
     return _rank(paint, samples, join_candidates(best, rolled), np.append(scores, others))
