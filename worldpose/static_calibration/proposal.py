@@ -35,6 +35,8 @@ from worldpose.static_calibration.camera_candidates import (
     project_markings,
     refine_candidates,
     score_with_prior,
+    stand_on,
+    thin_out,
 )
 from worldpose.static_calibration.circle_candidates import name_circles
 from worldpose.static_calibration.ground_error import points_in_view
@@ -267,7 +269,7 @@ def propose_from_paint(
     if found is None:
         return None
     paint, ranked, scores = found
-    samples, best = sample_markings(pitch, _FINE[0]), _stand_on(ranked[:1], side)
+    samples, best = sample_markings(pitch, _FINE[0]), stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)
     markings, drawn = _measure_support(paint, samples, seen)
     return Proposal(
@@ -500,7 +502,8 @@ def _rank_rolled(
     near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
     # Apart: circles are refined already, and would crowd out better ones of three lines.
     found, near = (_keep_best(paint, samples, each, prior, _MEDIUM[1]) for each in (found, near))
-    found = join_candidates(_thin_out(found[: 10 * _REFINED]), _thin_out(near[: 10 * _REFINED]))
+    found, near = (thin_out(each[: 10 * _REFINED], _REFINED) for each in (found, near))
+    found = join_candidates(found, near)
     samples = sample_markings(pitch, _FINE[0])
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
@@ -524,30 +527,9 @@ def _rank(
     """Return different cameras on the near side, the best first, and their scores (k,)."""
     order = np.argsort(-scores, kind="stable")
     # Behind a goal refinement moves cameras across the long axis: half a turn makes them equal.
-    found, scores = _stand_on(found[order], "near"), scores[order]
+    found, scores = stand_on(found[order], "near"), scores[order]
     different = _distinct(paint, samples, found)
     return found[different], scores[different]
-
-
-def _thin_out(candidates: Candidates) -> Candidates:
-    """Return candidates that differ from all before, at most as many as will be refined."""
-    centers = candidates.centers
-    near = np.maximum(5.0, 0.1 * np.linalg.norm(centers, axis=1))[:, None]
-    places = np.concatenate(
-        [
-            centers / near,
-            10.0 * candidates.rotations[:, 2],
-            5.0 * np.log(candidates.focals)[:, None],
-        ],
-        axis=1,
-    )
-    kept: list[int] = []
-    for index, place in enumerate(places):
-        if len(kept) == _REFINED:
-            break
-        if not kept or (np.abs(places[kept] - place).max(axis=1) > 1.0).all():
-            kept.append(index)
-    return candidates[np.array(kept, dtype=np.int64)]
 
 
 def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
@@ -565,18 +547,6 @@ def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> 
         else:
             kept.append(index)
     return np.array(kept, dtype=np.int64)
-
-
-def _stand_on(candidates: Candidates, side: Side) -> Candidates:
-    """Return candidates on one side of the pitch: themselves, or turned by half a turn about z."""
-    axis, sign = {"near": (1, -1.0), "far": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}[side]
-    turn = np.where(candidates.centers[:, axis] * sign < 0.0, -1.0, 1.0)[:, None]
-    half = np.concatenate([turn, turn, np.ones_like(turn)], axis=1)
-    return replace(
-        candidates,
-        rotations=candidates.rotations * half[:, None, :],
-        centers=candidates.centers * half,
-    )
 
 
 def _measure_support(
