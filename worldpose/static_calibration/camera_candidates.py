@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
+from data_contracts.match import Side
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
@@ -110,6 +111,39 @@ def join_candidates(*parts: Candidates) -> Candidates:
         np.concatenate([part.centers for part in parts]),
         np.concatenate([part.focals for part in parts]),
         np.concatenate([part.radial for part in parts]),
+    )
+
+
+def thin_out(candidates: Candidates, most: int) -> Candidates:
+    """Return candidates that differ from all before, at most this many."""
+    centers = candidates.centers
+    near = np.maximum(5.0, 0.1 * np.linalg.norm(centers, axis=1))[:, None]
+    places = np.concatenate(
+        [
+            centers / near,
+            10.0 * candidates.rotations[:, 2],
+            5.0 * np.log(candidates.focals)[:, None],
+        ],
+        axis=1,
+    )
+    kept: list[int] = []
+    for index, place in enumerate(places):
+        if len(kept) == most:
+            break
+        if not kept or (np.abs(places[kept] - place).max(axis=1) > 1.0).all():
+            kept.append(index)
+    return candidates[np.array(kept, dtype=np.int64)]
+
+
+def stand_on(candidates: Candidates, side: Side) -> Candidates:
+    """Return candidates on one side of the pitch: themselves, or turned by half a turn about z."""
+    axis, sign = {"near": (1, -1.0), "far": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}[side]
+    turn = np.where(candidates.centers[:, axis] * sign < 0.0, -1.0, 1.0)[:, None]
+    half = np.concatenate([turn, turn, np.ones_like(turn)], axis=1)
+    return replace(
+        candidates,
+        rotations=candidates.rotations * half[:, None, :],
+        centers=candidates.centers * half,
     )
 
 

@@ -173,7 +173,7 @@ def refine_by_search(
     if chdtrc(search.free.sum(), distance**2) < settings.contradiction:
         return _keep_start(
             start,
-            "the lines contradict the clicks: the camera would move by "
+            "the lines contradict the clicked or drawn pixels: the camera would move "
             f"{distance:.1f} standard deviations",
         )
     return LineRefinement(

@@ -35,6 +35,8 @@ from worldpose.static_calibration.camera_candidates import (
     project_markings,
     refine_candidates,
     score_with_prior,
+    stand_on,
+    thin_out,
 )
 from worldpose.static_calibration.circle_candidates import name_circles
 from worldpose.static_calibration.ground_error import points_in_view
@@ -58,7 +60,8 @@ MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
 _CLEAR_SHARES: Final = (0.75, 0.6)
-"""Both shares; a clear camera that reaches neither of these does not end the search [1]."""
+"""Both shares; a clear camera that reaches neither of these does not end the search for rolls, and
+one that does not reach the first does not end that for lenses [1]."""
 _MAX_DISPLACEMENT: Final = 0.01
 """Maximum median displacement of markings by the calibration, in image widths [1]."""
 _TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
@@ -266,7 +269,7 @@ def propose_from_paint(
     if found is None:
         return None
     paint, ranked, scores = found
-    samples, best = sample_markings(pitch, _FINE[0]), _stand_on(ranked[:1], side)
+    samples, best = sample_markings(pitch, _FINE[0]), stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)
     markings, drawn = _measure_support(paint, samples, seen)
     return Proposal(
@@ -356,6 +359,14 @@ def calibrate_proposal(
         kept = (each for each in proposal.drawn.drawn if each.name not in names)
         calibration = calibrate(ClickedMarkings(drawn=(*kept, *thin)))
     lines = calibration.report.lines  # each camera has its own ground
+    if lines is not None and not lines.refined:
+        # The proposal is made of painted lines: a right one leads the search to them.
+        raise InputError(
+            where,
+            expected="painted lines where the proposed camera projects the markings",
+            found=lines.reason,
+            todo=_TO_CLICK,
+        )
     surfaced = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
     pixels, calibrated_pixels = (
         camera.project(ground.sample_lines(_FINE[0]).points_world)
@@ -408,14 +419,37 @@ def _rank_under_lenses(
 ) -> tuple[PaintMap, Candidates, Floats] | None:
     """Return the paint under the lens that explains it best, its cameras and their scores."""
     best: tuple[PaintMap, Candidates, Floats] | None = None
+    samples = sample_markings(pitch, _FINE[0])
     for paint in paints:
         focals = _FOCALS if lens is None else np.array([paint.focal / paint.size[0]])
         ranked, scores = rank_cameras(paint, pitch, prior, focals)
         if len(ranked) and (best is None or scores[0] > best[2][0]):
             best = (paint, ranked, scores)
-        if best is not None and best[2][0] - _runner_up(best[2]) >= MIN_MARGIN:
-            break
+        # Under a wrong lens a camera may be clear though a third of its markings misses the paint.
+        if best is not None:
+            found, _ = _shares_if_clear(best[0], samples, best[1], best[2])
+            if found >= _CLEAR_SHARES[0]:
+                break
     return best
+
+
+def _shares_if_clear(
+    paint: PaintMap, samples: LineSamples, ranked: Candidates, scores: Floats
+) -> tuple[float, float]:
+    """Return the first camera's shares of markings on paint, and of paint on markings [1].
+
+    Both are 0 if another camera explains the paint nearly as well.
+
+    Args:
+        paint: paint of the image.
+        samples: of the markings.
+        ranked: different cameras, the best first.
+        scores: of these (k,).
+    """
+    if not len(scores) or scores[0] - _runner_up(scores) < MIN_MARGIN:
+        return 0.0, 0.0
+    seen = project_markings(paint, samples, ranked[:1])
+    return _share_on_paint(seen), explained_share(paint, seen)
 
 
 def _share_on_paint(seen: SeenMarkings) -> float:
@@ -442,11 +476,9 @@ def rank_cameras(
     """
     best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
     samples = sample_markings(pitch, _FINE[0])
-    if len(scores) and scores[0] - _runner_up(scores) >= MIN_MARGIN:
-        seen = project_markings(paint, samples, best[:1])
-        shares = _share_on_paint(seen), explained_share(paint, seen)
-        if np.greater_equal(shares, _CLEAR_SHARES).any():
-            return best, scores
+    shares = _shares_if_clear(paint, samples, best, scores)
+    if np.greater_equal(shares, _CLEAR_SHARES).any():
+        return best, scores
     rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
     return _rank(paint, samples, join_candidates(best, rolled), np.append(scores, others))
 
@@ -470,7 +502,8 @@ def _rank_rolled(
     near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
     # Apart: circles are refined already, and would crowd out better ones of three lines.
     found, near = (_keep_best(paint, samples, each, prior, _MEDIUM[1]) for each in (found, near))
-    found = join_candidates(_thin_out(found[: 10 * _REFINED]), _thin_out(near[: 10 * _REFINED]))
+    found, near = (thin_out(each[: 10 * _REFINED], _REFINED) for each in (found, near))
+    found = join_candidates(found, near)
     samples = sample_markings(pitch, _FINE[0])
     for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
         free = (len(focals) > 1, bends and len(focals) > 1)
@@ -494,30 +527,9 @@ def _rank(
     """Return different cameras on the near side, the best first, and their scores (k,)."""
     order = np.argsort(-scores, kind="stable")
     # Behind a goal refinement moves cameras across the long axis: half a turn makes them equal.
-    found, scores = _stand_on(found[order], "near"), scores[order]
+    found, scores = stand_on(found[order], "near"), scores[order]
     different = _distinct(paint, samples, found)
     return found[different], scores[different]
-
-
-def _thin_out(candidates: Candidates) -> Candidates:
-    """Return candidates that differ from all before, at most as many as will be refined."""
-    centers = candidates.centers
-    near = np.maximum(5.0, 0.1 * np.linalg.norm(centers, axis=1))[:, None]
-    places = np.concatenate(
-        [
-            centers / near,
-            10.0 * candidates.rotations[:, 2],
-            5.0 * np.log(candidates.focals)[:, None],
-        ],
-        axis=1,
-    )
-    kept: list[int] = []
-    for index, place in enumerate(places):
-        if len(kept) == _REFINED:
-            break
-        if not kept or (np.abs(places[kept] - place).max(axis=1) > 1.0).all():
-            kept.append(index)
-    return candidates[np.array(kept, dtype=np.int64)]
 
 
 def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
@@ -535,18 +547,6 @@ def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> 
         else:
             kept.append(index)
     return np.array(kept, dtype=np.int64)
-
-
-def _stand_on(candidates: Candidates, side: Side) -> Candidates:
-    """Return candidates on one side of the pitch: themselves, or turned by half a turn about z."""
-    axis, sign = {"near": (1, -1.0), "far": (1, 1.0), "left": (0, -1.0), "right": (0, 1.0)}[side]
-    turn = np.where(candidates.centers[:, axis] * sign < 0.0, -1.0, 1.0)[:, None]
-    half = np.concatenate([turn, turn, np.ones_like(turn)], axis=1)
-    return replace(
-        candidates,
-        rotations=candidates.rotations * half[:, None, :],
-        centers=candidates.centers * half,
-    )
 
 
 def _measure_support(

@@ -12,7 +12,11 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, simulate_scene
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import calibrate_without_clicks, propose_camera
+from worldpose.static_calibration import (
+    calibrate_proposal,
+    calibrate_without_clicks,
+    propose_camera,
+)
 from worldpose.static_calibration.camera_candidates import (
     Candidates,
     project_markings,
@@ -128,6 +132,50 @@ def test_a_tilted_camera_is_found_where_a_level_one_fits_half_of_the_paint():
     found = propose_camera(still, PitchTemplate.from_spec(scene.surveyed), side="left")
     assert found.is_clear
     assert np.linalg.norm(found.camera.center - true.center) < 0.2  # seen: 0.03
+
+
+def partly_found(others):
+    """Return paint as under a wrong lens: some markings are not straight. Other lines lie about."""
+    lost = {"touch_line_far", "halfway_line", "center_circle", "touch_line_near"}
+    lost |= {name for name in PITCH.arcs if name.startswith("corner")}
+    some = ridges(camera(), [each for each in (*PITCH.lines, *PITCH.arcs) if each not in lost])
+    rng = np.random.default_rng(5)
+    ends = rng.uniform([100.0, 250.0], [1180.0, 700.0], (others, 2, 2))
+    steps = np.linspace(0.0, 1.0, 400)[:, None]
+    way = ends[:, 1] - ends[:, 0]
+    angles = (np.arctan2(way[:, 1], way[:, 0]) + 0.5 * np.pi) % np.pi
+    clutter = [start + steps * along for start, along in zip(ends[:, 0], way, strict=True)]
+    both = Ridges(
+        np.concatenate([some.points, *clutter]),
+        np.append(some.normals, np.repeat(angles, len(steps))),
+    )
+    return straighten_paint(both, np.ones(SIZE[::-1], np.bool_), guess_lens(0.0, SIZE), 1.0)
+
+
+@pytest.mark.parametrize("others", [0, 10])
+def test_a_clear_camera_whose_markings_lack_does_not_end_the_search_for_the_lens(others):
+    poor, whole = partly_found(others), paint_of(camera(), [*PITCH.lines, *PITCH.arcs])
+    alone = propose_from_paint([poor], PITCH, side="near")
+    assert alone is not None
+    assert alone.is_clear  # seen: margin 50, 62 % of its markings on paint
+    tried = []
+
+    def under_lenses():
+        for paint in (poor, whole, poor):
+            tried.append(paint)
+            yield paint
+
+    found = propose_from_paint(under_lenses(), PITCH, side="near")
+    assert found is not None
+    assert found.found > 0.95 > alone.found
+    assert tried == [poor, whole]  # one that finds nearly all markings ends it
+
+
+def test_a_proposal_whose_markings_are_not_in_the_image_is_refused():
+    proposal = propose_camera(still(), PITCH, side="near")
+    other = still((-20.0, -64.0, 19.0))
+    with pytest.raises(InputError, match=r"lines where the proposed camera projects.*Click four"):
+        calibrate_proposal(PITCH, proposal, other, where="image of cam3")
 
 
 def test_drawn_pixels_lie_on_the_markings_that_they_name():
