@@ -241,7 +241,7 @@ def tracked():
     for name in ("joints", "covariance"):
         fits[name] = placed[name]
     return {
-        "tracking__A_1": xr.Dataset(coords={"person": [3, 8]}, attrs={"tracks": tracks}),
+        "tracking__A_1": xr.Dataset(coords=coordinates, attrs={"tracks": tracks}),
         "triangulation__A_1": xr.Dataset(placed, coords=coordinates),
         "body_fitting__A_1": fits,
         "broadcast_calibration__A_1": broadcast(),
