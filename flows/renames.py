@@ -172,14 +172,21 @@ SETTINGS: Final[Mapping[str, Mapping[str, str]]] = {
     },
 }
 """By stage; a dot separates a group of settings from a setting in it."""
+REMOVED: Final[Mapping[str, Mapping[str, str]]] = {
+    "bundle_adjustment": dict.fromkeys(("candidates", "max_candidates"), "triangulation.max_frames")
+}
+"""By stage: settings that another stage's replaces; those of earlier runs are not read."""
 
 
 def rename_settings(
     overrides: Mapping[str, Mapping[str, JsonValue]],
 ) -> dict[str, dict[str, JsonValue]]:
-    """Return settings by stage under their present names."""
+    """Return settings by stage under their present names, without removed ones."""
     return {
-        stage: _rename_settings(SETTINGS.get(stage, {}), values)
+        stage: _rename_settings(
+            SETTINGS.get(stage, {}),
+            {name: value for name, value in values.items() if name not in REMOVED.get(stage, {})},
+        )
         for stage, values in overrides.items()
     }
 

@@ -10,7 +10,7 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record
 from flows.method import METHOD
-from flows.renames import former_names
+from flows.renames import REMOVED, former_names
 from flows.stage import Stage
 from worldpose.errors import UsageError
 
@@ -91,6 +91,14 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
 
 
 def _refuse_former_name(assignment: str, stage: str, field: str, value: JsonValue) -> None:
+    replacement = REMOVED.get(stage, {}).get(field)
+    if replacement is not None:
+        raise UsageError(
+            f"--set {assignment}",
+            expected=f"{replacement}, which replaces this setting",
+            found=f"{stage}.{field}",
+            todo=f"Write --set {replacement}=VALUE.",
+        )
     for former, present in former_names(stage, field, value):
         group, dot, name = present.partition(".")
         written = f'{group}={{"{name}": VALUE}}' if dot else f"{present}=VALUE"

@@ -152,6 +152,18 @@ def test_settings_in_the_record_of_an_earlier_version_get_their_present_names():
     assert renames.rename_settings(recorded) == renamed
 
 
+def test_a_removed_setting_is_refused_with_what_replaces_it_and_not_read_from_records():
+    for stage, names in renames.REMOVED.items():
+        for removed, replacement in names.items():
+            by_name = {stage.name: stage.settings for stage in METHOD}
+            other, _, field = replacement.partition(".")
+            assert is_setting(by_name[other], field) and not is_setting(by_name[stage], removed)
+            with pytest.raises(UsageError, match=re.escape(f"Write --set {replacement}=VALUE")):
+                parse_overrides([f"{stage}.{removed}=1"])
+            recorded = {stage: {removed: 1, "min_views": 4}}
+            assert renames.rename_settings(recorded) == {stage: {"min_views": 4}}
+
+
 def test_settings_of_a_group_get_their_present_names():
     recorded = {"bundle_adjustment": {"frames": 9, "solver": {"iterations": 5, "damping": 0.1}}}
     renamed = {
