@@ -2,6 +2,7 @@
 
 import fcntl
 import importlib
+import multiprocessing.util
 import os
 import shutil
 import threading
@@ -15,6 +16,10 @@ from hypothesis import settings
 from warm_process import STAGES
 
 from flows.orchestration.prefect_environment import local_cluster_options, prefect_server
+
+# multiprocessing keeps its sockets in the first folder that it gets: not in that of a test, which
+# is removed after it.
+multiprocessing.util.get_temp_dir()
 
 # How long a case takes says how busy a machine is.
 settings.register_profile("untimed", deadline=None)
