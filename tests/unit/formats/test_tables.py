@@ -80,9 +80,11 @@ def test_joints_come_back_from_parquet_exactly(tracks, tmp_path):
 
 
 def test_parquet_without_pyarrow_is_refused(tracks, tmp_path, monkeypatch):
+    # Before: a first table without pyarrow would decide how pandas stores strings from then on.
+    table = pd.DataFrame({"a": [1]})
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(UsageError, match=r"pip install 'worldpose\[tables\]'"):
-        write_parquet(tmp_path / "a.parquet", pd.DataFrame({"a": [1]}), NOTES)
+        write_parquet(tmp_path / "a.parquet", table, NOTES)
     assert not (tmp_path / "a.parquet").exists()
 
 
