@@ -1,12 +1,14 @@
 """Trains the weights that ship with the project: renders scenes, trains both nets, scores them.
 
     python infra/embedded_detector/train.py FOLDER [--share 1.0] [--real DATA --movenet FILE] \
-        [scenes people keypoints figures]
+        [--stills DATA] [scenes people keypoints figures]
 
 A training has phases, each of which begins with the weights of the previous one. Every phase
 resumes after an interruption, and ends with the same weights as without it. The last phases of
-each net add real frames, see real_frames.py; without `--real` they are left out. Weights and
-figures.json end in FOLDER; with another seed or torch their bytes differ, but metrics are similar.
+each net add real frames, see real_frames.py; without `--real` they are left out. With `--stills`
+the detector's last phase learns from labelled stills of other stadiums instead, for comparison.
+Weights and figures.json end in FOLDER; with another seed or torch their bytes differ, but metrics
+are similar.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -33,6 +35,7 @@ from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.augmentation import REAL_LOOKS
 from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.keypoint_training import KeypointCrops
+from worldpose.training.labels import read_labels
 from worldpose.training.metrics import (
     HEIGHTS,
     detect_labelled,
@@ -42,6 +45,8 @@ from worldpose.training.metrics import (
 from worldpose.training.people_training import PeopleWindows
 
 Net = TypeVar("Net", PeopleNet, KeypointNet)
+RealImages = Literal["frames", "stills"]
+"""Frames: see real_frames.py. Stills: of benchmarks/stills.py, from other stadiums."""
 
 SCENES: Final = {
     "training": (TRAINING, 50, 4, 2),
@@ -82,7 +87,8 @@ class Phase:
         rate: highest learning rate [1].
         seed: of its batches.
         learned: sets to learn from, and how often each of their images counts.
-        real: learns from real frames, too: no held-out renderings choose its weights.
+        real: the real images that it learns from, too; then no held-out renderings choose its
+            weights.
     """
 
     steps: int
@@ -90,7 +96,7 @@ class Phase:
     rate: float
     seed: int
     learned: Mapping[str, int]
-    real: bool = False
+    real: RealImages | None = None
 
     def settings(self, share: float) -> TrainingSettings:
         """Return the training settings for a share of the phase."""
@@ -116,20 +122,25 @@ PHASES: Final = {
         Phase(
             *(4000, 4000, 1e-3, 5),
             {"training": 2, "far": 2, "crowds": 1, "panorama": 3, "pair": 4},
-            real=True,
+            real="frames",
         ),
         Phase(
             *(6000, 6000, 1e-3, 6),
             {"training": 2, "far": 1, "crowds": 3, "panorama": 3, "pair": 4},
-            real=True,
+            real="frames",
+        ),
+        Phase(
+            *(4000, 4000, 1e-3, 5),
+            {"training": 2, "far": 2, "crowds": 1, "stills": 25},
+            real="stills",
         ),
     ),
     "keypoints": (
         Phase(8000, 8000, 1.5e-3, 1, FEW),
         Phase(6000, 6000, 1e-3, 2, FEW),
         Phase(3750, 5000, 1e-3, 11, ALL),
-        Phase(3500, 3500, 1e-3, 7, {"training": 1, "crowds": 1, "pair": 7}, real=True),
-        Phase(5000, 5000, 1e-3, 9, {"training": 1, "crowds": 1, "pair": 7}, real=True),
+        Phase(3500, 3500, 1e-3, 7, {"training": 1, "crowds": 1, "pair": 7}, real="frames"),
+        Phase(5000, 5000, 1e-3, 9, {"training": 1, "crowds": 1, "pair": 7}, real="frames"),
     ),
 }
 """Phases of the shipped weights, with exceptions in the model card."""
@@ -140,7 +151,11 @@ REAL_CROPS: Final = KeypointCrops(looks=REAL_LOOKS)
 
 
 def main(
-    folder: Path, parts: Sequence[str], share: float, real: tuple[Path, Path] | None = None
+    folder: Path,
+    parts: Sequence[str],
+    share: float,
+    data: Mapping[RealImages, Path],
+    movenet: Path | None = None,
 ) -> None:
     """Run the named parts: `scenes`, `people`, `keypoints`, `figures`.
 
@@ -148,8 +163,8 @@ def main(
         folder: of all outputs.
         parts: parts to run.
         share: of scenes and steps [1]; less than 1 is a smoke test only.
-        real: folder of the real frames, see real_frames.py, and MoveNet; None leaves out the phases
-            that learn from them.
+        data: folders of real images; phases that learn from others are left out.
+        movenet: labels the real frames' joints, as ONNX; needed with real frames.
     """
     torch.set_num_threads(1)
     if "scenes" in parts:
@@ -157,9 +172,10 @@ def main(
             scenes = max(round(share * count), 1)
             for line in render_set(folder / name, kind, scenes, views=views, frames=frames):
                 say(line)
-        for line in label_pair(*real, folder / "pair") if real else ():
-            say(line)
-    cache, data = PictureCache(), real[0] if real else None
+        if "frames" in data and movenet is not None:
+            for line in label_pair(data["frames"], movenet, folder / "pair"):
+                say(line)
+    cache = PictureCache()
     if "people" in parts:
         train_phases(folder, "people", PeopleNet(), cache, share, data)
     if "keypoints" in parts:
@@ -171,11 +187,16 @@ def main(
 
 
 def train_phases(
-    folder: Path, name: str, net: Net, cache: PictureCache, share: float, data: Path | None
+    folder: Path,
+    name: str,
+    net: Net,
+    cache: PictureCache,
+    share: float,
+    data: Mapping[RealImages, Path],
 ) -> None:
-    """Train a net through its phases; without DATA those of real frames are left out."""
+    """Train a net through its phases; those of real images that DATA lacks are left out."""
     checked = read_set(folder / "checking")[::2]
-    phases = [phase for phase in PHASES[name] if data is not None or not phase.real]
+    phases = [phase for phase in PHASES[name] if phase.real is None or phase.real in data]
     for number, phase in enumerate(phases):
         done = folder / f"{name}-{number}.safetensors"
         if not done.exists():
@@ -188,7 +209,9 @@ def train_phases(
                 for picture in times * _read(folder, each, data)
             ]
             train_phase(net, phase, (learned, checked, cache), share, done)
-            trained_on = "rendered scenes and real frames" if phase.real else "rendered scenes"
+            trained_on = (
+                f"rendered scenes and real {phase.real}" if phase.real else "rendered scenes"
+            )
             save_weights(done, net, {"trained-on": trained_on, "seed": str(phase.seed)})
         net = load_weights(done, type(net)())
     (folder / f"embedded_{name}.safetensors").write_bytes(done.read_bytes())
@@ -226,9 +249,11 @@ def train_phase(
         )  # fmt: skip
 
 
-def _read(folder: Path, name: str, data: Path | None) -> list[LabelledPicture]:
-    if name == "panorama" and data is not None:
-        return read_panorama(data)
+def _read(folder: Path, name: str, data: Mapping[RealImages, Path]) -> list[LabelledPicture]:
+    if name == "panorama":
+        return read_panorama(data["frames"])
+    if name == "stills":
+        return read_labels(data["stills"] / "stills" / "labels.json")
     return read_set(folder / name)
 
 
@@ -279,8 +304,14 @@ if __name__ == "__main__":
     parser.add_argument("--share", type=float, default=1.0)
     parser.add_argument("--real", type=Path, metavar="DATA", help="adds real frames")
     parser.add_argument("--movenet", type=Path, metavar="FILE", help="labels their joints")
+    parser.add_argument(
+        "--stills", type=Path, metavar="DATA", help="adds labelled stills of other stadiums instead"
+    )
     given = parser.parse_args()
     if (given.real is None) != (given.movenet is None):
         parser.error("--real and --movenet go together")
-    real_frames = None if given.real is None else (given.real, given.movenet)
-    main(given.folder, given.parts, given.share, real_frames)
+    if given.real is not None and given.stills is not None:
+        parser.error("--real and --stills are two different trainings: give one")
+    images: dict[RealImages, Path | None] = {"frames": given.real, "stills": given.stills}
+    real_images = {name: path for name, path in images.items() if path is not None}
+    main(given.folder, given.parts, given.share, real_images, given.movenet)
