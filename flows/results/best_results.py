@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
@@ -66,7 +67,9 @@ def joint_tracks(
     """Return the joints of one clip, from the best available or the given stage.
 
     People that a broadcast camera alone films have the joints of their bodies; all joints are NaN
-    if none has a body. Triangulated joints have the detector's definition always.
+    if none has a body. Triangulated joints have the detector's definition always. If the first
+    triangulation is the best available, the frames that it skipped have the tracker's joints,
+    without covariance; if it is asked for by name, they are missing.
 
     Raises:
         UsageError: the run has no such result.
@@ -81,6 +84,7 @@ def joint_tracks(
             person_ids=tracked["person"].values.astype(np.int64),
             joints=np.full((*index.shape, 17, 3), np.nan),
         )
+    best = stage is None
     if stage in stages:
         stages = stages[stages.index(stage) :]
     elif stage is not None or not stages:
@@ -94,6 +98,9 @@ def joint_tracks(
     fitted = stages[0] in BODY_STAGES and not on_plane
     seen = placed_joints(run, clip) if fitted else result
     joints, covariance = result["joints"].values, result["covariance"].values
+    views = seen["views"].values.astype(np.int64)
+    if best and stages[0] == "triangulation":
+        joints, views = _with_tracked_joints(run, clip, joints, views)
     if stages[0] in BODY_STAGES and definition == "detector":
         joints = perceived_joints(joints, result["joint_offsets"].values)
     if fitted and definition == "detector":
@@ -103,7 +110,7 @@ def joint_tracks(
         person_ids=result["person"].values.astype(np.int64),
         joints=joints,
         covariance=covariance,
-        views=seen["views"].values.astype(np.int64),
+        views=views,
         extra=_extra_tracks(result, seen, definition),
     )
 
@@ -308,6 +315,28 @@ def _stage_joints(run: Run, clip: str, stage: str) -> xr.Dataset:
         for name, array in result.data_vars.items()
     }
     return result.reindex(frame=frame, fill_value=unknown)
+
+
+def _with_tracked_joints(
+    run: Run, clip: str, joints: Floats, views: NDArray[np.int64]
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return joints and views with the tracker's in the frames that triangulation skipped.
+
+    Args:
+        run: the run.
+        clip: the clip.
+        joints: (frames, persons, 17, 3) [m].
+        views: (frames, persons, 17) cameras.
+    """
+    computed = run[f"triangulation/{clip}"]
+    tracking = run[f"tracking/{clip}"].sel(person=computed["person"])
+    skipped = ~tracking["frame"].isin(computed["frame"]).values
+    matched = (tracking["detection_index"].values >= 0).sum(axis=1)
+    joints, views = joints.copy(), views.copy()
+    joints[skipped] = tracking["joints"].values[skipped]
+    seen = np.isfinite(joints[skipped, ..., 0])
+    views[skipped] = np.where(seen, matched[skipped, :, None], 0)
+    return joints, views
 
 
 def placed_joints(run: Run, clip: str) -> xr.Dataset:

@@ -91,6 +91,12 @@ def test_more_views_leave_fewer_joints(stricter_run):
     assert int(strict.views.where(strict.views > 0).min()) >= 3
 
 
+def walked_m(run):
+    """The way of all people over the ground [m]."""
+    places = joint_tracks(run, "clip").joints[:, :, 11:13, :2].mean(axis=2)
+    return np.nansum(np.linalg.norm(np.diff(places, axis=0), axis=-1))
+
+
 def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy):
     few = ("--set", "triangulation.max_frames=10", "--until", "bundle_adjustment")
     run_json(tiny, "--project", project_copy, *few)
@@ -105,6 +111,20 @@ def test_the_first_triangulation_of_a_long_match_skips_frames(tiny, project_copy
     np.testing.assert_array_equal(seen.frames, every)
     assert np.isnan(seen.joints[1]).all() and not seen.views[1].any()
     np.testing.assert_array_equal(seen.joints[::3], placed["joints"])
+
+    # Without a later stage, the skipped frames have the tracker's joints.
+    best, tracked = joint_tracks(run, "clip"), run["tracking/clip"]["joints"].values
+    np.testing.assert_array_equal(best.joints[1::3], tracked[1::3].astype(np.float64))
+    np.testing.assert_array_equal(best.joints[::3], placed["joints"])
+    assert best.covariance is not None and np.isnan(best.covariance[1::3]).all()
+    assert (best.views[1::3] > 0).any() and not best.views[np.isnan(best.joints[..., 0])].any()
+    complete = open_run(str(project_copy), TINY, "0001")
+    assert walked_m(run) == pytest.approx(walked_m(complete), rel=0.1)
+    out = Path(project_copy).parent / "positions"
+    succeed("export", tiny, "--project", project_copy, "--format", "positions", "--out", out)
+    lines = (out / "positions" / "clip.csv").read_text().splitlines()[1:]
+    assert len({line.split(",")[0] for line in lines}) == len(every)
+    assert not any("nan" in line for line in lines)
 
     between = (*few, "--set", "bundle_adjustment.chosen_frames=[0,4]")
     answer = worldpose("run", tiny, "--project", project_copy, *between)

@@ -71,8 +71,9 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
     """Write a line per person and frame, frame by frame; missing people have none.
 
     Columns: frame, time_s (frame / fps), person, name, kind in this frame (triangulated or plane),
-    x_m and y_m (world), x_std_m, y_std_m and xy_correlation of their covariance, speed_m_s over
-    `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed by their feet.
+    x_m and y_m (world), x_std_m, y_std_m and xy_correlation of their covariance (empty where it is
+    not known), speed_m_s over `SPEED_WINDOW_S` (empty at a track's ends), height_m of people placed
+    by their feet.
     """
     speed = _speeds(positions.xy, fps)
     variance = np.diagonal(positions.covariance, axis1=-2, axis2=-1)
@@ -84,7 +85,7 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
         table.writerow(COLUMNS)
         for row, frame in enumerate(positions.frames.tolist()):
             for p in np.flatnonzero(np.isfinite(positions.xy[row, :, 0])).tolist():
-                numbers = (*positions.xy[row, p], *std[row, p])
+                numbers = (*std[row, p], correlation[row, p])
                 table.writerow(
                     [
                         frame,
@@ -92,8 +93,8 @@ def write_positions(path: Path, positions: Positions, fps: float) -> None:
                         int(positions.person[p]),
                         positions.names[p],
                         "plane" if positions.on_plane[row, p] else "triangulated",
-                        *(f"{number:.3f}" for number in numbers),
-                        f"{correlation[row, p]:.3f}",
+                        *(f"{number:.3f}" for number in positions.xy[row, p]),
+                        *(f"{number:.3f}" if np.isfinite(number) else "" for number in numbers),
                         f"{speed[row, p]:.2f}" if np.isfinite(speed[row, p]) else "",
                         f"{positions.height[p]:.2f}" if np.isfinite(positions.height[p]) else "",
                     ]
