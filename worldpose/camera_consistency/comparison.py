@@ -169,7 +169,7 @@ class Comparison:
         known = np.isfinite(points).all(axis=-1)
         rays[known] = camera.unproject(points[known]).directions
         spread = np.full(points.shape[:2], self._pixel_noise[c] / float(camera.focal.mean()))
-        return View(rays, np.ascontiguousarray(camera.center), spread)
+        return View(rays, np.array(camera.center), spread)
 
     def times(self, hypothesis: Hypothesis) -> Ints:
         """Return the camera's frame at each sampled frame under a hypothesis; -1 = none."""
@@ -177,7 +177,9 @@ class Comparison:
 
     def scores(self, view: View, partner: View, at: Ints, there: Ints) -> Floats:
         """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
-        scores = pair_scores(view, at, partner, there, self._heights, self._joint_noise)
+        # One order of the arrays: kernels are compiled for each anew.
+        times = np.ascontiguousarray(at), np.ascontiguousarray(there)
+        scores = pair_scores(view, times[0], partner, times[1], self._heights, self._joint_noise)
         return np.asarray(scores)
 
     def quick(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> float:

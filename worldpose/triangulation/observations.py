@@ -101,11 +101,14 @@ class Observations(NamedTuple):
         index: NDArray[np.integer],
         shift: Floats | None = None,
     ) -> Observations:
-        """Return the observations of a rig; arguments as the attributes, by default unshifted."""
+        """Return the observations of a rig; arguments as the attributes, by default unshifted.
+
+        Order and type of the arrays are always the same: kernels are compiled for each anew.
+        """
         return cls(
             keypoints=keypoints,
-            precision=precision,
-            detection_index=index,
+            precision=np.ascontiguousarray(precision),
+            detection_index=np.ascontiguousarray(index, dtype=np.int64),
             shift=no_shift() if shift is None else shift,
             cameras=rig.cameras,
             depths=rig.depths,
