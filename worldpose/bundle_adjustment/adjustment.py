@@ -314,21 +314,22 @@ class _Adjuster:
             return solve(markings_problem(self.clip, fixed, self.settings), MARKINGS_SOLVER)
         observed = self.observations
         # A refused calibrated camera contributes nothing: its markings contradict people. A refused
-        # given camera without contradictions is no more exact than the others. It moves with them
-        # here and is put back, because two fixed cameras would pull all others to their own errors.
-        uncertain = fixed & self.clip.given & ~self.other_people
-        kept = (~fixed | uncertain)[observed.camera_of]
+        # given camera without contradictions contributes. In a small rig it is fixed and the others
+        # adapt to it. In a larger one it moves with them here and is put back, because it is no
+        # more exact than they are, and two fixed cameras would pull all others to their own errors.
+        consistent = self.clip.given & ~self.other_people
+        kept = (~fixed | consistent)[observed.camera_of]
+        held = fixed if len(fixed) <= _SMALL_RIG else fixed & ~consistent
         if without is not None:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
             kept &= groups[row, observed.person_of] != without
         observed = _select_observations(observed, kept)
-        held = fixed & ~uncertain
         problem = players_problem(
             self.clip, observed, self.noise, held, self.settings, self.variance_factor
         )
         solution = solve(problem, self.settings.solver, self.offset, covariance=without is None)
-        if self.clip.given.all():
+        if self.clip.given.all() and not (held & consistent).any():
             solution = self._align_to_initial_people(solution, observed)
         cameras = _merge_cameras(~fixed, solution.cameras, self.clip.cameras)
         return replace(solution, cameras=cameras)
