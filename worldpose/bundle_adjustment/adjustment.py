@@ -45,6 +45,7 @@ from worldpose.bundle_adjustment.uncertainty import (
 from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 from worldpose.static_calibration import PARAMETERS, project_with_jacobian
+from worldpose.triangulation import triangulate_joints
 
 _OTHER_PEOPLE: Final = (
     "refused: this camera shows other people than the other cameras under the same ids"
@@ -128,8 +129,9 @@ def adjust_cameras(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views, used
     )
     judged = judged if len(judged) else used
+    placed = _place_people(clip, used)
     clip = learn_confidence(clip, np.union1d(used, judged))
-    adjuster = _Adjuster(clip, settings, used, judged)
+    adjuster = _Adjuster(clip, settings, used, judged, placed)
     count = len(clip.clicks)
     observed = adjuster.observations
     if settings.evidence == "markings_and_players" and not len(observed.points):
@@ -218,8 +220,10 @@ class _Adjuster:
         settings: BundleAdjustmentSettings,
         used: Integers,
         judged: Integers,
+        placed: Floats,
     ) -> None:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
+        self.placed = placed
         people = np.ones(clip.detections.detection_index.shape[2], dtype=np.bool_)
         self.observations = select_observations(
             clip, used, people, clip.cameras, settings.min_views
@@ -305,42 +309,45 @@ class _Adjuster:
         return ""
 
     def adjust(self, fixed: Flags, without: int | None = None) -> Solution:
-        """Return the adjustment to all people, or to all but one group."""
+        """Return the adjustment to all people, or to all but one group; fixed cameras unchanged."""
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, fixed, self.settings), MARKINGS_SOLVER)
         observed = self.observations
         # A refused calibrated camera contributes nothing: its markings contradict people. A refused
-        # given camera without contradictions is held fixed, and the others adapt to it.
-        trusted = ~fixed | (self.clip.given & ~self.other_people)
-        kept = trusted[observed.camera_of]
+        # given camera without contradictions contributes. In a small rig it is fixed and the others
+        # adapt to it. In a larger one it moves with them here and is put back, because it is no
+        # more exact than they are, and two fixed cameras would pull all others to their own errors.
+        consistent = self.clip.given & ~self.other_people
+        kept = (~fixed | consistent)[observed.camera_of]
+        held = fixed if len(fixed) <= _SMALL_RIG else fixed & ~consistent
         if without is not None:
             groups = self._groups(len(self.used))
             row = np.searchsorted(self.used, observed.frame_of)
             kept &= groups[row, observed.person_of] != without
         observed = _select_observations(observed, kept)
         problem = players_problem(
-            self.clip, observed, self.noise, fixed, self.settings, self.variance_factor
+            self.clip, observed, self.noise, held, self.settings, self.variance_factor
         )
         solution = solve(problem, self.settings.solver, self.offset, covariance=without is None)
-        if self.clip.given.all() and not (fixed & ~self.other_people).any():
-            return self._align_to_initial_people(solution, observed, fixed)
-        return solution
+        if self.clip.given.all() and not (held & consistent).any():
+            solution = self._align_to_initial_people(solution, observed)
+        cameras = _merge_cameras(~fixed, solution.cameras, self.clip.cameras)
+        return replace(solution, cameras=cameras)
 
-    def _align_to_initial_people(
-        self, solution: Solution, observed: Observations, fixed: Flags
-    ) -> Solution:
-        """Return the solution, aligned to the people as the given cameras had them.
+    def _align_to_initial_people(self, solution: Solution, observed: Observations) -> Solution:
+        """Return the solution, aligned to the people as the given cameras have them.
 
         A similarity transform of all cameras and people changes no residual: only the given cameras
         determine it, and people stay where all of them together put them.
         """
         first = np.searchsorted(observed.point_of, np.arange(len(solution.points)))
         person, joint = observed.person_of[first], observed.joint_of[first]
-        before = self.clip.joints[observed.frame_of[first], person, joint]
+        row = np.searchsorted(self.used, observed.frame_of[first])
+        before = self.placed[row, person, joint]
         found = np.isfinite(before).all(axis=1)
         back = align_points(solution.points[found], before[found])
-        cameras = _merge_cameras(~fixed, back.move_cameras(solution.cameras), solution.cameras)
-        return replace(solution, cameras=cameras, points=back.move_points(solution.points))
+        cameras, points = back.move_cameras(solution.cameras), back.move_points(solution.points)
+        return replace(solution, cameras=cameras, points=points)
 
     def uncertainty(self, adjusted: Solution) -> Floats:
         """Return the covariance (cameras, 12, 12) of adjusted cameras.
@@ -402,6 +409,17 @@ class _Adjuster:
         if persons > 1:
             return np.tile(np.arange(persons) % min(folds, persons), (frames, 1))
         return np.repeat((np.arange(frames) * folds // max(frames, 1))[:, None], persons, axis=1)
+
+
+def _place_people(clip: Clip, frames: Integers) -> Floats:
+    """Return joints (k, persons, 17, 3) [m] by the given cameras; NaN if any is calibrated.
+
+    The clip's own joints are by cameras of the last iteration: to keep people there would add the
+    shifts of all iterations.
+    """
+    if not clip.given.all():
+        return np.full((len(frames), *clip.joints.shape[1:]), np.nan)
+    return triangulate_joints(clip.cameras, clip.detections[frames], clip.triangulation).joints
 
 
 def _select_observations(observed: Observations, kept: Flags) -> Observations:

@@ -1,10 +1,14 @@
 """Given cameras, no pitch, people who cross: adjustment improves or refuses, and never drifts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lab import joint_error, make_lab, triangulated
 
-from worldpose.bundle_adjustment import adjust_cameras
+from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
+from worldpose.static_calibration import step_camera
+from worldpose.triangulation import triangulate_joints
 
 CASES = {
     "exact": {},
@@ -54,6 +58,40 @@ def test_people_stay_where_all_given_cameras_put_them():
     # The joints of single people move; all of them together do not.
     assert np.linalg.norm(np.nanmean(after - before, axis=(0, 1, 2))) < 0.006
     assert np.nanmean(np.linalg.norm(after - before, axis=-1)) > 0.006
+
+
+def test_refused_given_cameras_do_not_pull_the_others():
+    lab = make_lab(1, cameras=8, center=0.02, rotation=np.radians(0.1))
+    # Two cameras err by 5 cm together, and have too few keypoints for a change.
+    step = np.zeros((8, 12))
+    step[:2, 3:6] = lab.clip.cameras.cam_from_world.rotation[:2] @ [0.05, 0.0, 0.0]
+    cameras = step_camera(lab.clip.cameras, step)
+    confidence = lab.clip.detections.confidence.copy()
+    confidence[:, :2, :, ::2] = 0.0
+    seen = replace(lab.clip.detections, confidence=confidence)
+    placed = triangulate_joints(cameras, seen, lab.clip.triangulation)
+    views = placed.views.astype(np.int64)
+    clip = replace(lab.clip, cameras=cameras, detections=seen, joints=placed.joints, views=views)
+    adjusted = adjust_cameras(clip, BundleAdjustmentSettings(min_judges=1200))
+    np.testing.assert_array_equal(adjusted.accepted, [False] * 2 + [True] * 6)
+    np.testing.assert_array_equal(adjusted.cameras.numbers[:2], cameras.numbers[:2])
+    others = seen.detection_index.copy()
+    others[:, :2] = -1
+    lab = lab._replace(clip=replace(clip, detections=seen.assign_people(others)))
+    before, after = triangulated(lab, cameras), triangulated(lab, adjusted.cameras)
+    # No more than their share of eight cameras.
+    assert np.linalg.norm(np.nanmean(after - before, axis=(0, 1, 2))) < 0.05 * 2 / 8
+
+
+@pytest.mark.parametrize("shift", [[0.06, 0.0, 0.0], [0.0, 0.0, -0.06]])
+def test_people_of_the_last_iteration_do_not_move_the_cameras(shift):
+    clip = make_lab(1, center=0.05, rotation=np.radians(0.3)).clip
+    first = adjust_cameras(clip)
+    later = adjust_cameras(replace(clip, joints=clip.joints + shift))
+    assert first.accepted.all()
+    assert later.accepted.all()
+    off = later.cameras.center - first.cameras.center
+    assert np.linalg.norm(off.mean(axis=0)) < 0.003
 
 
 def test_stated_uncertainty_leaves_out_what_all_cameras_share():
