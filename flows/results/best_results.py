@@ -69,7 +69,7 @@ def joint_tracks(
     People that a broadcast camera alone films have the joints of their bodies; all joints are NaN
     if none has a body. Triangulated joints have the detector's definition always. If the first
     triangulation is the best available, the frames that it skipped have the tracker's joints,
-    without covariance; if it is asked for by name, they are missing.
+    without covariance; if `stage` names it, they are missing.
 
     Raises:
         UsageError: the run has no such result.

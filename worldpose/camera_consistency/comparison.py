@@ -177,7 +177,7 @@ class Comparison:
 
     def scores(self, view: View, partner: View, at: Ints, there: Ints) -> Floats:
         """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
-        # One order of the arrays: kernels are compiled for each anew.
+        # Contiguous: numba compiles a kernel again for every other memory layout.
         times = np.ascontiguousarray(at), np.ascontiguousarray(there)
         scores = pair_scores(view, times[0], partner, times[1], self._heights, self._joint_noise)
         return np.asarray(scores)

@@ -103,7 +103,7 @@ class Observations(NamedTuple):
     ) -> Observations:
         """Return the observations of a rig; arguments as the attributes, by default unshifted.
 
-        Order and type of the arrays are always the same: kernels are compiled for each anew.
+        Arrays are contiguous and have one type: numba compiles a kernel again for every other.
         """
         return cls(
             keypoints=keypoints,
