@@ -35,7 +35,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -65,6 +65,7 @@ from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch import PitchTemplate
 from worldpose.static_calibration import StaticCalibration, calibrate_camera
+from worldpose.static_calibration.line_refinement import LineRefinement
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store import Store
 from worldpose.tracking import TrackingSettings, locate_feet, track_on_plane
@@ -120,6 +121,50 @@ def score_clicks(folder: Path, side: str, count: int | None) -> Metrics:
         "wrong_names": len(wrong),
         "right_accused": len(rejected - wrong),
     }
+
+
+def score_lines(folder: Path, side: str, count: int | None) -> Metrics:
+    """Return the error of left-out painted markings (the first `count`).
+
+    Each marking is taken off the pitch, the camera is calibrated on all others and the clicks, and
+    its projection is compared with the paint that the calibration with all markings found.
+    """
+    pitch, clicks = static_pair.clicked_pitch(folder, side)
+    still = static_pair.median_still(folder, side)
+    bars = _find_lines(pitch, clicks, still).bars
+    assert bars is not None  # the camera was refined
+    off, deviations = [], []
+    for number in np.unique(bars.samples.marking)[:count]:
+        mine, name = bars.samples.marking == number, bars.samples.names[number]
+        lines = {key: line for key, line in pitch.lines.items() if key != name}
+        arcs = {key: arc for key, arc in pitch.arcs.items() if key != name}
+        without = _find_lines(replace(pitch, lines=lines, arcs=arcs), clicks, still).estimate
+        own = replace(
+            bars,
+            samples=bars.samples[mine],
+            pixels=bars.pixels[mine],
+            noise=bars.noise[mine],
+            by_paint=bars.by_paint[mine],
+            unknowns=bars.unknowns[mine],
+        )
+        whitened, moves = own.whiten_raw(without.camera, without.surface)
+        variance = 1.0 + np.einsum("ni,ij,nj->n", moves, without.covariance, moves)
+        variance += ((own.by_paint / own.noise[:, None]) ** 2).sum(axis=1)
+        off.append(np.abs(whitened) * own.noise)
+        deviations.append(np.abs(whitened) / np.sqrt(variance))
+    return {
+        "left_out_line_px_median": float(np.median(np.concatenate(off))),
+        "left_out_line_in_region": float((np.concatenate(deviations) < 1.96).mean()),
+    }
+
+
+def _find_lines(
+    pitch: PitchTemplate, clicks: ClickedMarkings, still: NDArray[np.uint8]
+) -> LineRefinement:
+    lines = calibrate_camera(pitch, clicks, static_pair.SIZE, picture=still).report.lines
+    if lines is None or not lines.refined:
+        raise WorldposeError(f"static pair: the lines were not used: {lines and lines.reason}")
+    return lines
 
 
 def track_sides(
@@ -199,7 +244,10 @@ def score_static_pair(folder: Path, frames: int | None) -> Metrics:
         for side, offset in static_pair.SIDES.items()
     )
     count = whole if frames is None else min(frames, whole)
-    metrics: Metrics = {side: score_clicks(folder, side, frames) for side in static_pair.SIDES}
+    metrics: Metrics = {
+        side: score_clicks(folder, side, frames) | score_lines(folder, side, frames)
+        for side in static_pair.SIDES
+    }
     for clicked in (True, False):
         with tempfile.TemporaryDirectory() as temporary:
             found, places = track_sides(folder, count, Path(temporary), clicked=clicked)
@@ -410,6 +458,8 @@ PARTS: dict[str, Part] = {
         {
             "left.left_out_px_median": "leave-one-out, median",
             "right.left_out_px_median": "leave-one-out, median",
+            "left.left_out_line_px_median": "each painted marking predicted by the others",
+            "right.left_out_line_px_median": "each painted marking predicted by the others",
             "feet_m_median": "0.15 wanted",
             "feet_m_p95": "0.5 wanted",
             "people_per_frame": f"pairs; {WANTED_PAIRS:g} or more wanted",
