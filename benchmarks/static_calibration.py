@@ -48,7 +48,6 @@ FREE = SPREAD > 0.0
 START_ERROR = 5.0
 FARTHEST = 30.0
 """Upper limit of the distance map [px]."""
-NO_MAP = np.empty(0, np.float32)
 ROBUST = 3.0
 """Cauchy scale of the peers' residuals on the map [px]: boards and shadows have edges, too."""
 
@@ -93,8 +92,9 @@ def distance_map(picture: NDArray[np.uint8], start: Camera) -> NDArray[np.float3
 
 def looked_up(away: MatLike, pixels: Floats) -> Floats:
     """Return the map interpolated at pixels (n,)."""
-    at = pixels.astype(np.float32)[None]
-    mapped = cv2.remap(away, at, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # Not as one map and an empty second one: OpenCV 5 then reads arbitrary values.
+    x, y = np.ascontiguousarray(pixels.T, dtype=np.float32)[:, None]
+    mapped = cv2.remap(away, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(mapped[0], float)
 
 
