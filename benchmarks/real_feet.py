@@ -16,7 +16,7 @@ cameras.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -108,7 +108,9 @@ def distances(camera: Camera, points: Floats, seen: KeypointDetections, c: int) 
 
 def main() -> None:
     """Print the table."""
-    cameras, seen, fps = open_trial(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("trial", type=Path, help="folder of a Pose2Sim trial with feet in pose/")
+    cameras, seen, fps = open_trial(parser.parse_args().trial)
     settings = TriangulationSettings()
     names = ("triangulated", "bodies without feet", "bodies with feet")
     found: dict[str, list[Floats]] = {name: [] for name in names}
