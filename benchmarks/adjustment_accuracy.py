@@ -2,10 +2,11 @@
 
     python benchmarks/adjustment_accuracy.py [--scenario match] [--seeds 601 602] [--duration 4]
 
-Cameras are calibrated from the scenario's clicks and one image each, people are tracked and
-triangulated with them, and all cameras are adjusted together. Ground: the true pixel of a player's
-position, projected back through the camera onto the pitch, median / 95 %. Regions: share of the
-positions in a camera's image whose image error is within the camera's covariance.
+Cameras are calibrated from the scenario's clicks and one image each ("alone"), then on the pitch
+that all of them show ("calibrated"), as the stages take them. People are tracked and triangulated
+with them, and all cameras are adjusted together. Ground: the true pixel of a player's position,
+projected back through the camera onto the pitch, median / 95 %. Regions: share of the positions in
+a camera's image whose image error is within the camera's covariance.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, Scenario, Scene, simulate_scene
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration import StaticCalibration, calibrate_camera, project_with_jacobian
+from worldpose.static_calibration.report import calibration_arrays
+from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.triangulation import TriangulationSettings, triangulate_joints
 
@@ -45,15 +48,16 @@ def calibrate_static(scene: Scene, scenario: Scenario, seed: int) -> dict[str, S
     return found
 
 
-def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration]) -> Clip:
+def as_clip(scene: Scene, fps: float, known: dict[str, StaticCalibration], venue: Venue) -> Clip:
     """Return the clip in bundle adjustment's format."""
     seen, settings = scene.static_views(list(known)), TriangulationSettings()
-    cameras = Camera.stack([each.estimate.camera for each in known.values()])
-    covariance = np.stack([each.estimate.covariance for each in known.values()])
+    cameras, covariance = venue.cameras, venue.covariance
     index = track_people(cameras, seen.detections, fps, TrackingSettings()).detection_index
     detections = seen.detections.assign_people(index)
     placed = triangulate_joints(cameras, detections, settings, covariance)
     surveyed = PitchTemplate.from_spec(scene.surveyed)
+    if venue.surface is not None:
+        surveyed = surveyed.with_surface(venue.surface.shape)
     return Clip(
         cameras=cameras,
         covariance=covariance,
@@ -99,7 +103,7 @@ def tell(label: str, found: list[tuple[Floats, Floats]]) -> None:
 
 
 def main() -> None:
-    """Print two lines per match, and two for all."""
+    """Print three lines per match, and three for all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenario", default="match")
     parser.add_argument("--seeds", type=int, nargs="+", default=[601, 602])
@@ -108,12 +112,14 @@ def main() -> None:
     changes = {"duration": options.duration, "broadcast": None}
     scenario = SCENARIOS[options.scenario].model_copy(update=changes)
     painted = PitchTemplate.from_spec(scenario.pitch)
+    alone: list[tuple[Floats, Floats]] = []
     before: list[tuple[Floats, Floats]] = []
     after: list[tuple[Floats, Floats]] = []
     for seed in options.seeds:
         scene = simulate_scene(scenario, seed)
         known = calibrate_static(scene, scenario, seed)
-        clip = as_clip(scene, scenario.fps, known)
+        venue = join_cameras([calibration_arrays(each) for each in known.values()])
+        clip = as_clip(scene, scenario.fps, known, venue)
         begin = time.process_time()
         adjusted = adjust_cameras(clip)
         spent = time.process_time() - begin
@@ -121,15 +127,20 @@ def main() -> None:
         places = scene.truth.joints[moments][:, :, 15:17].mean(axis=2).reshape(-1, 3)
         places[:, 2] = painted.height(places[:, 0], places[:, 1])
         true = Camera.stack([scene.cameras[name] for name in known])
+        own = Camera.stack([each.estimate.camera for each in known.values()])
+        spread = np.stack([each.estimate.covariance for each in known.values()])
+        alone.append(errors(own, spread, true, places, painted))
         before.append(errors(clip.cameras, clip.covariance, true, places, painted))
         after.append(errors(adjusted.cameras, adjusted.covariance, true, places, painted))
         print(
             f"{options.scenario} {seed}: {int(adjusted.accepted.sum())} of {len(known)} cameras "
             f"changed in {spent:.1f} s"
         )
+        tell("alone", alone[-1:])
         tell("calibrated", before[-1:])
         tell("adjusted", after[-1:])
     print(f"all {len(options.seeds)}:")
+    tell("alone", alone)
     tell("calibrated", before)
     tell("adjusted", after)
 

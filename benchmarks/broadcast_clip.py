@@ -155,9 +155,10 @@ def estimated_surface(found: BroadcastCalibration) -> PitchTemplate:
 
 
 def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrames) -> list[Row]:
-    """Return frame, marking, signed distance and its stated deviation of every drawn pixel.
+    """Return frame, marking, signed distance, its stated deviation and its slopes per drawn pixel.
 
     A distance is from the projected marking to the pixel, positive below it [px of 512 columns].
+    Slopes are by the frame's parameters, in the order of `found.uncertainty.frame`.
     """
     squeeze = np.array([SQUEEZED / SIZE[0], 1.0])
     rows = []
@@ -173,21 +174,54 @@ def distances(found: BroadcastCalibration, pitch: PitchTemplate, drawn: KeyFrame
                 along = ends[1] - ends[0]
                 normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
                 normal *= np.sign(normal[1])
-                covariance = _pixel_covariance(found, key.frame, world[nearest])
-                std = np.sqrt(normal * squeeze @ covariance @ (normal * squeeze))
-                rows.append((key.frame, marking.name, float(off[nearest] @ normal), float(std)))
+                slopes = normal * squeeze @ _pixel_slopes(found, key.frame, world[nearest])
+                std = np.sqrt(slopes @ found.uncertainty.frame[key.frame] @ slopes)
+                distance = float(off[nearest] @ normal)
+                rows.append((key.frame, marking.name, distance, float(std), slopes))
     return rows
 
 
-Row = tuple[int, str, float, float]
+Row = tuple[int, str, float, float, Floats]
 
 
-def _pixel_covariance(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
-    """Return the covariance (2, 2) [px^2] of a place's pixel by the camera's covariance."""
+def _pixel_slopes(found: BroadcastCalibration, frame: int, place: Floats) -> Floats:
+    """Return the slopes (2, 12) of a place's pixel by the parameters of its frame."""
     camera, pixel, by_step = found.camera, np.empty(2), np.empty((2, 12))
     lens = camera.lens(frame)
     point_row(camera.rotation[frame], camera.center, lens, place, pixel, by_step)
-    return np.asarray(by_step @ found.uncertainty.frame[frame] @ by_step.T)
+    return by_step
+
+
+def expected_rms(
+    found: BroadcastCalibration, rows: list[Row], draws: int = 4000
+) -> tuple[Floats, Floats]:
+    """Return root mean squares (draws,) of distances that the stated covariance lets expect.
+
+    Pixels of a frame share the error of its camera, and frames share that of centre and pitch: few
+    errors make all distances of a clip, and their root mean square varies. The covariance between
+    frames is not kept. So there are two draws: one error for all frames (the square roots of their
+    covariances are symmetric, so that it acts alike in all), and one per frame.
+
+    Args:
+        found: the camera and its covariance.
+        rows: of `distances`.
+        draws: number of clips.
+    """
+    rng = np.random.default_rng(0)
+    frames = sorted({row[0] for row in rows})
+    roots = {}
+    for frame in frames:
+        values, vectors = np.linalg.eigh(found.uncertainty.frame[frame])
+        roots[frame] = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    loads = np.stack([roots[row[0]] @ row[4] for row in rows])
+    common = rng.normal(size=(draws, 1, loads.shape[1]))
+    apart = rng.normal(size=(draws, len(frames), loads.shape[1]))[
+        :, [frames.index(row[0]) for row in rows]
+    ]
+    together, single = (
+        np.sqrt(np.mean((each * loads).sum(axis=-1) ** 2, axis=1)) for each in (common, apart)
+    )
+    return together, single
 
 
 def repeatability(one: list[Row], two: list[Row]) -> float:
@@ -224,6 +258,15 @@ def score(data: Path, proposed: bool) -> None:
             print(f"{title}: {len(off)} pixels, mean {mean:.2f} px, median {middle:.2f}", end="")
             rms = np.sqrt(np.mean(off**2)), np.sqrt(np.mean(stated**2))
             print(f", 95 % {most:.2f}, rms {rms[0]:.2f}, stated {rms[1]:.2f}")
+            together, single = expected_rms(found, rows)
+            inside = 100.0 * np.mean(abs(off) < 1.96 * stated)
+            print(f"  {inside:.0f} % of them within 95 % regions; 95 % of clips with", end="")
+            for label, each in (("one error", together), ("errors of single frames", single)):
+                low, high = np.quantile(each, [0.025, 0.975])
+                below = 100.0 * np.mean(each < rms[0])
+                print(f" {label} have an rms of {low:.2f} to {high:.2f}", end="")
+                print(f", {below:.0f} % a smaller one;", end="")
+            print()
         for name in sorted({row[1] for row in drawings[0]}):
             offs = [[row[2] for row in rows if row[1] == name] for rows in drawings]
             print(f"  {name}: mean {np.mean(offs[0]):+.2f}, {np.mean(offs[1]):+.2f} px")

@@ -504,6 +504,10 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     options = parser.parse_args()
     data = None if options.data is None else Path(options.data)
+    if data is not None and not all((data / name).is_dir() for name in ("trajectories", "mocap")):
+        parser.error(
+            f"{data}: expected folders trajectories and mocap; without --data none is used"
+        )
     named: Counter[str] = Counter()
     planted: Counter[str] = Counter()
     others: Counter[str] = Counter()

@@ -169,7 +169,7 @@ def body_equations() -> tuple[Kernel, Kernel]:
     covariance = np.broadcast_to(JOINT_NOISE**2 * np.eye(3), (*joints.shape, 3))
     own = Evidence.of(joints, covariance, 50.0, settings)
     track = Track(
-        chained, own, prior, settings, 50.0, settings.acceleration_m_s2, settings.pose_weight
+        chained, own, prior, settings, 50.0, settings.acceleration_m_s2, settings.pose_weight(50.0)
     )
     betas = truth.flat().betas[0]
     pose = Pose(*start_poses(model, betas, joints, prior), betas)

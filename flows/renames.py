@@ -173,9 +173,13 @@ SETTINGS: Final[Mapping[str, Mapping[str, str]]] = {
 }
 """By stage; a dot separates a group of settings from a setting in it."""
 REMOVED: Final[Mapping[str, Mapping[str, str]]] = {
-    "bundle_adjustment": dict.fromkeys(("candidates", "max_candidates"), "triangulation.max_frames")
+    "bundle_adjustment": dict.fromkeys(
+        ("candidates", "max_candidates"), "triangulation.max_frames"
+    ),
+    "body_fitting": {"pose_weight": "body_fitting.poses_per_s"},
 }
-"""By stage: settings that another stage's replaces; those of earlier runs are not read."""
+"""By stage: settings that another one, of other units, replaces; those of earlier runs are not
+read."""
 
 
 def rename_settings(

@@ -337,7 +337,7 @@ class _Clip:
             settings,
             fps,
             settings.shape_acceleration_m_s2 if for_shape else settings.acceleration_m_s2,
-            settings.shape_pose_weight if for_shape else settings.pose_weight,
+            settings.shape_pose_weight if for_shape else settings.pose_weight(fps),
             monocular_prior=prior,
         )
 

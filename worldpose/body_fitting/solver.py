@@ -89,7 +89,7 @@ class Solver:
             settings,
             fps,
             settings.acceleration_m_s2,
-            settings.pose_weight,
+            settings.pose_weight(fps),
             monocular_prior=monocular_prior,
         )
         target = interpolate_gaps(evidence.joints[:, :17])
