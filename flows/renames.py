@@ -176,7 +176,7 @@ REMOVED: Final[Mapping[str, Mapping[str, str]]] = {
     "bundle_adjustment": dict.fromkeys(
         ("candidates", "max_candidates"), "triangulation.max_frames"
     ),
-    "body_fitting": {"pose_weight": "body_fitting.poses_per_s"},
+    "body_fitting": {"pose_weight": "body_fitting.pose_time_s"},
 }
 """By stage: settings that another one, of other units, replaces; those of earlier runs are not
 read."""

@@ -61,10 +61,10 @@ class BodyFittingSettings(Record):
     acceleration_loss_scale: float = Field(default=6.0, ge=1e-6, le=1000)
     """Deviation at which an acceleration has half its weight [standard deviations]: kicks. Jerk
     where views change is 1.2 times the truth's at 3, 0.9 at 8."""
-    poses_per_s: float = Field(default=1.8, ge=1e-3, le=1000)
-    """Independent poses of a person per second, for each of which the pose prior counts once [1/s]:
-    neighbouring frames are one pose, not many, at any frame rate. Bodies of real people gain on
-    Shelf (25 frames/s) up to 2.5, and lose in held-out cameras of Pose2Sim's demos (60) from 3."""
+    pose_time_s: float = Field(default=0.55, ge=1e-3, le=100)
+    """Time for which a pose lasts [s]: the pose prior counts once per such time at any frame rate,
+    since neighbouring frames are one pose, not many. Bodies of real people gain on Shelf
+    (25 frames/s) down to 0.4, and lose in held-out cameras of Pose2Sim's demos (60) from 0.33."""
     shape_pose_weight: float = Field(default=0.003, ge=1e-6, le=1)
     """Weight of the pose prior in each frame while shape is estimated [1]: it unbends limbs, and
     longer bones with compensating offsets would follow, increasing with clip length. With 20 mm of
@@ -95,4 +95,4 @@ class BodyFittingSettings(Record):
         Args:
             fps: of the frames that are fitted [1/s].
         """
-        return min(1.0, self.poses_per_s / fps)
+        return min(1.0, 1.0 / (self.pose_time_s * fps))

@@ -116,3 +116,11 @@ def test_a_track_of_two_intervals_has_the_equations_of_both(track):
         np.testing.assert_allclose(getattr(joined, name), expected, rtol=1e-9, atol=1e-9)
     tied = equations([pose, moved], both)
     assert np.abs(tied.gradient - joined.gradient).max() > 1e-3 * np.abs(joined.gradient).max()
+
+
+def test_the_pose_prior_counts_by_time_and_not_by_frames():
+    settings = BodyFittingSettings(pose_time_s=0.5)
+    # Two poses per second, in 25 or in 100 frames; no frame is more than one pose.
+    assert 25 * settings.pose_weight(25.0) == pytest.approx(2.0)
+    assert 100 * settings.pose_weight(100.0) == pytest.approx(2.0)
+    assert settings.pose_weight(1.0) == 1.0
