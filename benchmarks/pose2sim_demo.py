@@ -8,7 +8,8 @@ The stage `detection` finds 2D poses in the demo's videos, and this script write
 OpenPose's JSON into a copy of the demo. `worldpose import --pose2sim` imports this copy, and
 `worldpose run` computes it. Pose2Sim associates and triangulates the same files with its own
 defaults, once with the demo's calibration and once with that of the imported match. There is no
-truth: the table shows distances to the 2D poses, missing joints and the spread of limb lengths.
+truth: the table shows distances to the 2D poses, missing joints and the spread of limb lengths, and
+below it distances of bodies and joints to keypoints of cameras that they do not use.
 Pose2Sim (BSD-3) is called, and nothing of it is copied here.
 """
 
@@ -246,6 +247,24 @@ def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
                 f"{median:6.1f} {high:6.1f} {missing:6.1f} {limbs:6.1f}",
                 flush=True,
             )
+    print_held_out(project, match.name)
+
+
+def print_held_out(project: Path, match_id: str) -> None:
+    """Print how far bodies and triangulated joints are from keypoints of held-out cameras."""
+    figures = worldpose.open_run(str(project), match_id).record.figures
+    for unit, values in figures.items():
+        for kind in ("fitted", "triangulated"):
+            start = f"held_out_{kind}_m."
+            groups = {
+                name.removeprefix(start): 1000.0 * value
+                for name, value in values.items()
+                if name.startswith(start)
+            }
+            if groups:
+                print(f"{unit}, {kind}, from held-out cameras, rms [mm]: ", end="")
+                print(", ".join(f"{name} {value:.1f}" for name, value in groups.items()), end="")
+                print(f"; mean {sum(groups.values()) / len(groups):.1f}", flush=True)
 
 
 def main() -> None:
