@@ -229,7 +229,7 @@ def repeatability(one: list[Row], two: list[Row]) -> float:
     means: list[dict[tuple[int, str], float]] = []
     for rows in (one, two):
         groups: dict[tuple[int, str], list[float]] = {}
-        for frame, name, off, _ in rows:
+        for frame, name, off, *_ in rows:
             groups.setdefault((frame, name), []).append(off)
         means.append({key: float(np.mean(each)) for key, each in groups.items()})
     both = means[0].keys() & means[1].keys()
