@@ -40,6 +40,9 @@ ACROSS_STD: Final = 0.09
 """Standard deviation of the middle of the feet from the mid-hip, across the line of sight [m]."""
 BORDER_SHARE: Final = 0.03
 """A box so near to the image's border, relative to its height, is cut by it [1]."""
+MAX_PART_MOTION: Final = 0.08
+"""Maximum distance of a joint in a part's own keypoints from the same joint of the whole person
+[heights of the whole one's box]: in simulation below 0.02 for one person and above 0.12 for two."""
 PART_OVERLAP: Final = 0.3
 """Share of the smaller box from which two boxes may be of one person [1]. Second boxes of a person
 on the real pair: 0.3 to 1.0; people apart: 0."""
@@ -213,7 +216,9 @@ def locate_feet(
         bottom = np.stack([0.5 * (box[..., 0] + box[..., 2]), box[..., 3]], axis=-1)
         # A person who is cut by the image's border has no known middle or feet.
         inside = _are_inside(box, camera.image_size)
-        is_part = _are_parts(boxes[:, c], confidence[:, c], here)
+        half = 0.5 * np.array([pitch.length, pitch.width])
+        on_pitch = (np.abs(place) <= half).all(axis=-1)
+        is_part = _are_parts(boxes[:, c], keypoints[:, c], confidence[:, c], here, on_pitch)
         is_whole[:, c][here] = (inside | np.isnan(box[..., 0])) & ~is_part
         lower = np.where(inside[..., None], _meet(camera, bottom, pitch, BOX_HEIGHT), np.nan)
         absent = ~np.isfinite(place[..., 0])
@@ -248,15 +253,25 @@ def _are_inside(boxes: Floats, image_size: NDArray[np.int64]) -> Flags:
     return np.asarray(low.all(axis=-1) & high.all(axis=-1))
 
 
-def _are_parts(boxes: AnyFloats, confidence: AnyFloats, chosen: Flags) -> Flags:
-    """Return which chosen boxes a surer detection of their frame may explain.
+def _are_parts(
+    boxes: AnyFloats,
+    keypoints: AnyFloats,
+    confidence: AnyFloats,
+    chosen: Flags,
+    on_pitch: Flags,
+) -> Flags:
+    """Return which chosen boxes a surer detection of their frame explains.
 
-    Detectors give a person's upper body, or the legs, a box of their own beside the whole one.
+    Detectors give a person's upper body, or the legs, a box of their own beside the whole one. Its
+    joints are those of the whole one; the joints of a person who is partly hidden are not. Outside
+    of the lines people sit and stand in rows, where boxes alone decide.
 
     Args:
         boxes: (frames, detections, 4) [px].
+        keypoints: (frames, detections, 17, 2) [px].
         confidence: (frames, detections, 17).
         chosen: (frames, detections).
+        on_pitch: (number of chosen,), feet are between the lines.
     """
     frame, detection = np.nonzero(chosen)
     all_boxes = np.asarray(boxes, dtype=np.float64)
@@ -269,7 +284,17 @@ def _are_parts(boxes: AnyFloats, confidence: AnyFloats, chosen: Flags) -> Flags:
         smaller = np.minimum(area[frame, detection][:, None], area[frame])
         overlap = common >= PART_OVERLAP * smaller
     surer = total[frame] > total[frame, detection][:, None]
-    return np.asarray((overlap & surer).any(axis=1))
+    row, other = np.nonzero(overlap & surer)
+    first, second = (frame[row], detection[row]), (frame[row], other)
+    known = (confidence[first] >= MIN_CONFIDENCE) & (confidence[second] >= MIN_CONFIDENCE)
+    apart = np.where(known, np.linalg.norm(keypoints[first] - keypoints[second], axis=-1), np.inf)
+    apart[~on_pitch[row]] = 0.0
+    height = all_boxes[second][:, 3] - all_boxes[second][:, 1]
+    # At least half of the joints that both know; without a common one, the boxes alone decide.
+    near = (apart < MAX_PART_MOTION * height[:, None]).sum(axis=1)
+    is_part = np.zeros(len(frame), dtype=np.bool_)
+    is_part[row[2 * near >= known.sum(axis=1)]] = True
+    return is_part
 
 
 def count_covering_cameras(

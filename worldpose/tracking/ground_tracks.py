@@ -304,7 +304,7 @@ def track_on_plane(
             and track.seen >= MIN_SEEN * (track.last_seen - track.first + 1)
         )
     ]
-    paths = merge_paths([_smooth(track, move) for track in kept], fps, positions.boxes)
+    paths = merge_paths([_smooth(track, move) for track in kept], fps, positions)
     half = 0.5 * np.asarray(pitch_size) + margin_m
     paths = [
         path

@@ -67,15 +67,13 @@ class PlanePath:
         return self.first + len(self.state) - 1
 
 
-def merge_paths(
-    paths: list[PlanePath], fps: float, boxes: Floats | FrameBlocks | None
-) -> list[PlanePath]:
+def merge_paths(paths: list[PlanePath], fps: float, positions: GroundPositions) -> list[PlanePath]:
     """Join paths that are one person's."""
     merged = True
     while merged:
         merged = False
         for a, b in combinations(range(len(paths)), 2):
-            if _is_same_person(paths[a], paths[b], fps, boxes):
+            if _is_same_person(paths[a], paths[b], fps, positions):
                 both = _join(paths[a], paths[b])
                 paths = [path for i, path in enumerate(paths) if i not in (a, b)] + [both]
                 merged = True
@@ -92,14 +90,12 @@ def _common(a: PlanePath, b: PlanePath) -> tuple[slice, slice]:
     )
 
 
-def _is_same_person(
-    a: PlanePath, b: PlanePath, fps: float, boxes: Floats | FrameBlocks | None
-) -> bool:
+def _is_same_person(a: PlanePath, b: PlanePath, fps: float, positions: GroundPositions) -> bool:
     """Return whether two paths are one person's.
 
     Either they stay near each other and no camera sees both in one frame, or they lie so close for
-    so long that two bodies would be in one place, or their boxes always overlap: two boxes of one
-    person.
+    so long that two bodies would be in one place, or their boxes always overlap and one of them is
+    a part: two boxes of one person.
     """
     if a.person >= 0 and b.person >= 0:
         return False
@@ -117,8 +113,15 @@ def _is_same_person(
     ]
     if not both:
         return bool(apart.mean() <= SAME_PERSON_M)
-    if boxes is None or len(both) < MIN_TRACK_S * fps or np.median(apart) > MAX_PART_DISTANCE_M:
+    boxes, whole = positions.boxes, positions.is_whole
+    if boxes is None or whole is None or len(both) < MIN_TRACK_S * fps:
         return False
+    if np.median(apart) > MAX_PART_DISTANCE_M:
+        return False
+    parts = [
+        not all(whole[frame, camera, path.index[frame][camera]] for path in (a, b))
+        for frame, camera in both
+    ]
     first, second = (
         np.stack([boxes[frame, camera, path.index[frame][camera]] for frame, camera in both])
         for path in (a, b)
@@ -126,7 +129,7 @@ def _is_same_person(
     low, high = np.maximum(first[:, :2], second[:, :2]), np.minimum(first[:, 2:], second[:, 2:])
     smaller = np.minimum(*((box[:, 2:] - box[:, :2]).prod(axis=1) for box in (first, second)))
     overlapping = np.clip(high - low, 0.0, None).prod(axis=1) >= PART_OVERLAP * smaller
-    return bool(overlapping.mean() >= MIN_OVERLAPPING)
+    return bool((overlapping & np.array(parts)).mean() >= MIN_OVERLAPPING)
 
 
 def _join(a: PlanePath, b: PlanePath) -> PlanePath:

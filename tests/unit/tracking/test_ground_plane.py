@@ -325,6 +325,41 @@ def test_parts_of_a_person_continue_the_track_and_start_none(ring):
     assert track_on_plane(everything, FPS, pitch_size=SIZE).xy.shape[1] >= 2
 
 
+@pytest.mark.parametrize("outside", [False, True])
+def test_overlapping_boxes_are_two_people_where_their_joints_are_apart(ring, outside):
+    """Two people behind each other stay two on the pitch; on a bench, boxes alone decide."""
+    camera = ring(1)
+    sight = -camera[0].center[:2] / np.linalg.norm(camera[0].center[:2])
+    place = (40.0 if outside else 0.0) * sight
+    places = np.stack([place, place + 1.2 * sight])
+    truth = np.broadcast_to(places, (50, 2, 2))
+    heights = np.linspace(1.8, 0.09, 17)  # the nose is the top, the ankles are the lowest
+    points = np.concatenate(
+        [np.broadcast_to(places[:, None], (2, 17, 2)), np.tile(heights[:, None], (2, 1, 1))], axis=2
+    )
+    pixels = camera[0].project(points.reshape(-1, 3)).reshape(2, 17, 2)
+    size = pixels[:, -1, 1] - pixels[:, 0, 1]
+    half = np.array([0.3 * size[0], 0.05 * size[0]])
+    boxes = np.concatenate([pixels.min(axis=1) - half, pixels.max(axis=1) + half], axis=-1)
+    keypoints = np.broadcast_to(pixels, (50, 1, 2, 17, 2)).copy()
+    confidence = np.full((50, 1, 2, 17), 0.9)
+    confidence[:, :, 1] = 0.8
+    boxed = replace(
+        detections(keypoints, confidence), boxes=np.broadcast_to(boxes, (50, 1, 2, 4)).copy()
+    )
+    found = locate_feet(camera, boxed, PITCH)
+    assert found.is_whole[:, 0, 0].all()
+    assert found.is_whole[:, 0, 1].all() == (not outside)
+    tracks = track_on_plane(found, FPS, pitch_size=SIZE, margin_m=10.0)
+    assert tracks.xy.shape[1] == (1 if outside else 2)
+    if not outside:
+        off = np.linalg.norm(tracks.xy[:, :, None] - truth[:, None], axis=-1).min(axis=1)
+        assert off.max() < 0.3
+    keypoints[:, 0, 1] = keypoints[:, 0, 0] + 2.0  # a second box of the first person
+    copied = replace(boxed, keypoints=keypoints)
+    assert not locate_feet(camera, copied, PITCH).is_whole[:, 0, 1].any()
+
+
 def test_chosen_places_of_a_frame_stand_beside_each_other_and_widen_with_missing_ones():
     places = np.arange(24.0).reshape(2, 2, 3, 2)
     chosen = np.array([[[2, 0], [1, 2]], [[0, 1], [2, 1]]])
