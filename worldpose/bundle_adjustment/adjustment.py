@@ -54,9 +54,12 @@ _PASSES: Final = 3
 """Iterations of solution and noise estimation; the third changes little."""
 _MIN_VARIANCE_FACTOR: Final = 0.01
 """Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
+_CHANCE: Final = 2.0
+"""Standard errors by which a loss changes by chance [1]: one in forty falls by more."""
 _SMALL_RIG: Final = 4
-"""Maximum cameras of a rig that needs significant evidence [1]: each joint of a held-out person
-then has at most three other views, whose errors do not average out."""
+"""Maximum cameras of a rig in which cameras with a covariance change together or not at all [1]:
+each joint of a held-out person then has at most three other views, whose errors do not average
+out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +113,9 @@ def adjust_cameras(
 
     People are split into groups. Each group in turn is held out of an adjustment and validates its
     cameras: keypoints of the group in a camera against its joints from the other cameras, in frames
-    that are held out too. A camera whose held-out loss rises stays unchanged, and the others are
-    adjusted without it. Finally the accepted cameras are adjusted to all people.
+    that are held out too. A camera whose held-out loss does not fall, or falls by no more than
+    chance explains, stays unchanged; if it rises, the others are adjusted without it. Finally the
+    accepted cameras are adjusted to all people.
 
     Args:
         clip: calibrated cameras and triangulated people.
@@ -147,17 +151,15 @@ def adjust_cameras(
         comparison = compare_errors(before, after)
         first = first or comparison
         evidence = pool_evidence(before, after, ~other_people)
-        with np.errstate(invalid="ignore"):
-            confirmed = comparison.judges >= settings.min_judges
-            confirmed &= comparison.loss[:, 1] <= comparison.loss[:, 0]
+        confirmed = adjuster.confirm_cameras(comparison, fixed)
         if (confirmed | fixed).all():
             objection = "" if fixed.all() else adjuster.find_objection(before, after, fixed)
             if not objection:
                 break
             # Markings hold calibrated cameras, which may still change without the others.
-            confirmed = ~clip.given & (len(clip.given) > _SMALL_RIG)
+            confirmed = adjuster.stand_alone
         fixed |= ~confirmed
-        if (~fixed).sum() < 2:
+        if (~fixed | adjuster.consistent & adjuster.stand_alone).sum() < 2:
             fixed[:] = True
             break
     freely = adjuster.adjust(other_people)
@@ -173,7 +175,9 @@ def adjust_cameras(
         reasons=tuple(
             _OTHER_PEOPLE
             if other_people[c]
-            else _explain_decision(first, c, not fixed[c], settings, objection)
+            else _explain_decision(
+                first, c, not fixed[c], settings, objection, adjuster.stand_alone[c]
+            )
             + ("" if fixed[c] else _describe_motion(motion[c]))
             for c in range(count)
         ),
@@ -224,6 +228,7 @@ class _Adjuster:
     ) -> None:
         self.clip, self.settings, self.used, self.judged = clip, settings, used, judged
         self.placed = placed
+        self.stand_alone = ~clip.given & (len(clip.given) > _SMALL_RIG)
         people = np.ones(clip.detections.detection_index.shape[2], dtype=np.bool_)
         self.observations = select_observations(
             clip, used, people, clip.cameras, settings.min_views
@@ -238,6 +243,7 @@ class _Adjuster:
             found.variance_factor,
             found.offset,
         )
+        self.consistent = clip.given & ~self.other_people
         if clip.given.all():
             # If no camera states a covariance, the wrong one cannot be identified.
             self.variance_factor, self.offset = (
@@ -272,15 +278,35 @@ class _Adjuster:
             estimate_variance_factor(problem, rough), min_factor
         )
 
+    def confirm_cameras(self, verdict: Verdict, fixed: Flags) -> Flags:
+        """Return the cameras (cameras,) whose change held-out people confirm.
+
+        The loss of a camera with its own covariance, in a rig of more than `_SMALL_RIG`, must fall
+        by more than chance explains: well calibrated cameras move by hundredths of a pixel. Where
+        it neither falls nor rises by as much, the camera agrees with the others and still
+        contributes to their adjustment.
+
+        Args:
+            verdict: held-out errors of the latest adjustment.
+            fixed: (cameras,) bool, cameras that were fixed in it.
+        """
+        enough = verdict.judges >= self.settings.min_judges
+        alone = self.stand_alone
+        by_chance = alone & enough & (np.abs(verdict.significance) < _CHANCE)
+        self.consistent |= by_chance & ~fixed & ~self.other_people
+        with np.errstate(invalid="ignore"):
+            falls = verdict.loss[:, 1] <= verdict.loss[:, 0]
+        return np.asarray(enough & falls & ~by_chance)
+
     def find_objection(self, before: HeldOutErrors, after: HeldOutErrors, fixed: Flags) -> str:
         """Return the reason to refuse the whole change; empty without one.
 
-        Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only the
-        comparison per camera.
+        Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only
+        `confirm_cameras`.
         """
         changed = ~fixed
         given = self.clip.given & changed
-        if not given.any() and len(given) > _SMALL_RIG:
+        if not given.any() and self.stand_alone.any():
             return ""
         judged = given if given.any() else changed
         evidence = pool_evidence(before, after, judged)
@@ -313,11 +339,11 @@ class _Adjuster:
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, fixed, self.settings), MARKINGS_SOLVER)
         observed = self.observations
-        # A refused calibrated camera contributes nothing: its markings contradict people. A refused
-        # given camera without contradictions contributes. In a small rig it is fixed and the others
-        # adapt to it. In a larger one it moves with them here and is put back, because it is no
-        # more exact than they are, and two fixed cameras would pull all others to their own errors.
-        consistent = self.clip.given & ~self.other_people
+        # A refused calibrated camera whose markings contradict people contributes nothing. Any
+        # other refused camera contributes. In a small rig it is fixed and the others adapt to it.
+        # In a larger one it moves with them here and is put back, because it is no more exact than
+        # they are, and two fixed cameras would pull all others to their own errors.
+        consistent = self.consistent
         kept = (~fixed | consistent)[observed.camera_of]
         held = fixed if len(fixed) <= _SMALL_RIG else fixed & ~consistent
         if without is not None:
@@ -448,6 +474,7 @@ def _explain_decision(
     accepted: bool,
     settings: BundleAdjustmentSettings,
     objection: str,
+    stands_alone: bool,
 ) -> str:
     """Return why a camera's change was accepted or refused, with the deciding numbers."""
     judges = int(comparison.judges[c])
@@ -459,9 +486,14 @@ def _explain_decision(
         return f"accepted: {change}"
     if after > before:
         return f"refused: {change}"
+    if stands_alone and comparison.significance[c] < _CHANCE:
+        return (
+            f"refused: {change}, by {comparison.significance[c]:.1f} standard errors, at least "
+            f"{_CHANCE:g} are required"
+        )
     if objection:
         return f"refused: {change}, but {objection}"
-    return f"refused: {change}, but it rose after other cameras were refused"
+    return f"refused: {change}, but no more after other cameras were refused"
 
 
 def _describe_motion(motion: Floats) -> str:
@@ -493,7 +525,7 @@ def _refuse_all(
         used=clip.detections.frame[used],
         judged=clip.detections.frame[judged],
         noise=KeypointNoise(),
-        verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan),
+        verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan, np.zeros(count)),
         evidence=Evidence(0.0, 0.0, 0.0, 0.0, 0.0),
         motion=np.zeros((count, 3)),
         refused=clip.cameras,

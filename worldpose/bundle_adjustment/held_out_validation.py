@@ -113,11 +113,13 @@ class Verdict:
         judges: (cameras,) number of these keypoints [1].
         loss: (cameras, 2) mean of Cauchy's loss before and after [1]; NaN without keypoints.
         error: (cameras, 2) median length before and after [px]; NaN without keypoints.
+        significance: (cameras,) decrease of the loss over its standard error [1]; 0 if unknown.
     """
 
     judges: Integers
     loss: Floats
     error: Floats
+    significance: Floats
 
 
 def compare_errors(before: HeldOutErrors, after: HeldOutErrors) -> Verdict:
@@ -130,7 +132,30 @@ def compare_errors(before: HeldOutErrors, after: HeldOutErrors) -> Verdict:
         for side, held in enumerate((before, after)):
             loss[c, side] = held.loss[:, c][both[:, c]].mean()
             error[c, side] = np.median(held.error[:, c][both[:, c]])
-    return Verdict(judges, loss, error)
+    fall = before.loss - after.loss
+    significance = np.array([_significance(fall[:, c]) for c in range(count)])
+    return Verdict(judges, loss, error, significance)
+
+
+def _significance(fall: Floats) -> float:
+    """Return the mean decrease of the loss over its standard error [1]; 0 if unknown.
+
+    Args:
+        fall: (frames, ..., persons, 17) decrease [1]; NaN without data. A person in a quarter of
+            the time is one observation, since detector errors last.
+    """
+    told = np.isfinite(fall)
+    part = np.arange(len(fall)) * _INTERVALS // max(len(fall), 1)
+    groups = []
+    for person in range(fall.shape[-2]):
+        for each in range(_INTERVALS):
+            inside = fall[part == each, ..., person, :][told[part == each, ..., person, :]]
+            if len(inside):
+                groups.append(float(inside.mean()))
+    if len(groups) < 2:
+        return 0.0
+    error = float(np.std(groups, ddof=1) / np.sqrt(len(groups)))
+    return float(np.mean(groups)) / max(error, 1e-12)
 
 
 @dataclass(frozen=True)
@@ -139,8 +164,7 @@ class Evidence:
 
     Attributes:
         gain: relative decrease of the loss [1]; negative if it rises.
-        significance: decrease of the loss over its standard error [1]. A person in a quarter of the
-            time is one observation, since detector errors last.
+        significance: decrease of the loss over its standard error [1].
         shift: common shift of people [m].
         turn: common rotation of people [rad].
         scale: common growth of people [1].
@@ -163,19 +187,9 @@ def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -
     """
     fall = (before.loss - after.loss)[:, cameras]
     told = np.isfinite(fall)
-    part = np.arange(len(fall)) * _INTERVALS // max(len(fall), 1)
-    groups = []
-    for person in range(fall.shape[2]):
-        for each in range(_INTERVALS):
-            inside = fall[part == each, :, person][told[part == each, :, person]]
-            if len(inside):
-                groups.append(float(inside.mean()))
-    gain = significance = 0.0
+    gain = 0.0
     if told.any():
         gain = float(fall[told].sum() / max(before.loss[:, cameras][told].sum(), 1e-12))
-    if len(groups) > 1:
-        error = float(np.std(groups, ddof=1)) / len(groups) ** 0.5
-        significance = float(np.mean(groups)) / max(error, 1e-12)
     moved = common_motion(before.joints, after.joints)
     both = np.isfinite(before.joints[..., 0]) & np.isfinite(after.joints[..., 0])
     shift = 0.0
@@ -183,7 +197,7 @@ def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -
         center = before.joints[both].mean(axis=0)
         shift = float(np.linalg.norm(moved.move_points(center) - center))
     turn = float(np.arccos(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0)))
-    return Evidence(gain, significance, shift, turn, moved.scale - 1.0)
+    return Evidence(gain, _significance(fall), shift, turn, moved.scale - 1.0)
 
 
 def common_motion(before: Floats, after: Floats) -> Similarity:

@@ -86,14 +86,54 @@ def placed_again(clip):
 def honest(clip):
     """A clip of eight cameras, the true ones, and the errors that adjustment leaves them."""
     made, true, _ = clip(cameras=8, seed=3)
-    # Calibrations of a pixel, not of ten: three views or more agree about every joint.
-    covariance = 0.01 * made.covariance
+    # Calibrations of one or two pixels, not of ten: three views or more agree about every joint.
+    covariance = 0.02 * made.covariance
     spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     step = spread * np.random.default_rng(7).standard_normal((8, 12))
     made = placed_again(replace(made, cameras=step_camera(true, step), covariance=covariance))
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
     return made, true, errors(adjusted.cameras, true)
+
+
+def test_significance_counts_a_person_in_a_quarter_of_the_time_once(clip):
+    made, true, _ = clip(frames=8, persons=2)
+    before = held_out_errors(made, true, np.arange(8), np.ones((8, 2), dtype=bool), 3.0)
+    # Person 0 gains 1 and 2 by turns of two frames, person 1 gains 4 in all frames.
+    fall = np.full((8, 1, 2, 1), 4.0)
+    fall[:, 0, 0, 0] = [1.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 2.0]
+    said = compare_errors(replace(before, loss=before.loss + fall), before)
+    falls = [1.0, 2.0, 1.0, 2.0, 4.0, 4.0, 4.0, 4.0]
+    expected = np.mean(falls) / (np.std(falls, ddof=1) / np.sqrt(8.0))
+    np.testing.assert_allclose(said.significance, expected, rtol=1e-9)
+
+
+def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    exact = placed_again(replace(made, cameras=true, covariance=1e-4 * made.covariance))
+    adjusted = adjust_cameras(exact, QUICK)
+    assert not adjusted.accepted.any()
+    np.testing.assert_array_equal(adjusted.cameras.numbers, true.numbers)
+    np.testing.assert_array_equal(adjusted.covariance, exact.covariance)
+    # By chance the loss of some falls and that of others rises.
+    falls = adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]
+    assert falls.any()
+    assert all("standard errors" in adjusted.reasons[c] for c in np.flatnonzero(falls))
+
+
+def test_cameras_that_stay_still_place_the_one_that_is_wrong(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    step = np.zeros((8, 12))
+    step[WRONG, 1] = 0.02  # 40 px, two hundred times what its calibration states
+    covariance = 1e-4 * made.covariance
+    covariance[WRONG] *= 100.0
+    wrong = replace(made, cameras=step_camera(true, step), covariance=covariance)
+    adjusted = adjust_cameras(placed_again(wrong), QUICK)
+    assert adjusted.accepted[WRONG]
+    assert (~adjusted.accepted).any()
+    left = errors(adjusted.cameras, true)
+    assert left[WRONG] < 0.4
+    assert np.delete(left, WRONG).max() < 0.1
 
 
 def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
