@@ -1,27 +1,41 @@
-# Verbs: install, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, docs, schemas, pages, clean. All work from a
+# Verbs: install, develop, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, docs, schemas, pages, clean. All work from a
 # fresh clone; real-demo and pages need npm.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
+DEVELOP := .venv/develop
+# Bytecode is written when a module is first imported: most of the 20,000 modules never are.
+PIP := $(BIN)/pip install --disable-pip-version-check --no-compile -c constraints.txt
+FIRST_RUN := rm -rf .venv/first && $(BIN)/worldpose simulate --scenario tiny --duration 0.5 --out .venv/first/tiny && \
+  $(BIN)/worldpose run .venv/first/tiny --project .venv/first/project
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo demo-quick demo-match real-demo check format test test-all docs schemas pages clean
+.PHONY: install develop demo demo-quick demo-match real-demo check format test test-all docs schemas pages clean
 
+# What the commands need. What checks, tests and the documentation need besides is added before the first of them.
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	@# Bytecode is written when a module is first imported: most of the 23,000 modules never are.
-	$(BIN)/pip install --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	@echo "Compiling the kernels by reconstructing half a second: once, about a minute"
-	@rm -rf .venv/first
-	@$(BIN)/worldpose simulate --scenario tiny --duration 0.5 --out .venv/first/tiny
-	@$(BIN)/worldpose run .venv/first/tiny --project .venv/first/project
-	@rm -rf .venv/first
+	$(PIP) -e .
+	@$(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
+	  print(*(each for name in ("s3", "detectors", "reference", "tables") for each in extras[name]), sep="\n")' > .venv/extras.txt
+	@echo "Compiling the kernels by reconstructing half a second, once, while pip unpacks packages that no kernel needs"
+	@# A package that is half unpacked can fail to import: the run is then repeated.
+	@{ $(FIRST_RUN); } > .venv/first.log 2>&1 & kernels=$$!; \
+	  $(PIP) -r .venv/extras.txt; installed=$$?; \
+	  wait $$kernels || { $(FIRST_RUN); } && exit $$installed
+	@rm -rf .venv/first .venv/first.log .venv/extras.txt
 	@touch $(INSTALLED)
+
+develop: $(DEVELOP)
+
+$(DEVELOP): $(INSTALLED)
+	$(PIP) -e '.[dev]'
+	@touch $(DEVELOP)
 
 # What the demo reconstructs: 5 people before 5 cameras and the broadcast camera, from their rendered videos. demo-quick
 # and demo-match begin with keypoints: 5 people and 6 cameras, 25 people and 16 cameras.
@@ -54,29 +68,29 @@ real-demo: install
 	@echo "3/3  what it found"
 	@$(BIN)/python infra/real_demo/score.py real-demo/match real-demo/project real-demo/overlay.mp4
 
-check: install
+check: develop
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: install
+format: develop
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # Processes begin with neighbouring tests, which share what they made, and take over the rest of others.
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
-test: install check
+test: develop check
 	$(PYTEST) -m "not slow"
 
-test-all: install check
+test-all: develop check
 	$(PYTEST)
 
 # The site of the documentation, at build/docs/index.html; a warning is an error.
-docs: install
+docs: develop
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
-schemas: install
+schemas: develop
 	$(BIN)/python -m data_contracts.schemas docs/schemas
 
 # The review pages as they ship, from their sources.
