@@ -135,3 +135,23 @@ def distances_to_polyline(
     nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
     distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
     return distances
+
+
+def print_held_out(label: str, figures: Mapping[str, float]) -> None:
+    """Print how far bodies and triangulated joints are from keypoints of held-out cameras.
+
+    Args:
+        label: what the figures belong to.
+        figures: those of a unit; nothing is printed for one without such distances.
+    """
+    for kind in ("fitted", "triangulated"):
+        start = f"held_out_{kind}_m."
+        groups = {
+            name.removeprefix(start): 1000.0 * value
+            for name, value in figures.items()
+            if name.startswith(start)
+        }
+        if groups:
+            print(f"{label}, {kind}, from held-out cameras, rms [mm]: ", end="")
+            print(", ".join(f"{name} {value:.1f}" for name, value in groups.items()), end="")
+            print(f"; mean {sum(groups.values()) / len(groups):.1f}", flush=True)

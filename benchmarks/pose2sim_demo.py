@@ -26,7 +26,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from common import run_worldpose
+from common import print_held_out, run_worldpose
 from numpy.typing import NDArray
 
 import worldpose
@@ -247,24 +247,9 @@ def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
                 f"{median:6.1f} {high:6.1f} {missing:6.1f} {limbs:6.1f}",
                 flush=True,
             )
-    print_held_out(project, match.name)
-
-
-def print_held_out(project: Path, match_id: str) -> None:
-    """Print how far bodies and triangulated joints are from keypoints of held-out cameras."""
-    figures = worldpose.open_run(str(project), match_id).record.figures
-    for unit, values in figures.items():
-        for kind in ("fitted", "triangulated"):
-            start = f"held_out_{kind}_m."
-            groups = {
-                name.removeprefix(start): 1000.0 * value
-                for name, value in values.items()
-                if name.startswith(start)
-            }
-            if groups:
-                print(f"{unit}, {kind}, from held-out cameras, rms [mm]: ", end="")
-                print(", ".join(f"{name} {value:.1f}" for name, value in groups.items()), end="")
-                print(f"; mean {sum(groups.values()) / len(groups):.1f}", flush=True)
+    record = worldpose.open_run(str(project), match.name).record
+    for unit, figures in record.figures.items():
+        print_held_out(unit, figures)
 
 
 def main() -> None:

@@ -11,7 +11,8 @@ detector, actors 1 and 3, alpha 0.5.
 With --groups, frames 300 to 420 and 421 to 510 are two matches of all cameras, whose stages run in
 this process. For each stage and joint group: mean distance to the labels; the same less a constant
 offset per joint in the body's frame, which is the mean over all people of the window; and the share
-of labels in 95 % regions, as they are and less that offset. Labels have no joints of the face but a
+of labels in 95 % regions, as they are and less that offset. Before it, the distances of bodies and
+triangulated joints to keypoints of held-out cameras. Labels have no joints of the face but a
 bottom and a top of the head. Then lengths of limbs, medians over frames and sides, relative to the
 labels', per person.
 """
@@ -29,7 +30,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from common import run_in_process, run_worldpose
+from common import print_held_out, run_in_process, run_worldpose
 from joint_regions import group_joints
 from scipy.special import chdtri
 
@@ -155,6 +156,8 @@ def compare_groups(data: Path, folder: Path, overrides: dict[str, Any]) -> None:
             for stage in ("tracking", *STAGES)
         }
         labels = truth["gt"][np.isin(truth["frames"], frames)]
+        key = keys["body_fitting/clip"]
+        print_held_out("bodies", store.manifest(match, "body_fitting", "clip", key).figures)
         print(f"frames {frames.start} to {frames.stop - 1}: {', '.join(GROUPS)}")
         for stage, definition in SCORED:
             tracks = joint_tracks(run, "clip", stage, definition)
