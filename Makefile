@@ -25,9 +25,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  print(*(each for name in ("s3", "detectors", "reference", "tables") for each in extras[name]), sep="\n")' > .venv/extras.txt
 	@echo "Compiling the kernels by reconstructing half a second, once, while pip unpacks packages that no kernel needs"
 	@# A package that is half unpacked can fail to import: the run is then repeated.
-	@{ $(FIRST_RUN); } > .venv/first.log 2>&1 & kernels=$$!; \
-	  $(PIP) -r .venv/extras.txt; installed=$$?; \
-	  wait $$kernels || { $(FIRST_RUN); } && exit $$installed
+	@{ $(FIRST_RUN); } > .venv/first.log 2>&1 & kernels=$$!; stop='pkill -P '$$kernels'; kill '$$kernels; trap "$$stop" INT TERM; \
+	  $(PIP) -r .venv/extras.txt || { eval "$$stop"; exit 1; }; \
+	  wait $$kernels || { $(FIRST_RUN); }
 	@rm -rf .venv/first .venv/first.log .venv/extras.txt
 	@touch $(INSTALLED)
 
@@ -90,7 +90,7 @@ test-all: develop check
 docs: develop
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
-schemas: develop
+schemas: install
 	$(BIN)/python -m data_contracts.schemas docs/schemas
 
 # The review pages as they ship, from their sources.

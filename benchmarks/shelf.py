@@ -156,9 +156,10 @@ def compare_groups(data: Path, folder: Path, overrides: dict[str, Any]) -> None:
             for stage in ("tracking", *STAGES)
         }
         labels = truth["gt"][np.isin(truth["frames"], frames)]
+        label = f"frames {frames.start} to {frames.stop - 1}"
         key = keys["body_fitting/clip"]
-        print_held_out("bodies", store.manifest(match, "body_fitting", "clip", key).figures)
-        print(f"frames {frames.start} to {frames.stop - 1}: {', '.join(GROUPS)}")
+        print_held_out(label, store.manifest(match, "body_fitting", "clip", key).figures)
+        print(f"{label}: {', '.join(GROUPS)}")
         for stage, definition in SCORED:
             tracks = joint_tracks(run, "clip", stage, definition)
             found, covariance = match_labels(scorer, labels, tracks.joints, tracks.covariance)

@@ -62,7 +62,7 @@ _ACCEPTANCE = (
         missing="0",
         about="keypoints of held-out people that validated the camera",
     ),
-    _of_cameras("held_out_loss", "side", "1", "nan", "mean loss of these keypoints, which decides"),
+    _of_cameras("held_out_loss", "side", "1", "nan", "mean loss of these keypoints"),
     _of_cameras("held_out_error", "side", "px", "nan", "median error of these keypoints"),
     _of_cameras(
         "marking_error",

@@ -16,6 +16,7 @@ from worldpose.bundle_adjustment.clip import (
     select_observations,
 )
 from worldpose.bundle_adjustment.held_out_validation import (
+    CHANCE,
     Contradictions,
     Evidence,
     HeldOutErrors,
@@ -23,6 +24,7 @@ from worldpose.bundle_adjustment.held_out_validation import (
     compare_errors,
     find_contradictions,
     held_out_errors,
+    judge_cameras,
     pool_evidence,
 )
 from worldpose.bundle_adjustment.problems import (
@@ -54,8 +56,6 @@ _PASSES: Final = 3
 """Iterations of solution and noise estimation; the third changes little."""
 _MIN_VARIANCE_FACTOR: Final = 0.01
 """Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
-_CHANCE: Final = 2.0
-"""Standard errors by which a loss changes by chance [1]: one in forty falls by more."""
 _SMALL_RIG: Final = 4
 """Maximum cameras of a rig in which cameras with a covariance change together or not at all [1]:
 each joint of a held-out person then has at most three other views, whose errors do not average
@@ -113,9 +113,10 @@ def adjust_cameras(
 
     People are split into groups. Each group in turn is held out of an adjustment and validates its
     cameras: keypoints of the group in a camera against its joints from the other cameras, in frames
-    that are held out too. A camera whose held-out loss does not fall, or falls by no more than
-    chance explains, stays unchanged; if it rises, the others are adjusted without it. Finally the
-    accepted cameras are adjusted to all people.
+    that are held out too. A camera whose held-out loss rises stays unchanged, and so does a
+    calibrated camera of a rig of more than four whose loss falls by no more than chance explains.
+    Where a calibrated camera's loss rises by more, or too few keypoints judge it, the others are
+    adjusted without it. Finally the accepted cameras are adjusted to all people.
 
     Args:
         clip: calibrated cameras and triangulated people.
@@ -151,15 +152,19 @@ def adjust_cameras(
         comparison = compare_errors(before, after)
         first = first or comparison
         evidence = pool_evidence(before, after, ~other_people)
-        confirmed = adjuster.confirm_cameras(comparison, fixed)
+        confirmed, agrees = judge_cameras(comparison, adjuster.stand_alone, settings.min_judges)
         if (confirmed | fixed).all():
-            objection = "" if fixed.all() else adjuster.find_objection(before, after, fixed)
-            if not objection:
+            raised = adjuster.find_objection(before, after, fixed)
+            if not raised:
                 break
+            objection = raised
             # Markings hold calibrated cameras, which may still change without the others.
             confirmed = adjuster.stand_alone
+        if settings.evidence == "markings_and_players":
+            adjuster.consistent |= agrees & ~fixed & ~other_people
         fixed |= ~confirmed
-        if (~fixed | adjuster.consistent & adjuster.stand_alone).sum() < 2:
+        # People need a second camera, and without them one camera's markings are no evidence.
+        if fixed.all() or (~fixed | adjuster.consistent & adjuster.stand_alone).sum() < 2:
             fixed[:] = True
             break
     freely = adjuster.adjust(other_people)
@@ -278,31 +283,11 @@ class _Adjuster:
             estimate_variance_factor(problem, rough), min_factor
         )
 
-    def confirm_cameras(self, verdict: Verdict, fixed: Flags) -> Flags:
-        """Return the cameras (cameras,) whose change held-out people confirm.
-
-        The loss of a camera with its own covariance, in a rig of more than `_SMALL_RIG`, must fall
-        by more than chance explains: well calibrated cameras move by hundredths of a pixel. Where
-        it neither falls nor rises by as much, the camera agrees with the others and still
-        contributes to their adjustment.
-
-        Args:
-            verdict: held-out errors of the latest adjustment.
-            fixed: (cameras,) bool, cameras that were fixed in it.
-        """
-        enough = verdict.judges >= self.settings.min_judges
-        alone = self.stand_alone
-        by_chance = alone & enough & (np.abs(verdict.significance) < _CHANCE)
-        self.consistent |= by_chance & ~fixed & ~self.other_people
-        with np.errstate(invalid="ignore"):
-            falls = verdict.loss[:, 1] <= verdict.loss[:, 0]
-        return np.asarray(enough & falls & ~by_chance)
-
     def find_objection(self, before: HeldOutErrors, after: HeldOutErrors, fixed: Flags) -> str:
         """Return the reason to refuse the whole change; empty without one.
 
         Cameras with their own covariance, in a rig of more than `_SMALL_RIG`, need only
-        `confirm_cameras`.
+        `judge_cameras`.
         """
         changed = ~fixed
         given = self.clip.given & changed
@@ -339,10 +324,11 @@ class _Adjuster:
         if self.settings.evidence == "markings":
             return solve(markings_problem(self.clip, fixed, self.settings), MARKINGS_SOLVER)
         observed = self.observations
-        # A refused calibrated camera whose markings contradict people contributes nothing. Any
-        # other refused camera contributes. In a small rig it is fixed and the others adapt to it.
-        # In a larger one it moves with them here and is put back, because it is no more exact than
-        # they are, and two fixed cameras would pull all others to their own errors.
+        # A refused calibrated camera contributes only where it is found to agree with the others:
+        # elsewhere its markings contradict people. A refused given camera without contradictions
+        # contributes. In a small rig it is fixed and the others adapt to it. In a larger one a
+        # refused camera moves with them here and is put back, because it is no more exact than they
+        # are, and two fixed cameras would pull all others to their own errors.
         consistent = self.consistent
         kept = (~fixed | consistent)[observed.camera_of]
         held = fixed if len(fixed) <= _SMALL_RIG else fixed & ~consistent
@@ -486,12 +472,12 @@ def _explain_decision(
         return f"accepted: {change}"
     if after > before:
         return f"refused: {change}"
-    if stands_alone and comparison.significance[c] < _CHANCE:
+    if stands_alone and comparison.significance[c] < CHANCE:
         return (
-            f"refused: {change}, by {comparison.significance[c]:.1f} standard errors, at least "
-            f"{_CHANCE:g} are required"
+            f"refused: {change}; person by person it falls by {comparison.significance[c]:.1f} "
+            f"standard errors, at least {CHANCE:g} are required"
         )
-    if objection:
+    if objection and not stands_alone:
         return f"refused: {change}, but {objection}"
     return f"refused: {change}, but no more after other cameras were refused"
 

@@ -137,6 +137,30 @@ def compare_errors(before: HeldOutErrors, after: HeldOutErrors) -> Verdict:
     return Verdict(judges, loss, error, significance)
 
 
+CHANCE: Final = 2.0
+"""Standard errors by which a loss falls or rises by chance [1]: where many people judge, one in
+forty falls by more."""
+
+
+def judge_cameras(verdict: Verdict, alone: Flags, min_judges: int) -> tuple[Flags, Flags]:
+    """Return the cameras whose change is confirmed, and those that need none.
+
+    Well calibrated cameras move by hundredths of a pixel, and their loss falls or rises by chance.
+    A camera that is judged alone is confirmed only beyond that; within it, it agrees with the
+    others as it is. Other cameras are confirmed unless their loss rises, and never found to agree.
+
+    Args:
+        verdict: held-out errors before and after the change of all cameras.
+        alone: (cameras,) bool, cameras that need no evidence of all together.
+        min_judges: minimum held-out keypoints of a camera [1].
+    """
+    enough = verdict.judges >= min_judges
+    with np.errstate(invalid="ignore"):
+        falls = verdict.loss[:, 1] <= verdict.loss[:, 0]
+    confirmed = enough & falls & (~alone | (verdict.significance >= CHANCE))
+    return confirmed, enough & alone & (np.abs(verdict.significance) < CHANCE)
+
+
 def _significance(fall: Floats) -> float:
     """Return the mean decrease of the loss over its standard error [1]; 0 if unknown.
 

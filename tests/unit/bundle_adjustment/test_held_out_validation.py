@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
-from worldpose.bundle_adjustment.held_out_validation import compare_errors, held_out_errors
+from worldpose.bundle_adjustment.held_out_validation import (
+    Verdict,
+    compare_errors,
+    held_out_errors,
+    judge_cameras,
+)
 from worldpose.static_calibration import step_camera
 from worldpose.triangulation import triangulate_joints
 
@@ -108,6 +113,31 @@ def test_significance_counts_a_person_in_a_quarter_of_the_time_once(clip):
     np.testing.assert_allclose(said.significance, expected, rtol=1e-9)
 
 
+def test_a_camera_judged_alone_needs_more_than_chance():
+    loss = np.array([[2.0, 1.9], [2.0, 1.9], [2.0, 2.1], [2.0, 2.1], [2.0, 1.9], [2.0, 1.9]])
+    # The mean over keypoints falls and that over people rises: the people who weigh most gain.
+    significance = np.array([3.0, 1.0, -1.0, -3.0, -3.0, 3.0])
+    judges = np.array([200, 200, 200, 200, 200, 20])
+    verdict = Verdict(judges, loss, np.full((6, 2), np.nan), significance)
+    confirmed, agrees = judge_cameras(verdict, np.ones(6, dtype=bool), 100)
+    assert confirmed.tolist() == [True, False, False, False, False, False]
+    assert agrees.tolist() == [False, True, True, False, False, False]
+    confirmed, agrees = judge_cameras(verdict, np.zeros(6, dtype=bool), 100)
+    assert confirmed.tolist() == [True, True, False, False, True, False]
+    assert not agrees.any()
+
+
+def test_one_camera_alone_does_not_change_by_its_markings(clip):
+    made, true, _ = clip(cameras=8, seed=3)
+    step = np.zeros((8, 12))
+    step[WRONG, 1] = 0.02  # 40 px, which its own markings tell
+    wrong = placed_again(replace(made, cameras=step_camera(true, step)))
+    adjusted = adjust_cameras(wrong, QUICK.model_copy(update={"evidence": "markings"}))
+    assert adjusted.verdict.significance[WRONG] > 2.0
+    assert (np.delete(adjusted.verdict.significance, WRONG) < 2.0).any()
+    assert adjusted.accepted.sum() != 1
+
+
 def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
     made, true, _ = clip(cameras=8, seed=3)
     exact = placed_again(replace(made, cameras=true, covariance=1e-4 * made.covariance))
@@ -119,6 +149,7 @@ def test_well_calibrated_cameras_stay_unless_the_change_is_beyond_chance(clip):
     falls = adjusted.verdict.loss[:, 1] < adjusted.verdict.loss[:, 0]
     assert falls.any()
     assert all("standard errors" in adjusted.reasons[c] for c in np.flatnonzero(falls))
+    assert adjusted.evidence.shift > 0.0  # that of the proposed change
 
 
 def test_cameras_that_stay_still_place_the_one_that_is_wrong(clip):
@@ -133,7 +164,8 @@ def test_cameras_that_stay_still_place_the_one_that_is_wrong(clip):
     assert (~adjusted.accepted).any()
     left = errors(adjusted.cameras, true)
     assert left[WRONG] < 0.4
-    assert np.delete(left, WRONG).max() < 0.1
+    moved = np.flatnonzero(adjusted.accepted)
+    assert left[moved[moved != WRONG]].max(initial=0.0) < 0.1
 
 
 def test_a_camera_calibrated_wrong_is_mended_and_the_others_hardly_feel_it(honest):
