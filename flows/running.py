@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.resource_tracker import ensure_running
 from types import FrameType
@@ -183,7 +183,8 @@ def _machines(
         cluster: PrivateCluster | None = None
         ask_for: Callable[[int], None] = _no_more
         if request.dask is None:
-            cluster = stack.enter_context(start_cluster(request.workers, missing))
+            # Entering the cluster itself would wait for its workers.
+            cluster = stack.enter_context(closing(start_cluster(request.workers, missing)))
             ask_for = stack.enter_context(keep_workers(cluster))
             request = replace(request, dask=cluster.scheduler_address, security=cluster.security)
         else:

@@ -43,6 +43,22 @@ class KeypointJacobian:
 
 
 @dataclass(frozen=True, eq=False)
+class _Turned:
+    """Rotations of posed bodies, and the vectors that they rotate."""
+
+    local: Floats
+    """(n, 24, 3, 3), relative to the parent."""
+    world: Floats
+    """(n, 24, 3, 3)"""
+    axes: Floats
+    """(n, 24, 3, 3), of the angles, as of `_turn_joints`."""
+    terms: Floats
+    """(n, terms, 3) [m], unturned."""
+    origin: Floats
+    """(n, 3) [m], world: the unposed pelvis moved by `transl`."""
+
+
+@dataclass(frozen=True, eq=False)
 class ChainedKeypoints:
     """Keypoints as sums of rotated vectors, precomputed for many poses."""
 
@@ -86,37 +102,59 @@ class ChainedKeypoints:
         vectors[first + np.arange(len(joints)), joints, :, 0] += by
         return ChainedKeypoints(self.model, self.pelvis, vectors)
 
+    def place(self, parameters: BodyParameters) -> Floats:
+        """Return the keypoints (..., keypoints, 3) [m], world; NaN where a parameter is."""
+        turned = self._turn(parameters)
+        keypoint, joint, _, _ = self._terms
+        rotated = (turned.world[:, joint] @ turned.terms[..., None])[..., 0]
+        own = (keypoint == np.arange(len(self.vectors))[:, None]).astype(np.float64)
+        places = own @ rotated + turned.origin[:, None]
+        return np.asarray(places.reshape((*parameters.batch_shape, *places.shape[1:])))
+
+    def _turn(self, parameters: BodyParameters) -> _Turned:
+        """Return the rotations of poses, and the terms of their keypoints."""
+        flat = parameters.flat()
+        angles = np.concatenate([flat.global_orient, flat.body_pose], axis=-1)
+        local, world, axes = _turn_joints(angles.reshape(-1, JOINTS, 3), self.model.parents)
+        feature = np.concatenate([np.ones((len(angles), 1)), flat.betas], axis=-1)
+        origin = feature @ self.pelvis.T + flat.transl
+        if self._is_corrected:
+            away = (local[:, 1:] - np.eye(3)).reshape(len(angles), 9 * (JOINTS - 1))
+            feature = np.concatenate([feature, away], axis=-1)
+        constants = self._terms[2].reshape(-1, feature.shape[-1])
+        terms = (feature @ constants.T).reshape(len(angles), len(self._terms[1]), 3)
+        return _Turned(local, world, axes, terms, origin)
+
+    @property
+    def _is_corrected(self) -> bool:
+        """Whether keypoints also depend on the pose feature."""
+        return bool(self.vectors.shape[-1] > 1 + self.model.shapes)
+
     def differentiate(
         self, parameters: BodyParameters, *, by_betas: bool = True
     ) -> KeypointJacobian:
         """Return the keypoints and their Jacobian; NaN where a parameter is."""
-        flat, batch, count = parameters.flat(), parameters.batch_shape, len(self.vectors)
-        angles = np.concatenate([flat.global_orient, flat.body_pose], axis=-1)
-        local, turns, axes = _turn_joints(angles.reshape(-1, JOINTS, 3), self.model.parents)
-        feature = np.concatenate([np.ones((len(angles), 1)), flat.betas], axis=-1)
-        linear = feature.shape[-1]
-        corrected = self.vectors.shape[-1] > linear
-        if corrected:
-            away = (local[:, 1:] - np.eye(3)).reshape(len(angles), 9 * (JOINTS - 1))
-            feature = np.concatenate([feature, away], axis=-1)
-        keypoint, joint, constants, moves = self._terms
-        terms = (feature @ constants.reshape(-1, feature.shape[-1]).T).reshape(
-            len(angles), len(joint), 3
-        )
+        batch, count = parameters.batch_shape, len(self.vectors)
+        turned, shapes = self._turn(parameters), self.model.shapes
+        turns, axes = turned.world, turned.axes
+        keypoint, joint, _, moves = self._terms
         keypoints, by_pose = _sum_levers(
-            turns, axes, terms, keypoint, joint, moves, self.model.parents
+            turns, axes, turned.terms, keypoint, joint, moves, self.model.parents
         )
-        keypoints += (feature[:, :linear] @ self.pelvis.T + flat.transl)[:, None]
+        keypoints += turned.origin[:, None]
 
-        rows = turns.transpose(0, 2, 1, 3).reshape(len(angles), 3, 3 * JOINTS)
-        shaped = np.empty((len(angles), count, 3, 0))
+        frames = len(turns)
+        rows = turns.transpose(0, 2, 1, 3)
+        if by_betas or self._is_corrected:
+            rows = rows.reshape(frames, 3, 3 * JOINTS)
+        shaped = np.empty((frames, count, 3, 0))
         if by_betas:
-            shaped = (rows @ self._shaping).reshape(len(angles), 3, count, linear - 1)
+            shaped = (rows @ self._shaping).reshape(frames, 3, count, shapes)
             shaped = shaped.transpose(0, 2, 1, 3) + self.pelvis[:, 1:]
-        if corrected:
+        if self._is_corrected:
             by_feature = np.einsum("nac,cf->naf", rows, self._correctives, optimize=True)
-            by_feature = by_feature.reshape(len(angles), 3, count, JOINTS - 1, 9)
-            own = _own_change(local, turns, axes, self.model.parents)
+            by_feature = by_feature.reshape(frames, 3, count, JOINTS - 1, 9)
+            own = _own_change(turned.local, turns, axes, self.model.parents)
             by_pose[..., 3:] += np.einsum(
                 "nakjf,njfd->nkajd", by_feature, own, optimize=True
             ).reshape(by_pose[..., 3:].shape)

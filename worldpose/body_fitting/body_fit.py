@@ -513,15 +513,18 @@ def _gather_evidence(
         settings: scale and correlation time of the noise.
     """
     fps, present = evidence.fps, np.asarray(evidence.joint_seen.any(-1))
-    by_person = {
-        person: Evidence.of(evidence.joints[span, person], covariance[span, person], fps, settings)
-        for person, span in spans.items()
-    }
     for view in evidence.ray_constraints:
         present = present | view.seen
-        for person, span in spans.items():
+
+    def gather(person: int) -> Evidence:
+        span = spans[person]
+        own = Evidence.of(evidence.joints[span, person], covariance[span, person], fps, settings)
+        for view in evidence.ray_constraints:
             points, across = view.points[span, person], view.across[span, person]
-            by_person[person] = by_person[person].add_rays(points, across, fps, settings)
+            own = own.add_rays(points, across, fps, settings)
+        return own
+
+    by_person = dict(zip(spans, map_in_threads(gather, spans), strict=True))
     return by_person, present
 
 

@@ -138,7 +138,7 @@ def learn_point_offsets(
         part = people[person]
         pose, _ = moved.solve_poses(part, shapes.people[person], shapes.offsets, fps)
         parameters = pose.parameters()
-        places = solver.chained.differentiate(parameters).keypoints[:, len(COCO17) :]
+        places = solver.chained.place(parameters)[:, len(COCO17) :]
         turned = model.articulate(parameters).rotations[:, point_segments(model, points)]
         away: Floats = part.joints[:, len(COCO17) :] - places
         return np.asarray(np.einsum("fpba,fpb->fpa", turned, away))

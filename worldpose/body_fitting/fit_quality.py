@@ -205,15 +205,16 @@ def _reprojection(
     index = detections.detection_index
     if len(cameras.batch_shape) > 1:
         cameras = cameras[rows]
-    distances = []
-    for person in range(index.shape[2]):
+
+    def measure(person: int) -> Floats:
         place = index[:, :, person]
         frame, camera = np.nonzero(place >= 0)
         own = np.full((*place.shape, 17, 2), np.nan)
         own[frame, camera] = detections.keypoints[frame, camera, place[frame, camera]]
-        away = np.linalg.norm(cameras.project(perceived[:, None, person]) - own, axis=-1)
-        distances.append(away[np.isfinite(away)])
-    return distances
+        away: Floats = np.linalg.norm(cameras.project(perceived[:, None, person]) - own, axis=-1)
+        return away[np.isfinite(away)]
+
+    return list(map_in_threads(measure, range(index.shape[2])))
 
 
 def _median(values: AnyFloats) -> float | None:
@@ -390,7 +391,7 @@ def _fit_poses(
                 alone.points[part, person], alone.across[part, person], fps, solver.settings
             )
             pose, _ = solver.solve_poses(evidence, shape, fit.offsets, fps)
-            bodies[part, person] = solver.chained.differentiate(pose.parameters()).keypoints
+            bodies[part, person] = solver.chained.place(pose.parameters())
 
     for _ in map_in_threads(fit_person, np.flatnonzero(np.isfinite(fit.betas).all(-1)).tolist()):
         pass

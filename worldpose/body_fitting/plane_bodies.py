@@ -414,7 +414,7 @@ class _Clip:
         orient = Rigid.from_rotvec(start.orient, np.zeros(3)).rotation @ half
         pose = replace(start, orient=Rigid(orient, np.zeros(3)).rotvec)
         pose, _ = self.solver.search(replace(track, monocular_prior=prior), pose, offsets)
-        return np.asarray(self.solver.chained.differentiate(pose.parameters()).keypoints)
+        return np.asarray(self.solver.chained.place(pose.parameters()))
 
     def depth_covariance(self, person: int, own: _Person, joints: Floats) -> Floats:
         """Return the covariance (frames, 17, 3, 3) [m^2] that all frames of a person share.
@@ -445,7 +445,7 @@ def stand_on_ground(solver: Solver, pose: Pose, place: Floats) -> Pose:
     assert solver.ground is not None
     model = solver.chained.model
     pose = replace(pose, transl=np.zeros_like(pose.transl))
-    joints = solver.chained.differentiate(pose.parameters()).keypoints
+    joints = solver.chained.place(pose.parameters())
     xy = place - joints[:, HIPS, :2].mean(axis=1)
     feet = joints[:, ANKLES, :2] + xy[:, None]
     floor = solver.ground(feet[..., 0], feet[..., 1]) + ankle_height(model, pose.betas)

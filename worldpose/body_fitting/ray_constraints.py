@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from worldpose.body_fitting.pose_space import interpolate_gaps
+from worldpose.compiled import map_in_threads
 from worldpose.geometry import Camera
 
 BLOCK: Final = 256
@@ -60,9 +61,18 @@ def find_ray_constraints(
     """
     origins = np.full(joints.shape, np.nan)
     directions = np.full(joints.shape, np.nan)
-    for first in range(0, len(joints), BLOCK):
-        rows = slice(first, min(first + BLOCK, len(joints)))
-        origins[rows], directions[rows] = _lone_rays(cameras, detections[rows], joints[rows])
+    blocks = [
+        slice(first, min(first + BLOCK, len(joints))) for first in range(0, len(joints), BLOCK)
+    ]
+
+    def find(block: tuple[slice, KeypointDetections]) -> tuple[Floats, Floats]:
+        rows, seen = block
+        return _lone_rays(cameras, seen, joints[rows])
+
+    # Read one after the other, while threads compute.
+    read = ((rows, detections[rows]) for rows in blocks)
+    for rows, found in zip(blocks, map_in_threads(find, read), strict=True):
+        origins[rows], directions[rows] = found
     alone = np.isfinite(directions).any()
     return lines_of_sight(origins, directions, expected_joints(joints) if alone else joints)
 

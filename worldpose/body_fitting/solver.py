@@ -119,7 +119,7 @@ class Solver:
     def find_standing_ankles(self, track: Track, pose: Pose) -> Track:
         """Return the track with the ground contacts of its ankles in a pose."""
         assert self.ground is not None
-        joints = self.chained.differentiate(pose.parameters()).keypoints
+        joints = self.chained.place(pose.parameters())
         height = ankle_height(self.chained.model, pose.betas)
         contacts = find_contacts(
             joints, height, self.ground, track.fps, self.settings, track.starts
