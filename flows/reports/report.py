@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -86,15 +87,18 @@ def write_report(
     scores: Evaluation | None = None
     if source is not None and len(clips_of(run.record)) == 1:
         scores = score(match.match_id, source, store.url, run_id=run_id).evaluation
-    films = _write_videos(store, run, match, out, camera) if videos else []
+    with ThreadPoolExecutor(1) as painter:
+        # Painting and encoding leave the interpreter to the figures for much of their time.
+        filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
+        with nullcontext(None) if figures is None else keep_figures() as kept:
+            first, *others = _sections(store, run, match, source)
+    films = [] if filming is None else filming.result()
     beside = [LinkedFile(film.stem.removeprefix(f"{out.stem}-"), film.name) for film in films]
     shown = Section(
         "Videos",
         tuple(beside),
         "With markings and people drawn over them, in the folder of this page.",
     )
-    with nullcontext(None) if figures is None else keep_figures() as kept:
-        first, *others = _sections(store, run, match, source)
     if figures is not None and kept is not None:
         _write_figures([first, *others], kept, figures)
     page = report_page(
