@@ -16,8 +16,13 @@ from typing import TYPE_CHECKING, Any, cast
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gates import Gatekeeper
 from flows.orchestration.cluster_errors import require_room, require_workers
-from flows.orchestration.local_cluster import keep_workers, start_cluster, workers_for
-from flows.orchestration.prefect_environment import START_SECONDS, has_server, prefect_server
+from flows.orchestration.local_cluster import (
+    keep_workers,
+    start_cluster,
+    wait_for_worker,
+    workers_for,
+)
+from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
@@ -200,7 +205,7 @@ def _machines(
             require_room(failure, store.url)
             raise
         if cluster is not None:
-            cluster.wait_for_workers(1, START_SECONDS)
+            wait_for_worker(cluster)
         yield request, ask_for
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from flows.orchestration.prefect_environment import START_SECONDS, local_cluster_options
 from flows.run_plan import PlannedUnit
+from worldpose.errors import WorldposeError
 
 if TYPE_CHECKING:
     from flows.orchestration.private_cluster import PrivateCluster
@@ -75,6 +76,21 @@ def short_seconds(unit: PlannedUnit) -> float:
         return STILL_SECONDS
     frames = sources.get("frame_count", 0)
     return 0.2 + (frames / 20_000 if isinstance(frames, int) else math.inf)
+
+
+def wait_for_worker(cluster: PrivateCluster) -> None:
+    """Return when the first worker has started.
+
+    Raises:
+        WorldposeError: none did in time.
+    """
+    try:
+        cluster.wait_for_workers(1, START_SECONDS)  # type: ignore[no-untyped-call]
+    except TimeoutError:
+        raise WorldposeError(
+            f"No worker process started within {START_SECONDS:.0f} s. Whether its modules can be "
+            "imported shows: dask worker --preload tasks.preload --preload flows.match tcp://HOST:1"
+        ) from None
 
 
 @contextmanager

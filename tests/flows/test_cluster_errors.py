@@ -1,6 +1,8 @@
 """A lost Prefect server or Dask scheduler is not a unit's failure."""
 
+import os
 import time
+from contextlib import closing
 from types import SimpleNamespace
 
 import dask
@@ -13,7 +15,7 @@ from distributed.comm.core import CommClosedError
 from flows.orchestration import local_cluster
 from flows.orchestration.cluster_errors import LostWorkersError, require_workers
 from flows.orchestration.prefect_environment import local_cluster_options
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import InputError, StoreError, WorldposeError
 
 
 @pytest.mark.parametrize(
@@ -58,6 +60,27 @@ def test_a_worker_that_is_gone_for_good_is_begun_anew(monkeypatch):
         client.wait_for_workers(2, 60)
         time.sleep(0.3)  # the next looks after them keep both
         assert len(cluster.worker_spec) == 2
+
+
+def test_workers_that_cannot_import_their_modules_are_told(monkeypatch):
+    monkeypatch.setattr(local_cluster, "START_SECONDS", 5.0)
+    with (
+        dask.config.set({"distributed.worker.preload": ["no_such_module"]}),
+        closing(local_cluster.start_cluster(1, [])) as cluster,
+        pytest.raises(WorldposeError, match="No worker process started within 5 s"),
+    ):
+        local_cluster.wait_for_worker(cluster)
+
+
+def test_workers_get_large_arrays_in_huge_pages(monkeypatch):
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    with (
+        closing(local_cluster.start_cluster(1, [])) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        assert client.submit(os.environ.get, "GLIBC_TUNABLES").result(60) == (
+            "glibc.malloc.hugetlb=1"
+        )
 
 
 @pytest.mark.parametrize(
