@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from data_contracts.arrays import GroupLayout
 from data_contracts.records import CONTRACT_VERSION
@@ -20,6 +21,9 @@ from worldpose.store.documents import canonical_json, digest, record_checksum
 
 if TYPE_CHECKING:
     from worldpose.store.groups import Arrays
+
+DIGEST_THREADS: Final = 2
+"""Threads that hash the files of one result; the units of other workers do so, too."""
 
 
 class ResultWriter:
@@ -131,13 +135,16 @@ def stored_files(
         folder: the folder.
         sizes: sizes of the parts of files that consist of some [byte], by path.
     """
-    found = []
-    for path in folder.rglob("*"):
-        if path.is_file():
-            data = path.read_bytes()
-            name = path.relative_to(folder).as_posix()
-            parts = digest_parts(data, sizes.get(name, ()))
-            found.append(StoredFile(path=name, size=len(data), sha256=digest(data), parts=parts))
+
+    def describe(path: Path) -> StoredFile:
+        data = path.read_bytes()
+        name = path.relative_to(folder).as_posix()
+        parts = digest_parts(data, sizes.get(name, ()))
+        return StoredFile(path=name, size=len(data), sha256=digest(data), parts=parts)
+
+    # Hashing leaves the interpreter to other threads.
+    with ThreadPoolExecutor(DIGEST_THREADS) as threads:
+        found = list(threads.map(describe, filter(Path.is_file, folder.rglob("*"))))
     return tuple(sorted(found, key=lambda file: file.path))
 
 
