@@ -11,11 +11,7 @@ FIRST := .venv/first
 FIRST_RUN = rm -rf $(FIRST)/$(1) && $(BIN)/worldpose simulate --scenario tiny $(2) --out $(FIRST)/$(1)/match && \
   $(BIN)/worldpose run $(FIRST)/$(1)/match --project $(FIRST)/$(1)/project $(3)
 GIVEN = $(call FIRST_RUN,given,--duration 0.5 --calibrated --no-stills)
-STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration) && $(BIN)/python -c '$(IMPORTS)'
-# Bytecode of what stages, commands and reports import.
-IMPORTS = import importlib, pkgutil, flows.cli, flows.reports, onnxruntime, tasks, worldpose.detection.bundled_pose; \
-  [importlib.import_module(each.name) for package in (flows.cli, flows.reports, tasks) \
-  for each in pkgutil.iter_modules(package.__path__, package.__name__ + ".")]
+STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration)
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
