@@ -85,7 +85,7 @@ def wait_for_worker(cluster: PrivateCluster) -> None:
         WorldposeError: none did in time.
     """
     try:
-        cluster.wait_for_workers(1, START_SECONDS)  # type: ignore[no-untyped-call]
+        cluster.wait_for_workers(1, START_SECONDS)
     except TimeoutError:
         raise WorldposeError(
             f"No worker process started within {START_SECONDS:.0f} s. Whether its modules can be "
