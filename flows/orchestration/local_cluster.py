@@ -88,8 +88,9 @@ def wait_for_worker(cluster: PrivateCluster) -> None:
         cluster.wait_for_workers(1, START_SECONDS)
     except TimeoutError:
         raise WorldposeError(
-            f"No worker process started within {START_SECONDS:.0f} s. Whether its modules can be "
-            "imported shows: dask worker --preload tasks.preload --preload flows.match tcp://HOST:1"
+            f"No worker process started within {START_SECONDS:.0f} s. Import the modules that it "
+            "imports at its start to see why: python -c 'import tasks.preload, flows.match', and "
+            "those of distributed.worker.preload in Dask's configuration."
         ) from None
 
 

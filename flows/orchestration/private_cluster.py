@@ -17,7 +17,7 @@ from distributed import LocalCluster, Security
 
 HUGE_PAGES: Final = {"distributed.nanny.pre-spawn-environ.GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 """Let workers get large arrays in pages of 2 MiB, those of compiled kernels too: by pages of 4 KiB
-the kernel of the operating system took a quarter of the CPU time of body fitting. A value that the
+the kernel of the operating system took a fifth of the CPU time of body fitting. A value that the
 environment has is used instead; C libraries other than glibc ignore it."""
 
 

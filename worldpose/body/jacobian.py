@@ -103,7 +103,7 @@ class ChainedKeypoints:
         return ChainedKeypoints(self.model, self.pelvis, vectors)
 
     def place(self, parameters: BodyParameters) -> Floats:
-        """Return the keypoints (..., keypoints, 3) [m], world; NaN where a parameter is."""
+        """Return the keypoints (..., keypoints, 3) [m], world; all NaN where a parameter is."""
         turned = self._turn(parameters)
         keypoint, joint, _, _ = self._terms
         rotated = (turned.world[:, joint] @ turned.terms[..., None])[..., 0]

@@ -32,6 +32,13 @@ def test_keypoints_are_those_of_folding(folded, people):
     np.testing.assert_allclose(found, folded(people), atol=2e-13)
 
 
+def test_keypoints_without_derivatives_are_the_same(folded, people):
+    chained = ChainedKeypoints.of(folded)
+    placed = chained.place(people)
+    np.testing.assert_allclose(placed, chained.differentiate(people).keypoints, atol=1e-13)
+    np.testing.assert_allclose(placed, folded(people), atol=2e-13)
+
+
 @pytest.mark.parametrize("name", NAMES[:3])
 def test_derivatives_are_those_of_differences(folded, people, name):
     jacobian = ChainedKeypoints.of(folded).differentiate(people)
@@ -102,6 +109,8 @@ def test_batches_keep_their_shape(open_body, shape):
     assert jacobian.betas.shape == (*shape, 17, 3, 10)
     assert jacobian.global_orient.shape == (*shape, 17, 3, 3)
     assert jacobian.body_pose.shape == (*shape, 17, 3, 69)
+    placed = ChainedKeypoints.of(fold_keypoints(open_body, SKELETONS["coco17"])).place(person)
+    assert placed.shape == (*shape, 17, 3)
 
 
 def test_a_missing_person_is_missing_and_the_next_is_not(open_body, people):
