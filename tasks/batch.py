@@ -1,4 +1,4 @@
-"""Task that computes many small units of a stage in sequence, with less Prefect overhead each."""
+"""Task that computes many small units of a stage, with less Prefect overhead each."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from prefect import task
 
 from data_contracts.work import Work
 from tasks.unit import RETRIES, RETRY_SECONDS, may_pass
+from tasks.watchdog import was_interrupted
+from worldpose.compiled import map_in_threads
 from worldpose.store import Store
 
 
@@ -17,7 +19,8 @@ from worldpose.store import Store
 def batch(name: str, work: list[str]) -> list[Exception | None]:
     """Compute and publish each unit like its own task; return the exception of each, or None.
 
-    After its worker was killed, a retry resumes with the first unit without a result.
+    Two are computed at the same time. After its worker was killed, a retry resumes with the units
+    without a result, one by one: only the unit that ended the process may be given up.
 
     Args:
         name: name in the dashboard.
@@ -26,7 +29,9 @@ def batch(name: str, work: list[str]) -> list[Exception | None]:
     units = [Work.model_validate_json(each) for each in work]
     stage = units[0].recipe.stage
     compute = getattr(importlib.import_module(f"tasks.{stage}"), stage).fn
-    return [_failure(compute, each) for each in units]
+    if any(was_interrupted(each) for each in units):
+        return [_failure(compute, each) for each in units]
+    return list(map_in_threads(lambda each: _failure(compute, each), units))
 
 
 def _failure(compute: Callable[[Work], str], work: Work) -> Exception | None:

@@ -41,7 +41,7 @@ from worldpose.review.identities import select_triangulated
 from worldpose.store import ResultWriter, Store
 from worldpose.triangulation import ExtraJoints, undo_swaps
 
-MEASURED_FRAMES: Final = 3300
+MEASURED_FRAMES: Final = 1000
 """Frames of a clip from which medians of metrics are computed."""
 
 

@@ -15,6 +15,7 @@ from data_contracts.tracking import TRACKING
 from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import figures_of, open_uncorrected, unit_task
+from worldpose.compiled import map_in_threads
 from worldpose.pitch import PitchTemplate
 from worldpose.review.identities import (
     Identities,
@@ -225,8 +226,8 @@ class _Feet:
 def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None) -> _Feet:
     """Return foot positions by camera of chosen detections; None = all."""
     pitch = clip.raise_pitch(pitch)
-    positions, indices = [], []
-    for first in range(0, len(clip.detections.frame), BLOCK):
+
+    def locate(first: int) -> tuple[GroundPositions, NDArray[np.int16]]:
         rows = slice(first, first + BLOCK)
         detections = clip.detections[rows]
         there = np.isfinite(detections.confidence).any(-1) | np.isfinite(detections.boxes).all(-1)
@@ -239,8 +240,11 @@ def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool
             chosen=own,
         )
         order = np.argsort(~own, axis=2, kind="stable")[:, :, : max(1, int(own.sum(axis=2).max()))]
-        positions.append(located.select(order))
-        indices.append(np.where(np.take_along_axis(own, order, axis=2), order, -1).astype(np.int16))
+        index = np.where(np.take_along_axis(own, order, axis=2), order, -1)
+        return located.select(order), index.astype(np.int16)
+
+    blocks = map_in_threads(locate, range(0, len(clip.detections.frame), BLOCK))
+    positions, indices = zip(*blocks, strict=True)
     return _Feet(GroundPositions.join(positions, BLOCK), FrameBlocks(indices, BLOCK))
 
 

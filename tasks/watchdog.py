@@ -69,6 +69,12 @@ def kill_on_timeout(work: Work) -> Iterator[None]:
         mark.unlink(missing_ok=True)
 
 
+def was_interrupted(work: Work) -> bool:
+    """Return whether a process on this machine ended while it computed this unit of the run."""
+    mark = _mark_of(work)
+    return mark is not None and mark.exists()
+
+
 def _give_up(work: Work, stopped: list[str], deaths: int) -> None:
     name = work.recipe.name
     if len(stopped) >= MOST_STOPPED and work.seconds is not None:

@@ -1,5 +1,7 @@
 """Small units in one task: each is published or fails as in a task of its own."""
 
+import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -49,7 +51,7 @@ def test_a_units_failure_is_its_own(works, monkeypatch):
 
     failures = run(works, compute, monkeypatch)
     assert [type(each) for each in failures] == [type(None), DegenerateError, type(None)]
-    assert done == [works[0], works[2]]
+    assert sorted(each.recipe.unit for each in done) == ["a", "c"]
 
 
 def test_what_may_pass_is_tried_again_and_what_is_there_is_not(works, monkeypatch):
@@ -57,10 +59,26 @@ def test_what_may_pass_is_tried_again_and_what_is_there_is_not(works, monkeypatc
 
     def compute(work):
         tried.append(work.recipe.unit)
-        if work.recipe.unit == "c" or tried.count("b") == 1:
+        if work.recipe.unit == "c" or tried.count("b") == 1 and work.recipe.unit == "b":
             raise StoreError("no space")
 
     monkeypatch.setattr(Store, "has", lambda self, match, stage, unit, key: unit == "a")
     failures = run(works, compute, monkeypatch)
-    assert tried == ["b", "b", "c", "c", "c"]
+    assert sorted(tried) == ["b", "b", "c", "c", "c"]
     assert [type(each) for each in failures] == [type(None), type(None), StoreError]
+
+
+@pytest.mark.parametrize("interrupted", ["", "b"])
+def test_units_run_in_pairs_unless_one_ended_its_process_before(works, interrupted, monkeypatch):
+    at_work, most, changing = set(), [], threading.Lock()
+
+    def compute(work):
+        with changing:
+            at_work.add(work.recipe.unit)
+            most.append(len(at_work))
+        time.sleep(0.1)
+        at_work.remove(work.recipe.unit)
+
+    monkeypatch.setattr(batch, "was_interrupted", lambda work: work.recipe.unit == interrupted)
+    assert run(works, compute, monkeypatch) == [None, None, None]
+    assert max(most) == (1 if interrupted else 2)

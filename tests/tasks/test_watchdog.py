@@ -7,7 +7,12 @@ from types import SimpleNamespace
 import pytest
 
 from data_contracts.work import Recipe, Work
-from tasks.watchdog import TaskTimeoutError, WorkerCrashError, kill_on_timeout
+from tasks.watchdog import (
+    TaskTimeoutError,
+    WorkerCrashError,
+    kill_on_timeout,
+    was_interrupted,
+)
 from worldpose.store import recipe_key
 
 
@@ -37,8 +42,10 @@ def die(work):
 
 
 def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
+    assert not was_interrupted(work)
     for _ in range(3):
         die(work)
+    assert was_interrupted(work)
     with pytest.raises(WorkerCrashError, match="tracking/c: its process ended 3 times"):
         kill_on_timeout(work).__enter__()
     assert list(tmp_path.iterdir()) == []

@@ -538,7 +538,10 @@ def random_covariance(covariance: Floats, common_bias: Floats) -> Floats:
         common_bias: (17,) per axis [m], included in `covariance`.
     """
     modelled = np.maximum(common_bias**2 - KEPT_BIAS**2, 0.0)
-    return covariance - modelled[:, None, None] * np.eye(3)
+    random = covariance.astype(np.float64)
+    for axis in range(3):
+        random[..., axis, axis] -= modelled
+    return random
 
 
 def _long_gaps(seen: NDArray[np.bool_], max_frames: float) -> NDArray[np.bool_]:

@@ -93,7 +93,8 @@ class FitMetrics:
 
     Args:
         fps: [1/s].
-        stride: of this many values of a part, medians and spreads use one.
+        stride: of this many values of a part, medians and spreads use one; those of image
+            distances use one of this many blocks of frames, which are read faster than frames.
     """
 
     def __init__(self, fps: float, stride: int = 1) -> None:
@@ -135,9 +136,8 @@ class FitMetrics:
             self._keep("jerk", person, np.array([[squares.sum(), len(squares)]]))
         if seen is None:
             return
-        chosen = np.arange(0, len(joints), self._stride)
-        for first in range(0, len(chosen), BLOCK):
-            rows = chosen[first : first + BLOCK]
+        for first in range(0, len(joints), BLOCK * self._stride):
+            rows = slice(first, min(first + BLOCK, len(joints)))
             distances = _reprojection(perceived[rows], seen, rows)
             for person, values in enumerate(distances):
                 self._keep("reprojection", person, values.astype(np.float32))
@@ -191,7 +191,7 @@ def report_fit(
 
 
 def _reprojection(
-    perceived: Floats, seen: tuple[Camera, TrackedFrames], rows: NDArray[np.int64]
+    perceived: Floats, seen: tuple[Camera, TrackedFrames], rows: slice
 ) -> list[Floats]:
     """Return distances of each person's seen keypoints (n,) [px] in some frames.
 

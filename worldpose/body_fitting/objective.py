@@ -110,14 +110,6 @@ class Evidence:
             np.concatenate([self.information, own.information], axis=1),
         )
 
-    @classmethod
-    def concatenate(cls, parts: Sequence[Evidence]) -> Evidence:
-        """Return the evidence of intervals, one after the other."""
-        return cls(
-            np.concatenate([part.joints for part in parts]),
-            np.concatenate([part.information for part in parts]),
-        )
-
     @property
     def known(self) -> NDArray[np.bool_]:
         """(frames, 17), joints with any information."""
@@ -142,7 +134,7 @@ class Evidence:
         spread = spread + settings.min_joint_std_m**2 * np.eye(3)
         # Correlated frames count as one observation.
         spread *= 1.0 + settings.noise_time_s * fps
-        information: Floats = (np.linalg.inv(spread) * seen[..., None, None]).astype(np.float64)
+        information = _invert_symmetric(spread) * seen[..., None, None]
         return cls(np.where(seen[..., None], joints, np.nan), information)
 
     def add_rays(
@@ -156,17 +148,24 @@ class Evidence:
             fps: [1/s].
             settings: standard deviation of a joint from its line.
         """
+        rows = np.flatnonzero(np.isfinite(points).all(-1).any(-1))
+        if not len(rows):
+            return self
+        points, across = points[rows], across[rows]
+        joints, information = self.joints.copy(), self.information.copy()
         seen = np.asarray(np.isfinite(points).all(-1))
         spread = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2
         spread *= 1.0 + settings.noise_time_s * fps
-        line = np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
-        information = self.information + line
+        information[rows] += np.where(
+            seen[..., None, None], across / spread[:, None, None], 0.0
+        )
         # From the point on the line towards the known joint; a lone line has no force along
         # itself.
-        away = np.where(np.isfinite(self.joints), self.joints, points) - points
-        weighted = self.information @ np.nan_to_num(away)[..., None]
-        moved = np.linalg.solve(information + MIN_INFORMATION * np.eye(3), weighted)[..., 0]
-        return Evidence(np.where(seen[..., None], points + moved, self.joints), information)
+        away = np.where(np.isfinite(joints[rows]), joints[rows], points) - points
+        weighted = self.information[rows] @ np.nan_to_num(away)[..., None]
+        moved = np.linalg.solve(information[rows] + MIN_INFORMATION * np.eye(3), weighted)[..., 0]
+        joints[rows] = np.where(seen[..., None], points + moved, joints[rows])
+        return Evidence(joints, information)
 
 
 Ground = Callable[[Floats, Floats], Floats]
@@ -268,6 +267,26 @@ CACHED_FRAMES: Final = 64
 """Frames that are differentiated together: 2 MB of derivatives."""
 _MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
+
+
+@compile_kernel
+def _invert_symmetric(matrices: Floats) -> Floats:
+    """Return the inverses of symmetric matrices (frames, points, 3, 3); LAPACK takes ten times."""
+    inverses = np.empty(matrices.shape)
+    for t in range(matrices.shape[0]):
+        for p in range(matrices.shape[1]):
+            m, out = matrices[t, p], inverses[t, p]
+            xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+            xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+            xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+            scale = 1.0 / (m[0, 0] * xx + m[0, 1] * xy + m[0, 2] * xz)
+            out[0, 0] = scale * xx
+            out[1, 1] = scale * (m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2])
+            out[2, 2] = scale * (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1])
+            out[0, 1] = out[1, 0] = scale * xy
+            out[0, 2] = out[2, 0] = scale * xz
+            out[1, 2] = out[2, 1] = scale * (m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2])
+    return inverses
 
 
 @compile_kernel

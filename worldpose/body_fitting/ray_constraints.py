@@ -111,16 +111,22 @@ def lines_of_sight(origins: Floats, directions: Floats, expected: Floats) -> Ray
         directions: (frames, persons, 17, 3), of any length; NaN without a ray.
         expected: (frames, persons, 17, 3) [m], world, approximate joints.
     """
-    along = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    points, across = np.full(directions.shape, np.nan), np.zeros((*directions.shape, 3))
+    # Most people have none: their arrays are not computed.
+    rows = np.isfinite(directions).all(-1).any(-1)
+    origins, along, expected = origins[rows], directions[rows], expected[rows]
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     far = np.maximum(((expected - origins) * along).sum(-1, keepdims=True), 0.0)
-    points = origins + far * along
-    lost = ~np.isfinite(points).all(-1)
-    points[lost], along[lost] = np.nan, 0.0
-    mean = along.sum(axis=2, keepdims=True)
+    found = origins + far * along
+    lost = ~np.isfinite(found).all(-1)
+    found[lost], along[lost] = np.nan, 0.0
+    mean = along.sum(axis=1, keepdims=True)
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean / np.maximum(length, 1e-9)
-    across = np.eye(3) - mean[..., :, None] * mean[..., None, :]
-    return RayConstraints(points, np.where(lost[..., None, None], 0.0, across))
+    projection = np.eye(3) - mean[..., :, None] * mean[..., None, :]
+    points[rows] = found
+    across[rows] = np.where(lost[..., None, None], 0.0, projection)
+    return RayConstraints(points, across)
 
 
 def expected_joints(joints: Floats) -> Floats:

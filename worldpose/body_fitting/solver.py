@@ -396,27 +396,30 @@ def _sample_piece(
     joints, covariance = (np.concatenate(column) for column in zip(*intervals, strict=True))
     bones = measure_bones(joints, scale * covariance, 1.0 + settings.noise_time_s * fps)
     betas = fit_shape(model, bones).betas
-    evidence, poses, starts, frames = [], [], [], 0
-    for interval in intervals:
-        some, sure = (each[::stride] for each in interval)
-        if not (np.isfinite(some).all(-1) & np.isfinite(sure).all((-1, -2))).any():
-            continue
-        some = shorten_limbs(some, scale * sure)
-        evidence.append(Evidence.of(some, sure, rate, settings))
-        poses.append(start_poses(model, betas, interpolate_gaps(some), solver.prior))
-        starts.append(frames)
-        frames += len(some)
-    if not evidence:
+    sampled = [(some[::stride], sure[::stride]) for some, sure in intervals]
+    seen = [
+        each
+        for each in sampled
+        if (np.isfinite(each[0]).all(-1) & np.isfinite(each[1]).all((-1, -2))).any()
+    ]
+    if not seen:
         return None
+    joints, covariance = (np.concatenate(column) for column in zip(*seen, strict=True))
+    joints = shorten_limbs(joints, scale * covariance)
+    starts = np.cumsum([len(some) for some, _ in seen])[:-1].tolist()
+    parts = [interpolate_gaps(part) for part in np.split(joints, starts)]
+    if all(np.isfinite(part).all() for part in parts):
+        parts = [np.concatenate(parts)]  # for a few frames each, calls take longer than numbers
+    poses = [start_poses(model, betas, part, solver.prior) for part in parts]
     track = Track(
         solver.chained,
-        Evidence.concatenate(evidence),
+        Evidence.of(joints, covariance, rate, settings),
         solver.prior,
         settings,
         rate,
         settings.shape_acceleration_m_s2,
         settings.shape_pose_weight,
-        starts=tuple(starts[1:]),
+        starts=tuple(starts),
     )
     transl, orient, angles = (np.concatenate(column) for column in zip(*poses, strict=True))
     return Piece(person, track, Pose(transl, orient, angles, betas))

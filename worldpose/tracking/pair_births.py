@@ -101,7 +101,7 @@ class CameraVisibility:
         self.shown += expected.sum(axis=1)
         empty = expected & ~seen
         if empty.any():
-            empty &= ~find_covered_bodies(joints, self.centers, directions, weights)
+            empty = find_uncovered_bodies(empty, joints, self.centers, directions, weights)
             self.missed += empty.sum(axis=1)
 
     def misses_score(
@@ -126,30 +126,34 @@ class CameraVisibility:
             return np.zeros(0)
         empty = self.should_see(joints) & ~own
         if empty.any():
-            empty &= ~find_covered_bodies(joints, self.centers, directions, weights)
+            empty = find_uncovered_bodies(empty, joints, self.centers, directions, weights)
         rate = np.log((self.missed + 1.0) / (self.shown + 2.0))
         return np.asarray(np.where(empty, rate[:, None], 0.0).sum(axis=0))
 
 
 @compile_kernel
-def find_covered_bodies(
+def find_uncovered_bodies(
+    asked: Flags,
     joints: Floats,
     centers: Floats,
     directions: Floats,
     weights: Floats,
 ) -> Flags:
-    """Return in which cameras a detection lies on the image of bodies (cameras, n).
+    """Return in which of the asked cameras no detection lies on the image of bodies (cameras, n).
 
     Args:
+        asked: (cameras, n), the cameras and bodies to look at; False elsewhere in the result.
         joints: (n, 17, 3) [m], world; NaN where unknown.
         centers: (cameras, 3) [m], world.
         directions: (cameras, detections, 17, 3) unit rays, world; NaN where not seen.
         weights: (cameras, detections, 17); 0 where not seen.
     """
     cameras, detections, count, _ = directions.shape
-    covered = np.zeros((cameras, len(joints)), np.bool_)
+    uncovered = asked.copy()
     for c in range(cameras):
         for body in range(len(joints)):
+            if not asked[c, body]:
+                continue
             for detection in range(detections):
                 on = 0
                 for k in range(count):
@@ -167,9 +171,9 @@ def find_covered_bodies(
                             on += 1
                             break
                 if on >= MIN_COVERED_JOINTS:
-                    covered[c, body] = True
+                    uncovered[c, body] = False
                     break
-    return covered
+    return uncovered
 
 
 class CameraGates:

@@ -106,7 +106,9 @@ def test_a_track_of_two_intervals_has_the_equations_of_both(track):
 
     moved = replace(pose, transl=pose.transl + [0.05, 0.0, 0.0])
     apart = [equations([each], made.evidence) for each in (pose, moved)]
-    both = Evidence.concatenate([made.evidence, made.evidence])
+    both = Evidence(
+        np.concatenate([made.evidence.joints] * 2), np.concatenate([made.evidence.information] * 2)
+    )
     joined = equations([pose, moved], both, starts=(5,))
     for name, axis in (("blocks", 1), ("gradient", 0), ("border", 0)):
         expected = np.concatenate([getattr(each, name) for each in apart], axis=axis)

@@ -10,7 +10,7 @@ from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.pair_births import (
     CameraGates,
     CameraVisibility,
-    find_covered_bodies,
+    find_uncovered_bodies,
     group_pairs,
     judge_pairs,
 )
@@ -169,8 +169,13 @@ def test_detection_that_lies_on_the_person_excuses_a_camera(people):
     toward = np.array(THIRD) - [0.0, 0.0, 1.0]
     before = body + 0.1 * toward * [1.0, 1.0, 1.0]
     directions, weights = rays_of(cameras, np.concatenate([body, before]), [[1, 0], [1, 0], [0, 1]])
-    covered = find_covered_bodies(body, cameras.center, directions, weights)
-    assert covered[:, 0].tolist() == [True, True, True]
+    everywhere = np.ones((3, 1), dtype=bool)
+    uncovered = find_uncovered_bodies(everywhere, body, cameras.center, directions, weights)
+    assert uncovered[:, 0].tolist() == [False, False, False]
+    # A detection covers less than all of a body 3 m aside, and only in the cameras asked about.
+    aside, asked = body + [3.0, 3.0, 0.0], np.array([[True], [False], [True]])
+    uncovered = find_uncovered_bodies(asked, aside, cameras.center, directions, weights)
+    assert uncovered[:, 0].tolist() == [True, False, True]
     two = rig(*HIGH)
     judged = judge(cameras, directions, weights, known_sight(cameras))
     pair = judged.find(np.array([0, 0, -1]))
