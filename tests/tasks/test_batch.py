@@ -59,7 +59,7 @@ def test_what_may_pass_is_tried_again_and_what_is_there_is_not(works, monkeypatc
 
     def compute(work):
         tried.append(work.recipe.unit)
-        if work.recipe.unit == "c" or tried.count("b") == 1 and work.recipe.unit == "b":
+        if work.recipe.unit == "c" or (tried.count("b") == 1 and work.recipe.unit == "b"):
             raise StoreError("no space")
 
     monkeypatch.setattr(Store, "has", lambda self, match, stage, unit, key: unit == "a")

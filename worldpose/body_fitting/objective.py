@@ -156,9 +156,7 @@ class Evidence:
         seen = np.asarray(np.isfinite(points).all(-1))
         spread = (settings.ray_std_m * JOINT_SPREAD) ** 2 + settings.min_joint_std_m**2
         spread *= 1.0 + settings.noise_time_s * fps
-        information[rows] += np.where(
-            seen[..., None, None], across / spread[:, None, None], 0.0
-        )
+        information[rows] += np.where(seen[..., None, None], across / spread[:, None, None], 0.0)
         # From the point on the line towards the known joint; a lone line has no force along
         # itself.
         away = np.where(np.isfinite(joints[rows]), joints[rows], points) - points
