@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from itertools import pairwise
 from statistics import median
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from pydantic import JsonValue
@@ -31,7 +31,6 @@ from flows.iterate import Iteration, Iterations, iterate_match
 from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_match
-from flows.results.comparison import KINDS, Mark, compare_runs, count_marks
 from flows.review.advice import click_advice, clock_advice
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
@@ -40,6 +39,9 @@ from flows.running import RunRequest, run_match
 from flows.settings import parse_overrides, selected_stages
 from worldpose.errors import UsageError
 from worldpose.store import Store
+
+if TYPE_CHECKING:
+    from flows.results.comparison import Mark
 
 EXIT_CODES = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
 MAX_LISTED = 5
@@ -269,6 +271,9 @@ def figures_of(iteration: Iteration) -> dict[str, float | None]:
 
 def marks_of(store: Store, found: Iterations) -> list[dict[str, str]]:
     """Compare cameras, clips and players of each iteration with the iteration before."""
+    # Imported here: it takes 0.7 s, before Prefect and Dask can start, and few runs iterate.
+    from flows.results.comparison import KINDS, compare_runs, count_marks
+
     marks: list[dict[str, str]] = [{}]
     for before, after in pairwise(found.passes):
         changes = compare_runs(store, before.record, after.record)
@@ -306,7 +311,8 @@ def print_iterations(store: Store, found: Iterations) -> None:
         for name in columns[0]
     ]
     marks = marks_of(store, found)
-    rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in KINDS]
+    kinds = dict.fromkeys(kind for each in marks for kind in each)
+    rows += [(f"{kind}: b/w/m/u", *(each.get(kind, "") for each in marks)) for kind in kinds]
     heads = [f"{each.number} (run {each.record.run_id})" for each in found.passes]
     print_table("iterations", ("metric", *heads), rows)
     line("b/w/m/u: better, worse, mixed, unchanged against the iteration before (worldpose diff)")

@@ -262,6 +262,28 @@ def start_poses(
     return pelvis - rest[0], orient, coordinates
 
 
+def level_feet(rotations: Floats, clear: Floats) -> Floats:
+    """Return rotations of feet relative to their shanks (frames, 3, 3): flat where they stand.
+
+    Args:
+        rotations: (frames, 3, 3) rotations of the shank, world.
+        clear: (frames,) [m], height of the ankle above that of a flat foot; a foot 0.15 m up or on
+            a horizontal shank hangs as in the unposed body.
+    """
+    forward = rotations[..., 2].copy()
+    forward[..., 2] = 0.0
+    length = np.linalg.norm(forward, axis=-1, keepdims=True)
+    forward /= np.maximum(length, 1e-9)
+    up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
+    flat = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    upright = np.clip((rotations[:, 2, 1] - 0.25) / 0.35, 0.0, 1.0)
+    share = upright * np.clip(1.0 - clear / 0.15, 0.0, 1.0) * (length[:, 0] > 0.1)
+    mixed = share[:, None, None] * flat + (1.0 - share)[:, None, None] * rotations
+    u, _, vt = np.linalg.svd(mixed)
+    turned: Floats = rotations.swapaxes(-1, -2) @ u @ vt
+    return turned
+
+
 def cross(first: Floats, second: Floats) -> Floats:
     """Return the cross products (..., 3); for few vectors `np.cross` takes far longer."""
     after, before = (1, 2, 0), (2, 0, 1)

@@ -36,10 +36,14 @@ from worldpose.body_fitting.objective import (
     ankle_height,
     body_axes,
     find_contacts,
-    level_feet,
     propagate,
 )
-from worldpose.body_fitting.pose_space import PosePrior, interpolate_gaps, start_poses
+from worldpose.body_fitting.pose_space import (
+    PosePrior,
+    interpolate_gaps,
+    level_feet,
+    start_poses,
+)
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import map_in_threads
 from worldpose.errors import DegenerateError

@@ -192,7 +192,8 @@ def _median(values: Floats, count: int) -> float:
             values[place] = values[place - 1]
             place -= 1
         values[place] = value
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
+    low, high = values[(count - 1) // 2], values[count // 2]
+    return float(0.5 * (low + high))
 
 
 @compile_kernel

@@ -110,3 +110,15 @@ def test_a_sighting_is_replaced_or_taken_out_alone():
     assert len(kept) == FRAMES
     assert 6 not in kept
     assert [kept[frame].index[0] for frame in (4, 5, 7, FRAMES)] == [4, 500, 7, FRAMES]
+
+
+@pytest.mark.parametrize("known", [17, 16, 2, 1])
+def test_unseen_joints_move_by_the_median_of_the_seen_ones(known):
+    rng = np.random.default_rng(known)
+    pose, motion = rng.normal(size=(17, 3)), rng.normal(size=(17, 3))
+    joints = np.where(np.arange(17)[:, None] < known, pose + motion, np.nan)
+    person = Person(0, pose, 0)
+    person.see(1, sighting(joints), FPS, SETTINGS)
+    middle = np.median(motion[:known], axis=0)
+    np.testing.assert_allclose(person.pose[:known], joints[:known])
+    np.testing.assert_allclose(person.pose[known:], pose[known:] + middle, rtol=1e-12)
