@@ -40,7 +40,7 @@ MOST_TASKS: Final = 200
 """Tasks per stage; more units share tasks. Prefect needs 0.05 s of CPU time per task."""
 TASKS_EACH: Final = 20
 """Tasks per worker if many units share tasks, so that no worker waits long for the last one [1]."""
-TASK_SECONDS: Final = 3.0
+TASK_SECONDS: Final = 6.0
 """Processor time of a task whose units would take less than a second each [s]."""
 
 

@@ -16,8 +16,9 @@ from worldpose.errors import WorldposeError
 if TYPE_CHECKING:
     from flows.orchestration.private_cluster import PrivateCluster
 
-START_WORK_SECONDS = 9.0
-"""Processor time that the start of a worker takes [s]."""
+START_WORK_SECONDS = 18.0
+"""Processor time of units that one worker completes, two at a time, while another one starts, which
+takes 9 s [s]."""
 STILL_SECONDS = 0.8
 """Processor time of a camera from clicks and its still [s]."""
 KEEP_SECONDS = 5.0

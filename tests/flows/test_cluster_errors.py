@@ -87,7 +87,8 @@ def test_workers_get_large_arrays_in_huge_pages(monkeypatch):
     ("units", "workers"),
     [
         (17 * [("ingest", {"frame_count": 3000})] + 16 * [("static_calibration", {})], 1),
-        (16 * [("static_calibration", {"still": "stills/cam00.png"})], 3),
+        (16 * [("static_calibration", {"still": "stills/cam00.png"})], 1),
+        (30 * [("static_calibration", {"still": "stills/cam00.png"})], 3),
         (6 * [("static_calibration", {"still": "stills/cam00.png"})], 1),
         (2 * [("ingest", {"frame_count": 3000, "video": {"path": "videos/cam00.mp4"}})], 2),
         (16 * [("ingest", {"frame_count": 270_000})], 3),

@@ -46,7 +46,8 @@ def test_many_units_share_as_many_tasks_as_keep_all_workers_busy(workers, tasks)
 @pytest.mark.parametrize(
     ("seconds", "workers", "tasks"),
     [
-        (17 * [0.35], 1, 2),
+        (17 * [0.35], 1, 1),
+        (17 * [0.8], 1, 3),
         (17 * [0.35], 4, 4),
         (3 * [0.35], 4, 3),
         (17 * [14.0], 1, 17),

@@ -19,6 +19,7 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
+from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.detection_files import read_boxes
@@ -103,8 +104,9 @@ def write_match(
             for name, record in records.items():
                 (building / name).parent.mkdir(parents=True, exist_ok=True)
                 (building / name).write_text(record.model_dump_json(indent=2) + "\n", "utf-8")
-            for camera_id, picture in stills.items():
-                write_still(building / _still_name(spec, camera_id), picture)
+            files = [(building / _still_name(spec, name), image) for name, image in stills.items()]
+            for _ in map_in_threads(lambda still: write_still(*still), files):
+                pass
             if further is not None:
                 further(building)
             read_match(building)
