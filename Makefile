@@ -11,7 +11,10 @@ FIRST := .venv/first
 FIRST_RUN = rm -rf $(FIRST)/$(1) && $(BIN)/worldpose simulate --scenario tiny $(2) --out $(FIRST)/$(1)/match && \
   $(BIN)/worldpose run $(FIRST)/$(1)/match --project $(FIRST)/$(1)/project $(3)
 GIVEN = $(call FIRST_RUN,given,--duration 0.5 --calibrated --no-stills)
-STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration)
+STILLS = $(call FIRST_RUN,stills,--duration 0.2,--until static_calibration) && $(IMPORTS)
+# What other commands and stages import, for its bytecode, while the longer run still compiles.
+IMPORTS = $(BIN)/python -c 'import flows.reports.report, flows.results.evaluation, onnxruntime, worldpose.detection.bundled_pose, \
+  tasks.broadcast_calibration, tasks.detection, tasks.refitting'
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
