@@ -104,8 +104,11 @@ def write_match(
             for name, record in records.items():
                 (building / name).parent.mkdir(parents=True, exist_ok=True)
                 (building / name).write_text(record.model_dump_json(indent=2) + "\n", "utf-8")
-            files = [(building / _still_name(spec, name), image) for name, image in stills.items()]
-            for _ in map_in_threads(lambda still: write_still(*still), files):
+
+            def write(camera_id: str) -> None:
+                write_still(building / _still_name(spec, camera_id), stills[camera_id])
+
+            for _ in map_in_threads(write, stills):
                 pass
             if further is not None:
                 further(building)
