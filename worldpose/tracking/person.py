@@ -181,22 +181,6 @@ class Person:
 
 
 @compile_kernel
-def _median(values: Floats, count: int) -> float:
-    """Return the median of the first `count` values, which are sorted in place.
-
-    Insertion: for 17 values `np.median` takes as long as all else that a person needs in a frame.
-    """
-    for end in range(1, count):
-        value, place = values[end], end
-        while place > 0 and values[place - 1] > value:
-            values[place] = values[place - 1]
-            place -= 1
-        values[place] = value
-    low, high = values[(count - 1) // 2], values[count // 2]
-    return float(0.5 * (low + high))
-
-
-@compile_kernel
 def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Floats, bool]:
     """Update a pose with the joints of a new frame, which are NaN where unknown.
 
@@ -204,19 +188,18 @@ def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Float
         The pose, in which known joints are replaced and the others shifted by the median motion of
         the known ones; this shift (3,); whether any joint is known.
     """
-    both, known = np.empty((3, len(pose))), False
+    both, known = np.empty((len(pose), 3)), False
     count = 0
     for joint in range(len(pose)):
         if not math.isnan(joints[joint, 0]):
             known = True
             if not math.isnan(pose[joint, 0]):
-                for axis in range(3):
-                    both[axis, count] = joints[joint, axis] - pose[joint, axis]
+                both[count] = joints[joint] - pose[joint]
                 count += 1
     shift = np.zeros(3)
     if move and count:
         for axis in range(3):
-            shift[axis] = _median(both[axis], count)
+            shift[axis] = np.median(both[:count, axis])
     out = pose + shift
     for joint in range(len(pose)):
         if not math.isnan(joints[joint, 0]):
