@@ -129,6 +129,7 @@ def _track_people(store: Store, work: Work) -> Tracked:
         settings,
         pitch_size=None if pitch is None else (pitch.length, pitch.width),
         people=sources["people"],
+        camera_covariance=clip.camera_covariance,
     )
     found = Identities(
         frame=clip.detections.frame,

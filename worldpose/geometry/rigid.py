@@ -145,7 +145,7 @@ class Rigid:
         Raises:
             InputError: the last dimension is not 6.
         """
-        motion = check_shape("Rigid.updated: delta", delta, (6,))
+        motion = check_shape("Rigid.retract: delta", delta, (6,))
         return Rigid.from_rotvec(motion[..., :3], motion[..., 3:]) @ self
 
     def __getitem__(self, index: Index) -> Rigid:

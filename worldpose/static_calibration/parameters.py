@@ -21,7 +21,7 @@ from worldpose.geometry.projection import fold_squared, project_with_jacobians
 
 PARAMETERS: Final = CAMERA_STEP
 """Steps of a camera: rotation about its center [rad] and shift [m] in its own axes
-(`Rigid.update`), the logarithm of the focal length, principal point [px], distortion [1]."""
+(`Rigid.retract`), the logarithm of the focal length, principal point [px], distortion [1]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from data_contracts.tracking import Join, Track
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
+from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.tracking.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, Takeover, lasting_takeovers
 from worldpose.tracking.people_selection import join_people
@@ -26,6 +29,12 @@ from worldpose.tracking.settings import TrackingSettings
 JOINTS = len(COCO17)
 BLOCK = 64
 """Frames read and converted to rays at a time: bounds memory, not the result."""
+ADULT_HEIGHT, MIDDLE_HEIGHT = 1.75, 1.0
+"""Height of an adult, and of the middle of a body, over the pitch [m]."""
+FARTHEST: Final = 150.0
+"""Distance of a person in a pixel whose ray does not meet that height before [m]."""
+CELLS: Final = (32, 18)
+"""Columns and rows of the parts of an image with one weight."""
 
 
 class TrackingReport(Record):
@@ -93,6 +102,7 @@ def track_people(
     *,
     pitch_size: tuple[float, float] | None = None,
     people: int | None = None,
+    camera_covariance: Floats | None = None,
 ) -> Tracking:
     """Return the person to which every camera's detections belong, in all frames.
 
@@ -112,6 +122,8 @@ def track_people(
         pitch_size: length and width of the pitch around the origin [m], on which people stand at
             z = 0; None = they may be anywhere.
         people: most people at once; None = any number.
+        camera_covariance: (cameras, 12, 12) covariance of the calibration on a pitch, by
+            `static_calibration.parameters.PARAMETERS`; None = all cameras are equally accurate.
 
     Raises:
         InputError: the shapes do not fit together.
@@ -130,6 +142,9 @@ def track_people(
         )
     tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
+    by_place = None
+    if camera_covariance is not None and pitch_size is not None:
+        by_place = pixel_weights(cameras, camera_covariance)
 
     def read(start: int) -> tuple[int, Floats, Floats]:
         """Return the first frame of a block, and its rays and their weights."""
@@ -140,6 +155,12 @@ def track_people(
         seen = np.isfinite(directions[..., 0]) & (weights > 0.0)
         # The accuracy of an angle is a pixel over the focal length.
         weights *= (cameras.focal**2).mean(axis=-1)[:, None, None]
+        if by_place is not None:
+            count = np.maximum(np.count_nonzero(seen, axis=-1), 1)[..., None]
+            middle = np.where(seen[..., None], image, 0.0).sum(axis=-2) / count
+            cell = middle / cameras.image_size[:, None] * CELLS
+            column, row = np.moveaxis(np.clip(cell, 0, np.array(CELLS) - 1).astype(np.int64), -1, 0)
+            weights *= by_place[np.arange(len(by_place))[:, None], row, column][..., None]
         weights[~seen] = 0.0
         return start, np.where(seen[..., None], directions, np.nan), weights
 
@@ -152,6 +173,35 @@ def track_people(
             if progress is not None:
                 progress(start + offset + 1, frames)
     return _build_result(tracker, frames, pitch_size)
+
+
+def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:
+    """Return the weight (cameras, rows, columns) of people's keypoints in parts of the images [1].
+
+    It is the inverse of a keypoint's variance: its own (`feet.PIXEL_STD`, `feet.PIXEL_SHARE`) and
+    the calibration's. A camera whose clicks lie in one half of its image can be wrong by tens of
+    pixels in the other, and people there are often near: with the same weight per pixel as in other
+    cameras, it alone places them.
+
+    Args:
+        cameras: batch (cameras,).
+        covariance: (cameras, 12, 12), by `static_calibration.parameters.PARAMETERS`.
+    """
+    columns, rows = CELLS
+    grid = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1)
+    weights = np.empty((len(covariance), rows, columns))
+    for c in range(len(covariance)):
+        camera = cameras[c]
+        rays = camera.unproject((grid / CELLS * camera.image_size).reshape(-1, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (MIDDLE_HEIGHT - rays.origins[:, 2]) / rays.directions[:, 2]
+        along = np.where((along > 0.0) & (along < FARTHEST), along, FARTHEST)
+        _, by_step = project_with_jacobian(camera, rays.origins + along[:, None] * rays.directions)
+        moved = 0.5 * np.einsum("nij,jk,nik->n", by_step, covariance[c], by_step)
+        own = (PIXEL_STD + PIXEL_SHARE * ADULT_HEIGHT * camera.focal.mean() / along) ** 2
+        variance = own + np.where(np.isfinite(moved), moved, 0.0)
+        weights[c] = (PIXEL_STD**2 / variance).reshape(rows, columns)
+    return weights
 
 
 def _build_result(

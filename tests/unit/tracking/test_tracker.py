@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -5,8 +7,10 @@ from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
+from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
+from worldpose.tracking.tracker import pixel_weights
 
 detections = KeypointDetections.from_keypoints
 
@@ -343,3 +347,45 @@ def test_a_fall_is_followed_though_it_leaves_the_prediction(ring, people, seen):
     result = track_people(ring(4), detections(*seen(ring(4), joints)), FPS, SETTINGS)
     assert owners(result) == [0]
     assert (result.detection_index >= 0).all()
+
+
+def test_weights_are_the_inverse_of_the_keypoints_variance_and_the_calibrations(ring):
+    cameras, covariance = ring(4), np.zeros((4, 12, 12))
+    exact = pixel_weights(cameras, covariance)
+    for name in ("cx", "cy"):
+        covariance[2, PARAMETERS.index(name), PARAMETERS.index(name)] = 36.0  # [px^2]
+    shifted = pixel_weights(cameras, covariance)
+    # In the image's middle people are 29 m away, where 1.75 m have 90 px: 1 + 0.02 * 90 px.
+    distance = np.linalg.norm(cameras.center[2]) * (1.0 - 1.0 / cameras.center[2, 2])
+    own = 1.0 + 0.02 * 1.75 * 1500.0 / distance
+    middle = (2, slice(8, 10), slice(15, 17))
+    assert exact[middle].mean() == pytest.approx(1.0 / own**2, rel=0.05)
+    assert shifted[middle].mean() == pytest.approx(1.0 / (own**2 + 36.0), rel=0.05)
+    assert np.array_equal(np.delete(shifted, 2, axis=0), np.delete(exact, 2, axis=0))
+
+
+def test_camera_with_an_uncertain_calibration_does_not_drag_people(ring, people, seen):
+    right, angle = ring(4), 0.012
+    keypoints, confidence = seen(right, still(people))
+    turned = np.zeros((4, 6))
+    turned[1, 1] = angle
+    given = replace(right, cam_from_world=right.cam_from_world.retract(turned))
+    covariance = np.zeros((4, 12, 12))
+    covariance[1, 1, 1] = angle**2
+    truth = people(PLACES)
+
+    def errors(stated):
+        result = track_people(
+            given,
+            detections(keypoints, confidence),
+            FPS,
+            SETTINGS,
+            pitch_size=(105.0, 68.0),
+            camera_covariance=stated,
+        )
+        assert len(result.tracks) == len(PLACES)
+        order = [owners(result).index(n) for n in range(len(PLACES))]
+        return np.linalg.norm(result.joints[5:, order] - truth, axis=-1).mean()
+
+    assert errors(None) > 0.05
+    assert errors(covariance) < 0.5 * errors(None)
