@@ -380,10 +380,11 @@ def write_group(
             else:
                 files[path] = _write_shard(folder / path, array, values[part], values.shape)
             release_memory(values)
+    # Zarr warns that other readers may ignore it, as the format allows. Not in `catch_warnings`,
+    # whose end in one thread would end it in others, which write at the same time.
+    warnings.filterwarnings("ignore", "Consolidated metadata", ZarrUserWarning)
     # If another process has removed files meanwhile, their number reveals it.
-    with suppress(FileNotFoundError), warnings.catch_warnings():
-        # Zarr warns that other readers may ignore it, as the format allows.
-        warnings.simplefilter("ignore", ZarrUserWarning)
+    with suppress(FileNotFoundError):
         # For readers that open the folder themselves: they list it otherwise, and warn.
         zarr.consolidate_metadata(group.store)
     return files

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import ClipArray, Floats, Singles
+from data_contracts.arrays import ClipArray, Floats, Integers, Singles
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
-from worldpose.compiled import map_in_threads
+from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
@@ -142,27 +142,19 @@ def track_people(
         )
     tracker = FrameTracker(cameras, fps, pitch_size is not None, people, settings)
     frames = confidence.shape[0]
-    by_place = None
+    # The accuracy of an angle is a pixel over the focal length.
+    precision = (cameras.focal**2).mean(axis=-1)[:, None, None]
     if camera_covariance is not None and pitch_size is not None:
-        by_place = pixel_weights(cameras, camera_covariance)
+        precision = precision * pixel_weights(cameras, camera_covariance)
 
     def read(start: int) -> tuple[int, Floats, Floats]:
         """Return the first frame of a block, and its rays and their weights."""
-        image = np.asarray(keypoints[start : start + BLOCK], dtype=np.float64)
+        image = np.array(keypoints[start : start + BLOCK], dtype=np.float64, order="C")
         weights = np.array(confidence[start : start + BLOCK], dtype=np.float64, order="C")
         directions = cameras.unproject(image.reshape(*image.shape[:2], -1, 2)).directions
-        directions = directions.reshape(*image.shape[:-1], 3)
-        seen = np.isfinite(directions[..., 0]) & (weights > 0.0)
-        # The accuracy of an angle is a pixel over the focal length.
-        weights *= (cameras.focal**2).mean(axis=-1)[:, None, None]
-        if by_place is not None:
-            count = np.maximum(np.count_nonzero(seen, axis=-1), 1)[..., None]
-            middle = np.where(seen[..., None], image, 0.0).sum(axis=-2) / count
-            cell = middle / cameras.image_size[:, None] * CELLS
-            column, row = np.moveaxis(np.clip(cell, 0, np.array(CELLS) - 1).astype(np.int64), -1, 0)
-            weights *= by_place[np.arange(len(by_place))[:, None], row, column][..., None]
-        weights[~seen] = 0.0
-        return start, np.where(seen[..., None], directions, np.nan), weights
+        directions = np.array(directions.reshape(*image.shape[:-1], 3))
+        _weigh(weights, directions, image, cameras.image_size, precision)
+        return start, directions, weights
 
     # The next blocks are read while the frames of one are tracked.
     for start, directions, weights in map_in_threads(read, range(0, frames, BLOCK)):
@@ -173,6 +165,44 @@ def track_people(
             if progress is not None:
                 progress(start + offset + 1, frames)
     return _build_result(tracker, frames, pitch_size)
+
+
+@compile_kernel
+def _weigh(
+    weights: Floats, directions: Floats, image: Floats, size: Integers, precision: Floats
+) -> None:
+    """Multiply confidences by the precision in the part of the image where the person is.
+
+    Args:
+        weights: (frames, cameras, detections, joints), the confidences; 0 where not seen
+            afterwards.
+        directions: (frames, cameras, detections, joints, 3); NaN where not seen afterwards.
+        image: (frames, cameras, detections, joints, 2) [px].
+        size: (cameras, 2) [px].
+        precision: (cameras, rows, columns), of angles.
+    """
+    frames, cameras, detections, joints = weights.shape
+    _, rows, columns = precision.shape
+    for frame in range(frames):
+        for c in range(cameras):
+            for detection in range(detections):
+                x, y, count = 0.0, 0.0, 0
+                for joint in range(joints):
+                    place = (frame, c, detection, joint)
+                    # Also False for NaN.
+                    if weights[place] > 0.0 and directions[place][0] >= -1.0:
+                        x, y = x + image[place][0], y + image[place][1]
+                        count += 1
+                    else:
+                        weights[place] = 0.0
+                        directions[place][:] = math.nan
+                if count:
+                    column = int(x / count / size[c, 0] * columns)
+                    row = int(y / count / size[c, 1] * rows)
+                    column = min(max(column, 0), columns - 1)
+                    row = min(max(row, 0), rows - 1)
+                    for joint in range(joints):
+                        weights[frame, c, detection, joint] *= precision[c, row, column]
 
 
 def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:

@@ -6,7 +6,6 @@ estimated from tracks (`estimate_clocks`).
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -473,9 +472,10 @@ class _Table:
             others = self._total(drawn, camera, late, order)
             best = int(np.nanargmax(own))
             late[camera] = self.shifts[best]
-            with warnings.catch_warnings():  # shifts that no draw has are no candidates
-                warnings.simplefilter("ignore", RuntimeWarning)
-                error = np.nanstd(others[:, best, None] - others, axis=0)
+            change = others[:, best, None] - others
+            drawn_once = np.isfinite(change).any(axis=0)  # other shifts are no candidates
+            error = np.full(len(self.shifts), np.nan)
+            error[drawn_once] = np.nanstd(change[:, drawn_once], axis=0)
             likely = self.shifts[own[best] - own <= LIKELY * error + 1e-9]
             span[camera] = float(np.abs(likely - self.shifts[best]).max(initial=0))
             if span[camera] > MAX_SPAN:

@@ -95,6 +95,13 @@ def test_writers_in_many_threads_give_the_same_files(
         assert all(each == alone for each in pool.map(write_one, "abcd"))
 
 
+def test_writers_in_many_threads_show_no_warnings_of_zarr(tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as shown, ThreadPoolExecutor(4) as pool:
+        warnings.simplefilter("always")
+        list(pool.map(write, (tmp_path / str(n) for n in range(40))))
+    assert not [str(each.message) for each in shown if "onsolidated" in str(each.message)]
+
+
 def test_sign_and_payload_of_nan_do_not_change_the_files(tmp_path: Path) -> None:
     joints = all_sample_arrays()["joints"]
     joints[np.isnan(joints)] = np.uint64(0xFFF8000000000123).view(np.float64)
