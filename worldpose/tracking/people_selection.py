@@ -8,6 +8,9 @@ Bystanders are never on the pitch or near it (D2, in 3D). A single camera locate
 with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
 track to centimetres, and so distinguish people waiting behind the lines from players.
 
+A duplicate is a second track of a person, of detections that the first one lost for a moment. Two
+bodies are never as near to each other.
+
 A shadow is a false track that follows a person in a few of the cameras that see the person. If a
 detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
 of the cameras that see a person also see a real person so near; they do not see a shadow.
@@ -52,6 +55,8 @@ def join_people(
         chains: each person's tracks in time order.
     """
     settings = tracker.settings
+    tracks, merged = merge_duplicates(tracks, settings.merge_distance_m)
+    tracker.merged += merged
     sure = drop_shadows(tracks, settings.shadow_distance_m)
     sure = drop_bystanders(sure, pitch_size, settings.pitch_margin_m)
     limited = limit_people(sure, tracker.people)
@@ -137,6 +142,35 @@ class LocatedFrames:
     views: Integers
 
 
+def merge_duplicates(people: list[Person], distance: float) -> tuple[list[Person], int]:
+    """Return the people without second tracks, whose detections the first ones take over.
+
+    Args:
+        people: the clip's tracks; changed.
+        distance: between bodies, below which two are one [m], in most frames of the shorter track.
+
+    Returns:
+        The other people, and the number of duplicates.
+    """
+    seen = {person.number: located_frames(person) for person in people}
+    by_length = sorted(people, key=lambda person: (len(seen[person.number].frame), -person.number))
+    left = list(people)
+    for place, person in enumerate(by_length):
+        own = seen[person.number]
+        for other in reversed(by_length[place + 1 :]):
+            if len(own.frame) and _is_beside(own, seen[other.number], distance):
+                other.absorb(person, int(own.frame[0]))
+                left.remove(person)
+                break
+    return left, len(people) - len(left)
+
+
+def _is_beside(track: LocatedFrames, other: LocatedFrames, distance: float) -> bool:
+    """Return whether a track is so near to another in most of its frames."""
+    near = np.count_nonzero(_common_distances(track, other)[2] < distance)
+    return bool(near >= MIN_SHADOW_SHARE * len(track.frame))
+
+
 def drop_shadows(people: list[Person], distance: float) -> list[Person]:
     """Return the people without those nearly always close to a person seen by far more cameras.
 
@@ -170,18 +204,28 @@ def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distanc
     """Return the frames (frames,) in which a person seen by far more cameras is this close."""
     beside = np.zeros(len(track.frame), dtype=np.bool_)
     for other in others:
-        _, mine, theirs = np.intersect1d(
-            track.frame, other.frame, assume_unique=True, return_indices=True
-        )
+        mine, theirs, apart = _common_distances(track, other)
         fewer = track.views[mine] <= MAX_VIEW_SHARE * other.views[theirs]
-        mine, theirs = mine[fewer], theirs[fewer]
-        apart = track.joints[mine] - other.joints[theirs]
-        known = np.isfinite(apart[..., 0])
-        total = np.where(known[..., None], apart, 0.0).sum(axis=1)
-        count = known.sum(axis=1)
-        # Of bodies, not of joints: a shadow's joints are another person's, or mix two people's.
-        beside[mine] |= np.linalg.norm(total, axis=1) < distance * count
+        beside[mine] |= fewer & (apart < distance)
     return beside
+
+
+def _common_distances(
+    track: LocatedFrames, other: LocatedFrames
+) -> tuple[Integers, Integers, Floats]:
+    """Return the frames of two tracks that both have, by place in each, and the distances [m].
+
+    Of bodies, not of joints: a shadow's joints are another person's, or mix two people's. Infinite
+    without a common joint.
+    """
+    _, mine, theirs = np.intersect1d(
+        track.frame, other.frame, assume_unique=True, return_indices=True
+    )
+    apart = track.joints[mine] - other.joints[theirs]
+    known = np.isfinite(apart[..., 0])
+    total = np.linalg.norm(np.where(known[..., None], apart, 0.0).sum(axis=1), axis=1)
+    count = known.sum(axis=1)
+    return mine, theirs, np.where(count > 0, total / np.maximum(count, 1), np.inf)
 
 
 def located_frames(person: Person) -> LocatedFrames:

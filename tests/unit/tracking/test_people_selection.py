@@ -12,6 +12,7 @@ from worldpose.tracking.people_selection import (
     drop_shadows,
     join_people,
     limit_people,
+    merge_duplicates,
 )
 from worldpose.tracking.person import Person, Sighting
 
@@ -259,3 +260,34 @@ def test_tracking_keeps_a_player_who_fetches_the_ball(ring, people, seen, margin
     assert len(result.tracks) == 1
     assert result.tracks[0].frames_seen == np.count_nonzero(~unseen)
     assert result.report.dropped == 0
+
+
+@pytest.mark.parametrize(("near", "left"), [(0.7, [0]), (0.68, [0, 1])])
+def test_a_track_at_another_in_seven_tenths_of_its_frames_is_the_same_person(near, left):
+    first = track(0, (0, 3), 0.0)
+    second = track(1, (1, 2), np.where(np.arange(50) < near * 50, 0.19, 0.3))
+    people, merged = merge_duplicates([first, second], distance=0.2)
+    assert [person.number for person in people] == left
+    assert merged == 2 - len(left)
+
+
+def test_the_longer_track_takes_over_detections_that_it_lacks():
+    short, long = track(0, (1, 2), 0.1, views=CAMERAS), track(1, (0, 3), 0.0, views=4)
+    assert merge_duplicates([short, long], distance=0.2) == ([long], 1)
+    views = [np.count_nonzero(long.sightings[frame].index >= 0) for frame in (49, 50, 99, 100)]
+    assert views == [4, CAMERAS, CAMERAS, 4]
+    np.testing.assert_allclose(long.sightings[60].joints, BODY, atol=1e-6)
+
+
+def test_people_side_by_side_and_tracks_of_other_times_are_no_duplicates():
+    tracks = [track(0, (0, 3), 0.0), track(1, (0, 3), 0.25), track(2, (3, 4), 0.0)]
+    assert merge_duplicates(tracks, distance=0.2) == (tracks, 0)
+    assert merge_duplicates([], distance=0.2) == ([], 0)
+
+
+def test_a_duplicate_in_half_of_the_cameras_is_no_person():
+    def tracks():
+        return track(0, (0, 5), 0.0), track(1, (1, 1.4), 0.1, views=5)
+
+    assert found(*tracks()) == [[0]]
+    assert found(*tracks(), merge_distance_m=0.0) == [[0], [1]]
