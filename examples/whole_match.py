@@ -30,7 +30,8 @@ def main() -> None:
     covariance = np.stack([known.estimate.covariance for known in calibrations])
 
     seen = wp.KeypointDetections.stack([find_people(match, name) for name in names])
-    tracks = wp.track_people(cameras, seen, fps, pitch_size=(pitch.length, pitch.width))
+    extent = (pitch.length, pitch.width)
+    tracks = wp.track_people(cameras, seen, fps, pitch_size=extent, camera_covariance=covariance)
     people = seen.assign_people(tracks.detection_index)
     first = wp.reconstruct_joints(cameras, people, fps, camera_covariance=covariance)
 
