@@ -8,8 +8,8 @@ Bystanders are never on the pitch or near it (D2, in 3D). A single camera locate
 with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
 track to centimetres, and so distinguish people waiting behind the lines from players.
 
-A duplicate is a second track of a person, of detections that the first one lost for a moment. Two
-bodies are never as near to each other.
+A duplicate is a second track of a person, of detections that the first one lost for a moment. Both
+are at one place, and no camera shows both: cameras see two people beside each other apart.
 
 A shadow is a false track that follows a person in a few of the cameras that see the person. If a
 detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.tracking.frame_tracker import FrameTracker
@@ -134,12 +135,17 @@ class LocatedFrames:
     Attributes:
         frame: (frames,) rising.
         joints: (frames, 17, 3) [m], world; NaN where not determined.
-        views: (frames,) cameras that see it.
+        index: (frames, cameras) its detections; -1 = not seen.
     """
 
     frame: Integers
     joints: Floats
-    views: Integers
+    index: NDArray[np.int16]
+
+    @property
+    def views(self) -> Integers:
+        """(frames,) number of cameras that see it."""
+        return np.asarray(np.count_nonzero(self.index >= 0, axis=1))
 
 
 def merge_duplicates(people: list[Person], distance: float) -> tuple[list[Person], int]:
@@ -147,7 +153,8 @@ def merge_duplicates(people: list[Person], distance: float) -> tuple[list[Person
 
     Args:
         people: the clip's tracks; changed.
-        distance: between bodies, below which two are one [m], in most frames of the shorter track.
+        distance: between bodies, below which two can be one [m], in most frames of the shorter
+            track.
 
     Returns:
         The other people, and the number of duplicates.
@@ -156,19 +163,20 @@ def merge_duplicates(people: list[Person], distance: float) -> tuple[list[Person
     by_length = sorted(people, key=lambda person: (len(seen[person.number].frame), -person.number))
     left = list(people)
     for place, person in enumerate(by_length):
-        own = seen[person.number]
         for other in reversed(by_length[place + 1 :]):
-            if len(own.frame) and _is_beside(own, seen[other.number], distance):
-                other.absorb(person, int(own.frame[0]))
+            if _is_duplicate(seen[person.number], seen[other.number], distance):
+                other.absorb(person, min(person.sightings))
                 left.remove(person)
                 break
     return left, len(people) - len(left)
 
 
-def _is_beside(track: LocatedFrames, other: LocatedFrames, distance: float) -> bool:
-    """Return whether a track is so near to another in most of its frames."""
-    near = np.count_nonzero(_common_distances(track, other)[2] < distance)
-    return bool(near >= MIN_SHADOW_SHARE * len(track.frame))
+def _is_duplicate(track: LocatedFrames, other: LocatedFrames, distance: float) -> bool:
+    """Return whether a track is so near to another in most of its frames, in other cameras."""
+    mine, theirs, apart = _common_distances(track, other)
+    shared = ((track.index[mine] >= 0) & (other.index[theirs] >= 0)).any(axis=1)
+    near = np.count_nonzero(~shared & (apart < distance))
+    return bool(len(track.frame) > 0 and near >= MIN_SHADOW_SHARE * len(track.frame))
 
 
 def drop_shadows(people: list[Person], distance: float) -> list[Person]:
@@ -203,9 +211,10 @@ def is_shadow(chain: list[LocatedFrames], others: list[LocatedFrames], distance:
 def _near_better_seen(track: LocatedFrames, others: list[LocatedFrames], distance: float) -> Flags:
     """Return the frames (frames,) in which a person seen by far more cameras is this close."""
     beside = np.zeros(len(track.frame), dtype=np.bool_)
+    views = track.views
     for other in others:
         mine, theirs, apart = _common_distances(track, other)
-        fewer = track.views[mine] <= MAX_VIEW_SHARE * other.views[theirs]
+        fewer = views[mine] <= MAX_VIEW_SHARE * other.views[theirs]
         beside[mine] |= fewer & (apart < distance)
     return beside
 
@@ -233,8 +242,7 @@ def located_frames(person: Person) -> LocatedFrames:
     frames, index, _, joints = person.sightings.stack()
     order = np.argsort(frames)
     order = order[np.isfinite(joints[order, :, 0]).any(axis=1)]
-    views = np.count_nonzero(index[order] >= 0, axis=1)
-    return LocatedFrames(frames[order], joints[order].astype(np.float64), views)
+    return LocatedFrames(frames[order], joints[order].astype(np.float64), index[order])
 
 
 def people_at_births(people: list[Person]) -> dict[int, list[Person]]:

@@ -76,8 +76,9 @@ class TrackingSettings(Record):
     merge_distance_m: float = Field(default=0.2, ge=0, le=100)
     """Two tracks with mean joint distance below this are one person [m]: two bodies cannot be."""
     merge_time_s: float = Field(default=0.2, ge=1e-6, le=100)
-    """Time of such proximity after which tracks merge [s]. At the end of a clip, so do tracks with
-    such proximity in seven tenths of the shorter one's frames; not in causal mode."""
+    """Time of such proximity after which tracks merge [s]. At the end of a clip, so do tracks whose
+    bodies are so near in seven tenths of the shorter one's frames, where no camera shows both; not
+    in causal mode."""
     shadow_distance_m: float = Field(default=0.5, ge=0, le=100)
     """A track whose body is nearer than this to a person seen by two and a half times as many
     cameras, for seven tenths of its frames, is no person [m]; 0 keeps it. The whole person decides

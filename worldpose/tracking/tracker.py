@@ -227,6 +227,7 @@ def pixel_weights(cameras: Camera, covariance: Floats) -> Floats:
             along = (MIDDLE_HEIGHT - rays.origins[:, 2]) / rays.directions[:, 2]
         along = np.where((along > 0.0) & (along < FARTHEST), along, FARTHEST)
         _, by_step = project_with_jacobian(camera, rays.origins + along[:, None] * rays.directions)
+        # The mean over both axes of the image.
         moved = 0.5 * np.einsum("nij,jk,nik->n", by_step, covariance[c], by_step)
         own = (PIXEL_STD + PIXEL_SHARE * ADULT_HEIGHT * camera.focal.mean() / along) ** 2
         variance = own + np.where(np.isfinite(moved), moved, 0.0)

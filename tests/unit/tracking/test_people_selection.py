@@ -262,32 +262,53 @@ def test_tracking_keeps_a_player_who_fetches_the_ball(ring, people, seen, margin
     assert result.report.dropped == 0
 
 
+def in_cameras(person, cameras):
+    """Return the track with detections in these cameras alone."""
+    for frame, sighting in person.sightings.items():
+        index = np.where(np.isin(np.arange(CAMERAS), cameras), sighting.index, -1)
+        person.sightings[frame] = Sighting(index, sighting.ray_distance, sighting.joints)
+    return person
+
+
+LEFT, RIGHT = np.arange(CAMERAS)[: CAMERAS // 2], np.arange(CAMERAS)[CAMERAS // 2 :]
+
+
 @pytest.mark.parametrize(("near", "left"), [(0.7, [0]), (0.68, [0, 1])])
 def test_a_track_at_another_in_seven_tenths_of_its_frames_is_the_same_person(near, left):
-    first = track(0, (0, 3), 0.0)
-    second = track(1, (1, 2), np.where(np.arange(50) < near * 50, 0.19, 0.3))
+    first = in_cameras(track(0, (0, 3), 0.0), LEFT)
+    second = in_cameras(track(1, (1, 2), np.where(np.arange(50) < near * 50, 0.19, 0.3)), RIGHT)
     people, merged = merge_duplicates([first, second], distance=0.2)
     assert [person.number for person in people] == left
     assert merged == 2 - len(left)
 
 
 def test_the_longer_track_takes_over_detections_that_it_lacks():
-    short, long = track(0, (1, 2), 0.1, views=CAMERAS), track(1, (0, 3), 0.0, views=4)
+    short, long = track(0, (1, 2), 0.1), track(1, (0, 3), 0.0)
+    short, long = in_cameras(short, RIGHT), in_cameras(long, LEFT)
     assert merge_duplicates([short, long], distance=0.2) == ([long], 1)
     views = [np.count_nonzero(long.sightings[frame].index >= 0) for frame in (49, 50, 99, 100)]
-    assert views == [4, CAMERAS, CAMERAS, 4]
+    assert views == [len(LEFT), CAMERAS, CAMERAS, len(LEFT)]
     np.testing.assert_allclose(long.sightings[60].joints, BODY, atol=1e-6)
+
+
+def test_two_people_whom_a_camera_shows_at_once_are_no_duplicates():
+    first, second = track(0, (0, 3), 0.0), track(1, (1, 2), 0.1)
+    second = in_cameras(second, np.append(RIGHT, LEFT[0]))
+    tracks = [in_cameras(first, LEFT), second]
+    assert merge_duplicates(tracks, distance=0.2) == (tracks, 0)
 
 
 def test_people_side_by_side_and_tracks_of_other_times_are_no_duplicates():
     tracks = [track(0, (0, 3), 0.0), track(1, (0, 3), 0.25), track(2, (3, 4), 0.0)]
+    tracks = [in_cameras(tracks[0], LEFT), in_cameras(tracks[1], RIGHT), tracks[2]]
     assert merge_duplicates(tracks, distance=0.2) == (tracks, 0)
     assert merge_duplicates([], distance=0.2) == ([], 0)
 
 
 def test_a_duplicate_in_half_of_the_cameras_is_no_person():
     def tracks():
-        return track(0, (0, 5), 0.0), track(1, (1, 1.4), 0.1, views=5)
+        first, second = track(0, (0, 5), 0.0), track(1, (1, 1.4), 0.1)
+        return in_cameras(first, LEFT), in_cameras(second, RIGHT)
 
     assert found(*tracks()) == [[0]]
     assert found(*tracks(), merge_distance_m=0.0) == [[0], [1]]
