@@ -18,13 +18,15 @@ of the cameras that see a person also see a real person so near; they do not see
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers, Singles
+from worldpose.compiled import compile_kernel
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.joins import Candidate, choose_joins, join_costs
 from worldpose.tracking.person import Person
@@ -139,7 +141,7 @@ class LocatedFrames:
     """
 
     frame: Integers
-    joints: Floats
+    joints: Singles
     index: NDArray[np.int16]
 
     @property
@@ -227,14 +229,44 @@ def _common_distances(
     Of bodies, not of joints: a shadow's joints are another person's, or mix two people's. Infinite
     without a common joint.
     """
-    _, mine, theirs = np.intersect1d(
-        track.frame, other.frame, assume_unique=True, return_indices=True
-    )
-    apart = track.joints[mine] - other.joints[theirs]
-    known = np.isfinite(apart[..., 0])
-    total = np.linalg.norm(np.where(known[..., None], apart, 0.0).sum(axis=1), axis=1)
-    count = known.sum(axis=1)
-    return mine, theirs, np.where(count > 0, total / np.maximum(count, 1), np.inf)
+    return _body_distances(track.frame, track.joints, other.frame, other.joints)
+
+
+@compile_kernel
+def _body_distances(
+    frame: Integers, joints: Singles, other_frame: Integers, other_joints: Singles
+) -> tuple[Integers, Integers, Floats]:
+    """Return `_common_distances` of two tracks.
+
+    Args:
+        frame: (frames,) rising.
+        joints: (frames, 17, 3) [m], world; NaN where not determined.
+        other_frame: (others,) rising.
+        other_joints: (others, 17, 3) [m], world.
+    """
+    most = min(len(frame), len(other_frame))
+    mine, theirs, apart = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    count = a = b = 0
+    while a < len(frame) and b < len(other_frame):
+        if frame[a] < other_frame[b]:
+            a += 1
+        elif frame[a] > other_frame[b]:
+            b += 1
+        else:
+            x = y = z = 0.0
+            known = 0
+            for joint in range(joints.shape[1]):
+                step = joints[a, joint, 0] - np.float64(other_joints[b, joint, 0])
+                if not math.isnan(step):
+                    x += step
+                    y += joints[a, joint, 1] - np.float64(other_joints[b, joint, 1])
+                    z += joints[a, joint, 2] - np.float64(other_joints[b, joint, 2])
+                    known += 1
+            length = math.sqrt(x * x + y * y + z * z)
+            mine[count], theirs[count] = a, b
+            apart[count] = length / known if known else math.inf
+            a, b, count = a + 1, b + 1, count + 1
+    return mine[:count], theirs[:count], apart[:count]
 
 
 def located_frames(person: Person) -> LocatedFrames:
@@ -242,7 +274,7 @@ def located_frames(person: Person) -> LocatedFrames:
     frames, index, _, joints = person.sightings.stack()
     order = np.argsort(frames)
     order = order[np.isfinite(joints[order, :, 0]).any(axis=1)]
-    return LocatedFrames(frames[order], joints[order].astype(np.float64), index[order])
+    return LocatedFrames(frames[order], joints[order], index[order])
 
 
 def people_at_births(people: list[Person]) -> dict[int, list[Person]]:

@@ -145,11 +145,11 @@ class Person:
         """Update with the sighting in `frame`; undetermined joints follow the others."""
         self.sightings[frame] = sighting
         gain = 1.0 - math.exp(-1.0 / (fps * settings.velocity_time_s))
-        known = sighting.ray_distance[~np.isnan(sighting.ray_distance)]
-        # Not `mean`, which takes as long as all else here.
-        self.misfit += gain * (float(np.add.reduce(known) / len(known)) - self.misfit)
         elapsed = (frame - self.last_fixed) / fps
-        pose, shift, is_known = _shift_pose(self.pose, sighting.joints, elapsed > 0.0)
+        pose, shift, is_known, misfit = _shift_pose(
+            self.pose, sighting.joints, sighting.ray_distance, elapsed > 0.0
+        )
+        self.misfit += gain * (misfit - self.misfit)
         if not is_known:
             return
         if elapsed > 0.0:
@@ -181,12 +181,14 @@ class Person:
 
 
 @compile_kernel
-def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Floats, bool]:
+def _shift_pose(
+    pose: Floats, joints: Floats, ray_distance: Floats, move: bool
+) -> tuple[Floats, Floats, bool, float]:
     """Update a pose with the joints of a new frame, which are NaN where unknown.
 
     Returns:
         The pose, in which known joints are replaced and the others shifted by the median motion of
-        the known ones; this shift (3,); whether any joint is known.
+        the known ones; this shift (3,); whether any joint is known; the mean ray distance [m].
     """
     both, known = np.empty((len(pose), 3)), False
     count = 0
@@ -204,7 +206,11 @@ def _shift_pose(pose: Floats, joints: Floats, move: bool) -> tuple[Floats, Float
     for joint in range(len(pose)):
         if not math.isnan(joints[joint, 0]):
             out[joint] = joints[joint]
-    return out, shift, known
+    total, views = 0.0, 0
+    for c in range(len(ray_distance)):
+        if not math.isnan(ray_distance[c]):
+            total, views = total + ray_distance[c], views + 1
+    return out, shift, known, total / views
 
 
 @compile_kernel
