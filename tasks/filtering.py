@@ -109,7 +109,7 @@ def filtering(work: Work) -> str:
             figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
             figures[f"clock_late_frames.{camera}"] = float(systematic.late[c])
         figures["view_bias_m"] = float(np.sqrt((systematic.view_bias.coefficient**2).mean()))
-        result.figures.update(figures | _held_out(store, work, case, chosen))
+        result.figures.update(figures | _held_out(store, work, case, chosen, suspects))
     return work.key
 
 
@@ -244,20 +244,33 @@ def _counts(judged: Judgement, suspects: TriangulatedDetections) -> list[float]:
     ]
 
 
-def _held_out(store: Store, work: Work, case: _Case, frames: NDArray[np.int64]) -> dict[str, float]:
+def _held_out(
+    store: Store,
+    work: Work,
+    case: _Case,
+    frames: NDArray[np.int64],
+    suspects: TriangulatedDetections,
+) -> dict[str, float]:
     """Measure the held-out error of cameras from the keypoints that this iteration uses.
 
     The systematic errors of cameras are estimated in every iteration, and redetected people are not
     evaluated, so that iterations are comparable.
+
+    Args:
+        store: the store.
+        work: the current work order.
+        case: the clip and its bodies.
+        frames: the frames to measure in.
+        suspects: their detections.
     """
-    clip = open_clip(store, work).assign_people(case.clip.detections.detection_index)
-    whole = open_clip(store, work, filtered=False, redetected=False)
-    found = measure_held_out(
-        clip.cameras,
-        clip.detections[frames],
-        whole.detections.keypoints[frames],
-        case.triangulation,
-    )
+    used = suspects.detections
+    keypoints = used.keypoints
+    if not case.first:
+        clip = open_clip(store, work).assign_people(case.clip.detections.detection_index)
+        used = clip.detections[frames]
+        whole = open_clip(store, work, filtered=False, redetected=False)
+        keypoints = whole.detections.keypoints[frames]
+    found = measure_held_out(case.clip.cameras, used, keypoints, case.triangulation)
     if found is None:
         return {}
     return {"held_out_error": found.error, "held_out_keypoints": float(found.keypoints)}
