@@ -1,21 +1,30 @@
 """Prints the cost of person detection on this computer, stage by stage.
 
     python benchmarks/detection.py [--people 25] [--frames 8]
+    python benchmarks/detection.py --workers 1 4 [--device cuda] [--half]
 
 A crowd of `--people` in images of 1920 x 1080 is rendered, encoded and decoded; the embedded
 detector finds people in the images of a calibrated camera, and the embedded estimator finds the
 pose of each. The same nets in floating point stand beside them. One thread; times are processor
 time, so other work on the machine does not count. The last lines extrapolate the reconstruction's
 share, without rendering, to 90 minutes at 50 frames per second of 16 cameras.
+
+With `--workers`, that many processes at the same time take a video each through all of the stage:
+decoding, boxes, tracks of boxes, and poses, on a CPU or on a GPU that they share. The images per
+second are those of all processes, without the start and the first images.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from itertools import cycle, islice
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,7 +33,16 @@ import torch
 
 from data_contracts.arrays import Image
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import DetectionSettings, People, PoseEstimator
+from worldpose.detection import (
+    DetectionSettings,
+    People,
+    PeopleFinder,
+    Place,
+    PoseEstimator,
+    load_detectors,
+    load_pose,
+    load_score_map,
+)
 from worldpose.detection.enlargement import SeesParts, expect_parts
 from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
 from worldpose.geometry import Camera
@@ -39,11 +57,16 @@ from worldpose.video import open_video, write_video
 
 Result = TypeVar("Result")
 
+_shared: list[Barrier] = []
+"""In a process of a measurement: the barrier of all of them."""
+
 FPS = 50.0
 MATCH_FRAMES = 90 * 60 * 50 * 16
 """Images of a match: 90 minutes, 50 frames per second, 16 cameras."""
 SURE = 0.4
 """Minimum score of boxes that get a pose here: the stage's high score threshold."""
+VIDEO_FRAMES, FIRST_FRAMES = 192, 16
+"""Frames of each worker's video, and those computed before the clock starts."""
 
 
 def main() -> None:
@@ -51,9 +74,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--people", type=int, default=25)
     parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--workers", type=int, nargs="+", default=[])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--half", action="store_true")
     asked = parser.parse_args()
     torch.set_num_threads(1)
     rendering, pictures, camera, pitch = render_crowd(asked.people, asked.frames)
+    if asked.workers:
+        settings = DetectionSettings(device=asked.device, half=asked.half)
+        compare_workers(pictures, Place(camera, pitch), settings, asked.workers)
+        return
     decoding = time_decoding(pictures)
     parts = expect_parts(camera, pitch, DetectionSettings().pitch_margin_m)
     rows = [("rendering", rendering), ("decoding", decoding)]
@@ -84,6 +114,55 @@ def main() -> None:
             f"match, stride {stride}: {hours:.0f} core hours, {hours / 2:.0f} h on 2 cores, "
             f"{hours / 16:.1f} h on 16, at {persons / count:.1f} people per image"
         )
+
+
+def compare_workers(
+    pictures: list[Image], place: Place, settings: DetectionSettings, workers: list[int]
+) -> None:
+    """Print the images per second of numbers of processes that work at the same time."""
+    whole = f"{settings.device}{', half precision' if settings.half else ''}"
+    print(f"{whole:28}{'images/s':>10}{'ms per image':>14}{'people':>8}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "crowd.mp4"
+        # Neighbouring frames are as in a video.
+        there_and_back = [*pictures, *pictures[-2:0:-1]]
+        write_video(path, list(islice(cycle(there_and_back), VIDEO_FRAMES)), FPS)
+        for count in workers:
+            context = multiprocessing.get_context("spawn")
+            barrier = context.Barrier(count)
+            with ProcessPoolExecutor(
+                count, context, initializer=_share, initargs=(barrier,)
+            ) as processes:
+                each = [processes.submit(time_video, path, place, settings) for _ in range(count)]
+                results = [one.result() for one in each]
+            seconds = max(stop for _, stop, _ in results) - min(start for start, _, _ in results)
+            rate = count * VIDEO_FRAMES / seconds
+            people = sum(found for _, _, found in results) / (count * VIDEO_FRAMES)
+            print(f"{count:3} processes{rate:25.1f}{1e3 / rate:14.1f}{people:8.1f}", flush=True)
+
+
+def _share(barrier: Barrier) -> None:
+    """Keep the barrier at which the processes of a measurement wait for each other."""
+    _shared.append(barrier)
+
+
+def time_video(path: Path, place: Place, settings: DetectionSettings) -> tuple[float, float, int]:
+    """Return start and end [s since the epoch], and the people found, of detection in a video."""
+    torch.set_num_threads(1)
+    finder = PeopleFinder(
+        load_detectors(settings), load_pose(settings), settings, load_score_map(settings)
+    )
+
+    def find(frames: int) -> int:
+        with open_video(path) as video:
+            found = list(finder.find(video.frames(0, frames), place))
+        return sum(int(np.isfinite(chunk.score).sum()) for chunk in found)
+
+    find(FIRST_FRAMES)
+    _shared[0].wait()
+    start = time.time()
+    people = find(VIDEO_FRAMES)
+    return start, time.time(), people
 
 
 def find_poses(

@@ -64,6 +64,24 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
             yield waiting.popleft().result()
 
 
+def read_ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
+    """Yield items in order; a thread of their own computes up to `count` of them in advance."""
+    source, end = iter(items), object()
+
+    def take() -> Item | object:
+        return next(source, end)
+
+    with ThreadPoolExecutor(1) as thread:
+        # With the caller's settings of numpy's warnings.
+        waiting = deque(thread.submit(copy_context().run, take) for _ in range(count))
+        try:
+            while (item := waiting.popleft().result()) is not end:
+                waiting.append(thread.submit(copy_context().run, take))
+                yield cast(Item, item)
+        finally:
+            thread.shutdown(cancel_futures=True)
+
+
 def _module_of(function: Function) -> str:
     """Return the module that defines a function, such as `worldpose.tracking.person`."""
     source = Path(function.__code__.co_filename).resolve()

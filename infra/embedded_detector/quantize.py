@@ -43,15 +43,14 @@ from worldpose.detection.bundled_nets import (
     COARSEST,
     GREY_MEAN,
     GREY_SPREAD,
-    WEIGHTS_DIGEST,
     KeypointNet,
     PeopleNet,
     load_weights,
-    place_net,
 )
 from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.landmark_net import LandmarkNet, SeenLandmarks
 from worldpose.detection.models import BUNDLED_WEIGHTS, LANDMARK_WEIGHTS
+from worldpose.detection.net_inference import WEIGHTS_DIGEST, place_net
 from worldpose.ingest.registration import digest_of_files
 from worldpose.training import read_picture
 

@@ -1,10 +1,13 @@
-"""Kernels kept on disk are those of the source as it is now."""
+"""Kernels kept on disk are those of the source as it is now; items computed in advance."""
 
 import importlib
 import shutil
 import subprocess
 import sys
+from itertools import islice
 from pathlib import Path
+
+import pytest
 
 import worldpose.compiled
 
@@ -85,3 +88,33 @@ def test_the_modules_whose_change_compiles_a_kernel_again_include_all_that_it_us
                 if str(origin).startswith(("worldpose.", "data_contracts.")):
                     assert origin in reached, f"{name} uses {used} of {origin}"
     assert kernels > 100
+
+
+def test_items_read_ahead_come_in_order_and_no_further_than_asked():
+    taken = []
+
+    def source():
+        for number in range(20):
+            taken.append(number)
+            yield number
+
+    items = worldpose.compiled.read_ahead(source(), 3)
+    assert next(items) == 0
+    assert list(islice(items, 4)) == [1, 2, 3, 4]
+    items.close()
+    # One more may be asked for when an item is handed out.
+    assert 5 <= len(taken) <= 9
+    assert list(worldpose.compiled.read_ahead(iter([]), 3)) == []
+    assert list(worldpose.compiled.read_ahead(range(2), 3)) == [0, 1]
+
+
+def test_an_error_ahead_is_raised_in_its_turn():
+    def source():
+        yield from (1, 2)
+        raise ValueError("the third")
+
+    found = []
+    with pytest.raises(ValueError, match="the third"):
+        for item in worldpose.compiled.read_ahead(source(), 8):
+            found.append(item)
+    assert found == [1, 2]

@@ -16,9 +16,7 @@ from data_contracts.arrays import Image
 from worldpose.detection.bundled_nets import (
     COARSEST,
     PeopleNet,
-    QuantizedNet,
     decode_boxes,
-    placed_net,
 )
 from worldpose.detection.enlargement import (
     CLOSE_UP_GAIN,
@@ -34,6 +32,7 @@ from worldpose.detection.enlargement import (
     restore_size,
 )
 from worldpose.detection.interfaces import MIN_SCORE, People
+from worldpose.detection.net_inference import QuantizedNet, placed_net
 from worldpose.detection.suppression import suppress
 
 MAX_PEOPLE: Final = 300
@@ -125,7 +124,7 @@ class BundledDetector:
         with torch.inference_mode():
             logits, sides = self._net(padded)
             boxes, scores = decode_boxes(logits[0], sides[0], MIN_SCORE, MAX_PEOPLE)
-        found = boxes.double().cpu().numpy()
+        found = boxes.double().numpy()
         found = np.clip(found, -0.5, np.array([width, height, width, height]) - 0.5)
         real = np.all(found[:, 2:] - found[:, :2] > 1.0, axis=1)
-        return People(found[real], scores.double().cpu().numpy()[real])
+        return People(found[real], scores.double().numpy()[real])

@@ -12,19 +12,14 @@ import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from data_contracts.arrays import Image, Singles
-from worldpose.detection.onnx_nets import open_session
 from worldpose.errors import InputError
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -50,8 +45,6 @@ GREY_SPREAD: Final = 58.0
 """Mean and standard deviation of grey levels, by which images are normalized [of 255]."""
 FORMAT: Final = "worldpose-net"
 """Key of a file's metadata that names the class of the net."""
-WEIGHTS_DIGEST: Final = "weights_sha256"
-"""Key of the metadata of a net in integers: SHA-256 of the weights that it was made from."""
 _SCALE: Final = 16.0
 """Distance of a box side of logarithm 0 from its cell [px]: that of a person of about 60 px."""
 
@@ -255,22 +248,6 @@ def edges(maps: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(places, dim=1), torch.stack(spreads, dim=1)
 
 
-def fold_normalisations(net: Net) -> Net:
-    """Return `net` for inference: its normalisations are part of its convolutions.
-
-    Args:
-        net: net with its weights, changed in place.
-    """
-    for module in net.modules():
-        if isinstance(module, Block):
-            convolution, normalisation = module[0], module[1]
-            assert isinstance(convolution, nn.Conv2d)
-            assert isinstance(normalisation, nn.BatchNorm2d)
-            module[0] = fuse_conv_bn_eval(convolution, normalisation)
-            module[1] = nn.Identity()
-    return net
-
-
 def cell_centres(count: int, device: torch.device) -> Tensor:
     """Return the centres of the cells of a row in the frame (count,) [px]."""
     return torch.arange(count, device=device) * STRIDE + 0.5 * (STRIDE - 1)
@@ -286,8 +263,14 @@ def decode_boxes(logits: Tensor, sides: Tensor, least: float, most: int) -> tupl
         most: most people reported.
     """
     score = torch.sigmoid(logits)
-    best = functional.max_pool2d(score[None, None], 3, stride=1, padding=1)[0, 0]
-    row, column = torch.nonzero((score == best) & (score >= least), as_tuple=True)
+    row, column = torch.nonzero(score >= least, as_tuple=True)
+    # The 3 x 3 cells around each; few cells have such scores.
+    columns = score.shape[1] + 2
+    step = torch.arange(3, device=score.device)
+    around = (row * columns + column)[:, None] + (step[:, None] * columns + step).flatten()
+    highest = functional.pad(score, (1, 1, 1, 1)).flatten()[around].amax(dim=1)
+    peak = score[row, column] == highest
+    row, column = row[peak], column[peak]
     order = torch.argsort(score[row, column], descending=True, stable=True)[:most]
     row, column = row[order], column[order]
     x = cell_centres(score.shape[1], score.device)[column]
@@ -398,73 +381,3 @@ def load_weights(path: Path, net: Net) -> Net:
         raise refusal("numbers that are not finite")
     net.load_state_dict(tensors)
     return net.eval()
-
-
-def place_net(net: Net, device: str) -> Net:
-    """Return the net on a device, its batch normalisations folded into convolutions."""
-    placed = fold_normalisations(net.eval()).to(device)
-    placed.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return placed
-
-
-class FloatNet:
-    """A net in floating point on a device, for images of bytes."""
-
-    def __init__(self, net: nn.Module, device: str = "cpu", half: bool = False) -> None:
-        """Place a net.
-
-        Args:
-            net: one of the bundled nets, changed in place.
-            device: `cpu` or `cuda`.
-            half: compute in half precision, on a GPU only.
-        """
-        self._net, self._device, self._half = place_net(net, device), device, half
-
-    def __call__(self, images: Image, surroundings: Singles | None = None) -> tuple[Tensor, ...]:
-        """Return the outputs of the net, on its device.
-
-        Args:
-            images: (batch, height, width, 3).
-            surroundings: second input of the keypoint net.
-        """
-        half = torch.autocast(self._device, torch.float16, enabled=self._half)
-        with torch.inference_mode(), half:
-            given = normalize(torch.from_numpy(images).to(self._device))
-            if surroundings is None:
-                found: tuple[Tensor, ...] = self._net(given)
-            else:
-                found = self._net(given, torch.from_numpy(surroundings).to(self._device))
-        return found
-
-
-class QuantizedNet:
-    """A net in 8-bit integers, for images of bytes.
-
-    Integers give equal bytes for an image, whatever the other images of the batch are.
-
-    Attributes:
-        weights_sha256: SHA-256 of the file of float weights that it was made from.
-    """
-
-    def __init__(self, file: Path) -> None:
-        """Open a file that infra/embedded_detector/quantize.py has written.
-
-        Raises:
-            InputError: onnxruntime is not installed.
-        """
-        self._session = open_session(file, "cpu")
-        self._names = [each.name for each in self._session.get_inputs()]
-        self.weights_sha256 = self._session.get_modelmeta().custom_metadata_map[WEIGHTS_DIGEST]
-
-    def __call__(self, images: Image, surroundings: Singles | None = None) -> tuple[Tensor, ...]:
-        """Return the outputs of the net; arguments as of `FloatNet`."""
-        inputs = (np.ascontiguousarray(images.transpose(0, 3, 1, 2)), surroundings)
-        found: list[NDArray[Any]] = self._session.run(
-            None, dict(zip(self._names, inputs, strict=False))
-        )
-        return tuple(torch.from_numpy(each) for each in found)
-
-
-def placed_net(net: nn.Module | QuantizedNet, device: str, half: bool) -> FloatNet | QuantizedNet:
-    """Return a net that takes images of bytes; integers only compute on a CPU, as they are."""
-    return net if isinstance(net, QuantizedNet) else FloatNet(net, device, half)

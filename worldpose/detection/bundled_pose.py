@@ -8,14 +8,15 @@ the estimator also finds occluded people in crops shifted to the side of detecte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.special import expit
+from torch import Tensor
 
 from data_contracts.arrays import Flags, Floats, Image, Singles
 from data_contracts.conventions import COCO17_FLIP
@@ -25,12 +26,11 @@ from worldpose.detection.bundled_nets import (
     JOINTS,
     MAP_COUNT,
     KeypointNet,
-    QuantizedNet,
     Seen,
     decode_candidates,
-    placed_net,
 )
 from worldpose.detection.interfaces import People
+from worldpose.detection.net_inference import CROPS, QuantizedNet, placed_net
 from worldpose.detection.suppression import nms_indices, suppress, surest_confidence
 from worldpose.geometry.boxes import box_iou
 
@@ -51,8 +51,6 @@ MIN_OVERLAP_IOU: Final = 0.05
 """A person that overlaps a neighbour more gets a second crop [1, intersection over union]."""
 CANDIDATES: Final = 4
 """Candidate positions per joint [1]."""
-BATCH: Final = 16
-"""Crops per batch, always the same number: kernels for other numbers round differently."""
 RIVALRY: Final = 2.0
 """Cost of a candidate that certainly is another person's joint [nats]."""
 JOINT_SPREAD: Final = 0.03
@@ -91,7 +89,7 @@ class BundledPoseEstimator:
     def __init__(
         self, net: KeypointNet | QuantizedNet, device: str = "cpu", half: bool = False
     ) -> None:
-        self._net = placed_net(net, device, half)
+        self._net = placed_net(net, device, half, _decode, batch=CROPS)
 
     def estimate(self, image: Image, boxes: Floats) -> KeypointDetections:
         """Return the pose in each box; confidence is the probability that a keypoint is correct.
@@ -145,37 +143,32 @@ class BundledPoseEstimator:
             boxes=np.full((len(boxes), 4), np.nan),
             fit=np.full(len(boxes), np.nan),
         )
-        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
-        for start in range(0, len(maps), BATCH):
-            part = maps[start : start + BATCH]
-            stop = start + len(part)
-            crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
-            around = np.zeros(
-                (BATCH, MAP_COUNT, CROP[1] // MAP_CELL, CROP[0] // MAP_CELL), dtype=np.float32
+        for batch in cut_crops(image, boxes, others):
+            count, rows = len(batch.crops), batch.rows
+            pixels, corners, mass, sure, fit = (
+                each[:count].double().numpy() for each in self._net(batch.crops, batch.surroundings)
             )
-            for index, mapping in enumerate(part):
-                crops[index] = cut_crop(image, mapping, CROP)
-                person = start + index
-                around[index] = surroundings(boxes[person], others[person], mapping, CROP)
-            with torch.inference_mode():
-                seen = Seen(*self._net(crops, around))
-                at, mass = decode_candidates(seen.maps, CANDIDATES)
-                sure = torch.sigmoid(seen.sureness(mass))
-            pixels, corners = at.double().cpu().numpy(), seen.boxes.double().cpu().numpy()
-            for index, mapping in enumerate(part):
-                scale, corner = mapping[:, :2], mapping[:, 2]
-                estimates.places[start + index] = pixels[index] @ scale.T + corner
-                sides = corners[index].reshape(2, 2) @ scale.T + corner
-                estimates.boxes[start + index] = sides.ravel()
-            estimates.mass[start:stop] = mass.double().cpu().numpy()[: len(part)]
-            estimates.sure[start:stop] = np.clip(
-                sure.double().cpu().numpy()[: len(part)], 1e-3, 1.0
-            )
-            estimates.fit[start:stop] = torch.sigmoid(seen.fit).double().cpu().numpy()[: len(part)]
+            scale, corner = batch.mappings[:, :, :2], batch.mappings[:, None, :, 2]
+            estimates.places[rows] = np.einsum("njcx,nyx->njcy", pixels, scale) + corner[:, None]
+            sides = np.einsum("nsx,nyx->nsy", corners.reshape(count, 2, 2), scale) + corner
+            estimates.boxes[rows] = sides.reshape(count, 4)
+            # PyTorch rounds the last numbers of an array otherwise than the others.
+            estimates.mass[rows], estimates.fit[rows] = mass, expit(fit)
+            estimates.sure[rows] = np.clip(expit(sure), 1e-3, 1.0)
         height, width = image.shape[:2]
         limits = np.array([width, height, width, height]) - 0.5
         np.clip(estimates.boxes, -0.5, limits, out=estimates.boxes)
         return estimates
+
+
+def _decode(outputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return candidate positions, boxes, the probability around each position, and logits.
+
+    The last two are logits that positions are correct, and of the fit of boxes.
+    """
+    seen = Seen._make(outputs)
+    at, mass = decode_candidates(seen.maps, CANDIDATES)
+    return at, seen.boxes, mass, seen.sureness(mass.double()), seen.fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,6 +335,43 @@ def frame_from_crop(
     return np.column_stack([linear, np.array([x, y]) - linear @ middle])
 
 
+@dataclass(frozen=True, eq=False)
+class CropBatch:
+    """Some crops of a frame, as the nets take them.
+
+    Attributes:
+        rows: of the boxes.
+        mappings: (crops, 2, 3) affine maps from pixels of the crops to pixels of the frame.
+        crops: (crops, height, width, 3).
+        surroundings: (crops, 3, rows, columns) maps of the boxes.
+    """
+
+    rows: slice
+    mappings: Floats
+    crops: Image
+    surroundings: Singles
+
+
+def cut_crops(image: Image, boxes: Floats, others: Sequence[Floats]) -> Iterator[CropBatch]:
+    """Yield a crop around each box, `CROPS` at a time.
+
+    Args:
+        image: the whole frame.
+        boxes: (people, 4) [px].
+        others: boxes (others, 4) of the neighbours of each person [px].
+    """
+    mappings = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
+    for start in range(0, len(mappings), CROPS):
+        rows = slice(start, min(start + CROPS, len(mappings)))
+        each = list(zip(boxes[rows], others[rows], mappings[rows], strict=True))
+        yield CropBatch(
+            rows,
+            np.array(mappings[rows]),
+            np.stack([cut_crop(image, mapping, CROP) for _, _, mapping in each]),
+            np.stack([surroundings(box, near, mapping, CROP) for box, near, mapping in each]),
+        )
+
+
 def cut_crop(image: Image, mapping: Floats, size: tuple[int, int], outside: int = 115) -> Image:
     """Return a crop (height, width, 3), grey outside of the frame.
 
@@ -400,14 +430,22 @@ def surroundings(box: Floats, others: Floats, mapping: Floats, size: tuple[int, 
         size: width, height of the crop [px].
     """
     columns, rows = size[0] // MAP_CELL, size[1] // MAP_CELL
-    middles = np.stack(
-        np.meshgrid(*(MAP_CELL * np.arange(n) + 0.5 * (MAP_CELL - 1) for n in (columns, rows)))
-    )
-    at = np.einsum("ij,jrc->irc", mapping[:, :2], middles) + mapping[:, 2, None, None]
+    x, y = (MAP_CELL * np.arange(n) + 0.5 * (MAP_CELL - 1) for n in (columns, rows))
+    (xx, xy), (yx, yy) = mapping[:, :2]
+    if xy == yx == 0.0:
+        # Columns show the box's width, rows its height: far fewer numbers than cells.
+        places = (xx * x + mapping[0, 2])[None], (yy * y + mapping[1, 2])[:, None]
+    else:
+        x, y = np.meshgrid(x, y)
+        places = xx * x + xy * y + mapping[0, 2], yx * x + yy * y + mapping[1, 2]
     cell = MAP_CELL * float(np.sqrt(abs(np.linalg.det(mapping[:, :2]))))
     boxes = np.concatenate([box[None], others])[:, :, None, None]
-    low, high = (at - boxes[:, :2]) / cell, (boxes[:, 2:] - at) / cell
-    covered = np.prod(np.clip(low + 0.5, 0.0, 1.0) * np.clip(high + 0.5, 0.0, 1.0), axis=1)
+    across, down = (
+        np.clip((at - boxes[:, axis]) / cell + 0.5, 0.0, 1.0)
+        * np.clip((boxes[:, axis + 2] - at) / cell + 0.5, 0.0, 1.0)
+        for axis, at in enumerate(places)
+    )
+    covered = across * down
     before = others[:, 3] > box[3]
     maps = np.zeros((MAP_COUNT, rows, columns), dtype=np.float32)
     maps[0] = covered[0]

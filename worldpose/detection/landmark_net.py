@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,23 +22,13 @@ from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection.bundled_nets import (
     CELL,
-    CROP,
     MAP_COUNT,
     Block,
     Pyramid,
-    QuantizedNet,
     peaks,
-    placed_net,
 )
-from worldpose.detection.bundled_pose import (
-    BATCH,
-    MAP_CELL,
-    SAME_PERSON_IOU,
-    crops_around,
-    cut_crop,
-    frame_from_crop,
-    surroundings,
-)
+from worldpose.detection.bundled_pose import SAME_PERSON_IOU, cut_crops
+from worldpose.detection.net_inference import CROPS, QuantizedNet, placed_net
 from worldpose.geometry.boxes import box_iou
 
 POINTS: Final = (*LANDMARKS, *FEET)
@@ -87,7 +78,8 @@ def locate(maps: Tensor) -> tuple[Tensor, Tensor]:
     x, y = (CELL * torch.arange(n, device=maps.device) + 0.5 * (CELL - 1) for n in (columns, rows))
     across = (chance.sum(dim=2) * (x - places[..., :1]).square()).sum(dim=-1)
     down = (chance.sum(dim=3) * (y - places[..., 1:]).square()).sum(dim=-1)
-    return places, 0.5 * torch.log(0.5 * (across + down) + 1e-3)
+    # PyTorch rounds the last numbers of an array otherwise; in double precision nobody sees it.
+    return places, 0.5 * torch.log(0.5 * (across + down).double() + 1e-3)
 
 
 class LandmarkNet(nn.Module):
@@ -126,7 +118,7 @@ class LandmarkEstimator:
     def __init__(
         self, net: LandmarkNet | QuantizedNet, device: str = "cpu", half: bool = False
     ) -> None:
-        self._net = placed_net(net, device, half)
+        self._net = placed_net(net, device, half, _decode, batch=CROPS)
 
     def add_points(self, image: Image, people: KeypointDetections) -> KeypointDetections:
         """Return the people of a frame with `POINTS`.
@@ -160,28 +152,23 @@ class LandmarkEstimator:
         shape = (len(boxes), len(POINTS))
         found = Landmarks(np.empty((*shape, 2)), np.empty(shape), np.empty(shape))
         shares = box_iou(boxes, boxes)
-        maps = [frame_from_crop(crop, CROP) for crop in crops_around(boxes)]
-        cells = CROP[1] // MAP_CELL, CROP[0] // MAP_CELL
-        for start in range(0, len(maps), BATCH):
-            part = maps[start : start + BATCH]
-            crops = np.zeros((BATCH, CROP[1], CROP[0], 3), dtype=np.uint8)
-            around = np.zeros((BATCH, MAP_COUNT, *cells), dtype=np.float32)
-            for index, mapping in enumerate(part):
-                person = start + index
-                others = boxes[shares[person] <= SAME_PERSON_IOU]
-                crops[index] = cut_crop(image, mapping, CROP)
-                around[index] = surroundings(boxes[person], others, mapping, CROP)
-            with torch.inference_mode():
-                seen = SeenLandmarks(*self._net(crops, around))
-                decoded = (*seen.decode(), torch.sigmoid(seen.visible))
-            places, std, visible = (each.double().cpu().numpy() for each in decoded)
-            for index, mapping in enumerate(part):
-                person = start + index
-                scale = float(np.sqrt(abs(np.linalg.det(mapping[:, :2]))))
-                found.places[person] = places[index] @ mapping[:, :2].T + mapping[:, 2]
-                found.std[person] = scale * std[index]
-                found.visible[person] = visible[index]
+        others = [boxes[row <= SAME_PERSON_IOU] for row in shares]
+        for batch in cut_crops(image, boxes, others):
+            places, std, visible = (
+                each[: len(batch.crops)].double().numpy()
+                for each in self._net(batch.crops, batch.surroundings)
+            )
+            scale, corner = batch.mappings[:, :, :2], batch.mappings[:, None, :, 2]
+            found.places[batch.rows] = np.einsum("npx,nyx->npy", places, scale) + corner
+            size = np.sqrt(np.abs(np.linalg.det(scale)))
+            found.std[batch.rows], found.visible[batch.rows] = size[:, None] * std, expit(visible)
         return found
+
+
+def _decode(outputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return positions, standard deviations, and logits that points are visible."""
+    seen = SeenLandmarks._make(outputs)
+    return (*seen.decode(), seen.visible)
 
 
 @dataclass(frozen=True, eq=False)

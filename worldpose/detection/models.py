@@ -141,9 +141,10 @@ def load_bundled_detector(
     """
     nets = _bundled_nets()
     from worldpose.detection.bundled_detector import BundledDetector
+    from worldpose.detection.net_inference import QuantizedNet
 
     if weights is None and device == "cpu":
-        return BundledDetector(nets.QuantizedNet(QUANTIZED_WEIGHTS[0]))
+        return BundledDetector(QuantizedNet(QUANTIZED_WEIGHTS[0]))
     net = nets.load_weights(weights or BUNDLED_WEIGHTS[0], nets.PeopleNet())
     return BundledDetector(net, device, half)
 
@@ -154,9 +155,10 @@ def load_bundled_pose(
     """Return the bundled pose estimator; arguments and errors are those of the detector."""
     nets = _bundled_nets()
     from worldpose.detection.bundled_pose import BundledPoseEstimator
+    from worldpose.detection.net_inference import QuantizedNet
 
     if weights is None and device == "cpu":
-        return BundledPoseEstimator(nets.QuantizedNet(QUANTIZED_WEIGHTS[1]))
+        return BundledPoseEstimator(QuantizedNet(QUANTIZED_WEIGHTS[1]))
     net = nets.load_weights(weights or BUNDLED_WEIGHTS[1], nets.KeypointNet())
     return BundledPoseEstimator(net, device, half)
 
@@ -173,9 +175,10 @@ def load_landmarks(settings: DetectionSettings) -> LandmarkEstimator | None:
         return None
     nets = _bundled_nets()
     from worldpose.detection.landmark_net import LandmarkEstimator, LandmarkNet
+    from worldpose.detection.net_inference import QuantizedNet
 
     if settings.device == "cpu":
-        return LandmarkEstimator(nets.QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx")))
+        return LandmarkEstimator(QuantizedNet(LANDMARK_WEIGHTS.with_suffix(".onnx")))
     net = nets.load_weights(LANDMARK_WEIGHTS, LandmarkNet())
     return LandmarkEstimator(net, settings.device, settings.half)
 

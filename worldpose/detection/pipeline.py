@@ -10,6 +10,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.keypoints import KeypointDetections
+from worldpose.compiled import read_ahead
 from worldpose.detection.box_tracking import BoxCleaner, detect_strided
 from worldpose.detection.enlargement import Part, SeesParts, expect_parts
 from worldpose.detection.interfaces import (
@@ -79,6 +80,8 @@ def on_pitch(
         )
 
 
+FRAMES_AHEAD: Final = 8
+"""Frames decoded while earlier ones are searched."""
 CHUNK_FRAMES: Final = 64
 """Frames per chunk."""
 NO_PEOPLE: Final = People(np.empty((0, 4)), np.empty(0))
@@ -214,6 +217,7 @@ class PeopleFinder:
                 box is added, left out because of its score or its place, or tracked. None = detect.
         """
         self.report = DetectionReport(is_given=given is not None)
+        frames = read_ahead(frames, FRAMES_AHEAD)
         cleaner = BoxCleaner(self._settings)
         self._parts = None
         if place is not None and any(isinstance(each, SeesParts) for each in self._detectors):

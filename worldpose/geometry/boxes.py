@@ -9,7 +9,8 @@ from data_contracts.arrays import AnyFloats, Floats
 
 def box_areas(boxes: AnyFloats) -> Floats:
     """Return the areas (...) [px^2] of boxes (..., 4) x0, y0, x1, y1 [px], 0 for reversed sides."""
-    return np.asarray(np.maximum(boxes[..., 2:] - boxes[..., :2], 0.0).prod(axis=-1))
+    x0, y0, x1, y1 = np.moveaxis(boxes, -1, 0)
+    return np.asarray(np.maximum(x1 - x0, 0.0) * np.maximum(y1 - y0, 0.0))
 
 
 def box_iou(a: AnyFloats, b: AnyFloats) -> Floats:
@@ -21,10 +22,10 @@ def box_iou(a: AnyFloats, b: AnyFloats) -> Floats:
         a: (..., n, 4) x0, y0, x1, y1 [px].
         b: (..., m, 4) [px].
     """
-    first, second = a[..., :, None, :], b[..., None, :, :]
-    sides = np.minimum(first[..., 2:], second[..., 2:]) - np.maximum(
-        first[..., :2], second[..., :2]
-    )
-    shared = np.maximum(sides, 0.0).prod(axis=-1)
-    union = box_areas(first) + box_areas(second) - shared
+    # Each side by itself: operations along an axis of four numbers take several times as long.
+    x0, y0, x1, y1 = np.moveaxis(a[..., :, None, :], -1, 0)
+    u0, v0, u1, v1 = np.moveaxis(b[..., None, :, :], -1, 0)
+    width, height = np.minimum(x1, u1) - np.maximum(x0, u0), np.minimum(y1, v1) - np.maximum(y0, v0)
+    shared = np.maximum(width, 0.0) * np.maximum(height, 0.0)
+    union = box_areas(a)[..., :, None] + box_areas(b)[..., None, :] - shared
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0))

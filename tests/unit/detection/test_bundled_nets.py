@@ -9,7 +9,6 @@ from worldpose.detection.bundled_nets import (
     FORMAT,
     KeypointNet,
     PeopleNet,
-    QuantizedNet,
     decode_boxes,
     edges,
     load_weights,
@@ -29,6 +28,7 @@ from worldpose.detection.models import (
     load_bundled_detector,
     load_bundled_pose,
 )
+from worldpose.detection.net_inference import QuantizedNet
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.registration import digest_of_files

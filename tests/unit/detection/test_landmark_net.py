@@ -12,7 +12,7 @@ from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
 from worldpose.detection import DetectionSettings, People, PeopleFinder
-from worldpose.detection.bundled_nets import CELL, CROP, QuantizedNet, load_weights
+from worldpose.detection.bundled_nets import CELL, CROP, load_weights
 from worldpose.detection.landmark_net import (
     POINTS,
     LandmarkEstimator,
@@ -21,6 +21,7 @@ from worldpose.detection.landmark_net import (
     locate,
 )
 from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks, weights_of
+from worldpose.detection.net_inference import QuantizedNet
 from worldpose.ingest.registration import digest_of_files
 
 RECIPE = Path(__file__).parents[3] / "infra" / "embedded_detector"

@@ -1,0 +1,110 @@
+"""Nets in integers and in floating point, on a CPU and, where there is one, on a GPU."""
+
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+import torch
+
+from worldpose.detection import DetectionSettings, detect_people
+from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, decode_boxes, load_weights
+from worldpose.detection.models import BUNDLED_WEIGHTS, QUANTIZED_WEIGHTS, load_bundled_pose
+from worldpose.detection.net_inference import CROPS, FloatNet, QuantizedNet
+from worldpose.errors import InputError
+from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.training import read_picture
+
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+
+
+@pytest.fixture(scope="module")
+def crops():
+    rng = np.random.default_rng(3)
+    images = rng.integers(0, 256, (3 * CROPS, CROP[1], CROP[0], 3), dtype=np.uint8)
+    return images, rng.random((3 * CROPS, 3, 32, 24)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("still") / "tiny"
+    options = MatchOptions(duration=0.04, cameras=2, video=False)
+    simulate_match(SCENARIOS["tiny"], 5, folder, options)
+    return read_picture(sorted((folder / "stills").iterdir())[0])
+
+
+@pytest.mark.parametrize("count", [1, 5, 7, CROPS])
+def test_integers_give_equal_bytes_in_every_batch(crops, count):
+    net = QuantizedNet(QUANTIZED_WEIGHTS[1])
+    some, whole = (Seen._make(net(crops[0][:n], crops[1][:n])) for n in (count, CROPS))
+    for name in ("maps", "doubt", "boxes", "fit"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[:count])
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_a_person_has_the_same_pose_whoever_else_is_asked_for(still, count):
+    pose = load_bundled_pose()
+    x = 20.0 + 90.0 * np.arange(8)  # apart: neighbours may change a pose
+    boxes = np.stack([x, 0 * x + 100.0, x + 30.0, 0 * x + 180.0], axis=1)
+    together, alone = pose.estimate(still, boxes), pose.estimate(still, boxes[:count])
+    for name, values in alone.arrays().items():
+        np.testing.assert_array_equal(together.arrays()[name][:count], values)
+
+
+def test_boxes_stand_at_the_cells_that_none_of_their_neighbours_exceeds():
+    rng = np.random.default_rng(0)
+    # Levels, so that neighbours are often equal.
+    logits = torch.from_numpy(rng.integers(-4, 3, (23, 31)).astype(np.float32))
+    _, scores = decode_boxes(logits, torch.ones(4, 23, 31), 0.1, 1000)
+    score = torch.sigmoid(logits).numpy()
+    padded = np.pad(score, 1)
+    near = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).max(axis=(2, 3))
+    expected = np.sort(score[(score == near) & (score >= 0.1)])[::-1]
+    assert len(expected) > 20
+    np.testing.assert_array_equal(scores, expected)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_one_clear_error(still):
+    with pytest.raises(InputError, match=r"detection\.device") as caught:
+        detect_people([still], DetectionSettings(device="cuda"))
+    assert "detection.device=cpu" in str(caught.value)
+
+
+@on_gpu
+@pytest.mark.parametrize("half", [False, True])
+def test_a_graph_computes_what_its_kernels_compute_one_by_one(crops, half):
+    net = FloatNet(load_weights(BUNDLED_WEIGHTS[1], KeypointNet()), "cuda", half, batch=CROPS)
+    for count in (CROPS, 5, CROPS, 3, 7):
+        found = [each.clone() for each in net(crops[0][:count], crops[1][:count])]
+        alone = [torch.from_numpy(each[:CROPS].copy()).cuda() for each in crops]
+        for each in alone:
+            each[count:] = 0
+        with torch.inference_mode():
+            expected = net.compute(alone)
+        for one, other in zip(found, expected, strict=True):
+            # The weights of peaks are no row of an image.
+            rows = slice(count if len(one) == CROPS else None)
+            torch.testing.assert_close(one[rows], other.cpu()[rows], rtol=0.0, atol=0.0)
+
+
+@on_gpu
+def test_a_gpu_finds_the_same_people_as_a_cpu_and_in_two_threads(still):
+    weights = [f"embedded:{Path(each)}" for each in BUNDLED_WEIGHTS]
+    on_cpu = detect_people([still] * 4, DetectionSettings(detector=weights[0], pose=weights[1]))
+    settings = DetectionSettings(device="cuda")
+    found: list = [None, None]
+
+    def find(number):
+        found[number] = detect_people([still] * 4, settings)
+
+    threads = [Thread(target=find, args=(number,)) for number in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    np.testing.assert_array_equal(found[0].keypoints, found[1].keypoints)
+    assert found[0].score.shape == on_cpu.score.shape
+    np.testing.assert_allclose(found[0].boxes, on_cpu.boxes, atol=0.1)
+    apart = np.linalg.norm(found[0].keypoints - on_cpu.keypoints, axis=-1)
+    assert np.nanmedian(apart) < 0.02
