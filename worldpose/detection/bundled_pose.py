@@ -337,7 +337,7 @@ def frame_from_crop(
 
 @dataclass(frozen=True, eq=False)
 class CropBatch:
-    """Some crops of a frame, as the nets take them.
+    """Crops around people, as the nets take them.
 
     Attributes:
         rows: of the boxes.

@@ -78,7 +78,7 @@ def locate(maps: Tensor) -> tuple[Tensor, Tensor]:
     x, y = (CELL * torch.arange(n, device=maps.device) + 0.5 * (CELL - 1) for n in (columns, rows))
     across = (chance.sum(dim=2) * (x - places[..., :1]).square()).sum(dim=-1)
     down = (chance.sum(dim=3) * (y - places[..., 1:]).square()).sum(dim=-1)
-    # PyTorch rounds the last numbers of an array otherwise; in double precision nobody sees it.
+    # PyTorch rounds the last numbers of an array otherwise, which double precision makes harmless.
     return places, 0.5 * torch.log(0.5 * (across + down).double() + 1e-3)
 
 

@@ -91,7 +91,7 @@ class FloatNet:
                 for other numbers of images round differently.
 
         Raises:
-            InputError: a GPU is asked for, and torch finds none.
+            InputError: torch finds no GPU.
         """
         self._net, self._decode, self._batch = place_net(net, device), decode, batch
         self._kind = torch.float16 if half and device == "cuda" else torch.float32
@@ -247,7 +247,7 @@ def place_net(net: Net, device: str) -> Net:
     """Return the net on a device, its batch normalisations folded into convolutions.
 
     Raises:
-        InputError: a GPU is asked for, and torch finds none.
+        InputError: torch finds no GPU.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError(
