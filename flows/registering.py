@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from worldpose.ingest import (
     require_calibrated,
 )
 from worldpose.ingest.footage import read_still, require_footage
+from worldpose.ingest.registration import READERS
 from worldpose.store import Store
 
 
@@ -157,9 +159,13 @@ def _read_new_files(
     def is_new(path: Path) -> bool:
         return registration.digest_of(path.relative_to(match.folder).as_posix()) not in known
 
-    for unit, path in match.detections.items():
-        if is_new(path):
-            read_unit(match, unit)
+    def check_detections(unit: str) -> None:
+        read_unit(match, unit)
+
+    with ThreadPoolExecutor(READERS) as threads:
+        new = [unit for unit, path in match.detections.items() if is_new(path)]
+        for _ in threads.map(check_detections, new):
+            pass  # an error is raised here, that of the first file
     for unit, path in match.videos.items():
         if unit not in match.detections and (path.is_dir() or is_new(path)):
             require_footage(match.spec, unit, path)

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import FRAME_LIMIT
@@ -408,11 +409,11 @@ def _check_values(path: Path, people: KeypointDetections) -> None:
 def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
     found = np.isfinite(people.confidence)
     person = np.any(found, axis=-1)
-    unlike = (np.isfinite(people.keypoints) != found[..., None]).any(axis=-1)
+    unlike = _either(np.isfinite(people.keypoints) != found[..., None])
     far = np.abs(people.keypoints) > COORDINATE_LIMIT
-    ordered = ~np.any(people.boxes[..., :2] > people.boxes[..., 2:], axis=-1)
+    ordered = ~_either(people.boxes[..., :2] > people.boxes[..., 2:])
     checks = [
-        ("keypoints", far.any(axis=-1), f"pixels up to {COORDINATE_LIMIT:g}"),
+        ("keypoints", _either(far), f"pixels up to {COORDINATE_LIMIT:g}"),
         ("keypoints", unlike, "finite exactly where confidence is"),
         (
             "confidence",
@@ -427,9 +428,9 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
     if people.extra_keypoints is not None and people.extra_confidence is not None:
         there, sure = np.isfinite(people.extra_keypoints), people.extra_confidence
         far = np.abs(people.extra_keypoints) > COORDINATE_LIMIT
-        unlike = (there != np.isfinite(sure)[..., None]).any(axis=-1)
+        unlike = _either(there != np.isfinite(sure)[..., None])
         checks += [
-            ("extra_keypoints", far.any(axis=-1), f"pixels up to {COORDINATE_LIMIT:g}"),
+            ("extra_keypoints", _either(far), f"pixels up to {COORDINATE_LIMIT:g}"),
             ("extra_keypoints", unlike, "finite exactly where extra_confidence is"),
             ("extra_confidence", (sure <= 0) | (sure > 1), "values in (0, 1], NaN where not found"),
             (
@@ -446,6 +447,11 @@ def _check_block(path: Path, start: int, people: KeypointDetections) -> None:
             raise npz_error(
                 f"{path}: {name}{where} (frame {people.frame[place[0]]})", rule, f"{value}"
             )
+
+
+def _either(pairs: Flags) -> Flags:
+    """Return whether one of two flags (..., 2) is set (...); `any` takes several times as long."""
+    return np.asarray(pairs[..., 0] | pairs[..., 1])
 
 
 def read_observations(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +15,8 @@ from worldpose.ingest.match_folder import LENS_FILE, MatchFolder
 from worldpose.ingest.pitch_file import pitch_file
 from worldpose.ingest.validation import reachable
 
+READERS: Final = 2
+"""Files of a match that are read at the same time."""
 SETTLE_SECONDS: Final = 0.5
 """A file changed within this time [s] is checked again; recorders and copies write more often."""
 
@@ -46,7 +49,8 @@ def _register(match: MatchFolder, previous: Registration | None) -> Registration
         known = {(file.path, file.size, file.modified_ns): file.sha256 for file in previous.files}
     identifying = _identifying_files(match)
     paths = sorted({*identifying, *_further_files(match)})
-    files = tuple(_source_file(match.folder, path, known) for path in paths)
+    with ThreadPoolExecutor(READERS) as threads:
+        files = tuple(threads.map(lambda path: _source_file(match.folder, path, known), paths))
     _require_settled(match.folder, files)
     identity = hashlib.sha256()
     for file in files:
