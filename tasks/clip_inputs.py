@@ -29,7 +29,10 @@ PAGE = 256
 VENUES = 4
 """Venues that a process keeps: reading 16 cameras takes 0.5 s, in most stages twice."""
 PAGES = 4
-"""Cached pages: a chunk with its margins fits into four."""
+"""Cached pages of a long array: a chunk with its margins fits into four."""
+SMALL_BYTES = 2**28 + 2**27
+"""Size of an array that stays in memory as a whole once read [bytes]: a minute of 16 cameras needs
+a third of it. Stages read a clip up to six times."""
 
 
 class ChunkedRows:
@@ -110,7 +113,8 @@ class StoredArray:
         self._redetected = redetected
         self._rejected = None if rejected is None else ChunkedRows(rejected)
         self._shift = None if shift is None else ChunkedRows(shift)
-        self._page = lru_cache(PAGES)(self._read)
+        is_small = math.prod(self.shape) * np.dtype(np.float32).itemsize <= SMALL_BYTES
+        self._page = lru_cache(None if is_small else PAGES)(self._read)
         self._reading = Lock()
 
     def __getitem__(self, frames: slice | Integers) -> NDArray[np.float64]:
