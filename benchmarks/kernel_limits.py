@@ -36,6 +36,7 @@ from worldpose.body import fold_keypoints, load_open_body
 from worldpose.body.jacobian import ChainedKeypoints
 from worldpose.body_fitting import BodyFittingSettings
 from worldpose.body_fitting.objective import Evidence, Pose, Track
+from worldpose.body_fitting.point_equations import VECTOR
 from worldpose.body_fitting.pose_space import load_pose_prior, start_poses
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
@@ -182,11 +183,14 @@ def body_equations() -> tuple[Kernel, Kernel]:
     def solve() -> None:
         BandedFactor.of(blocks).solve(right)
 
-    # A point's rows times its information 15, gradient 6; then, for each unknown that moves it, a
-    # row of the lower triangle and two of the next frames' blocks.
+    # Which unknowns move a point 2 per number; a point's rows times its information 15, gradient 6;
+    # then, for each unknown that moves it, a row of the lower triangle and two of the next frames'
+    # blocks, all of them in whole vectors.
     moves = (made.points.pose[0] != 0.0).any(axis=1)
-    triangle = (moves * (places + 1)).sum() + 2 * size * moves.sum()
-    summed = len(moves) * size * (15 + 6 + 6) + 6 * triangle
+    whole = np.minimum(-(-(places + 1) // VECTOR) * VECTOR, size)
+    ends = np.array([whole[np.flatnonzero(each)[-1]] for each in moves])
+    summed = 6 * moves.size + 21 * ends.sum() + 6 * moves.sum()
+    summed += 6 * ((moves * np.minimum(whole, ends[:, None])).sum() + 2 * moves.sum(axis=1) @ ends)
     # Terms of the keypoints by shape 2 x 11 x 3, turned 18, levers and derivatives 30 each; angles
     # 45 per joint and 2 x 27 for both chains; sums of angles 2 per term.
     terms = len(chained._terms[0])

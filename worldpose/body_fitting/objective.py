@@ -20,6 +20,7 @@ from data_contracts.conventions import COCO17, COCO17_SIGMAS, FEET
 from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
 from worldpose.body_fitting.monocular import MonocularPrior
+from worldpose.body_fitting.point_equations import accumulate_points, invert_symmetric
 from worldpose.body_fitting.pose_space import (
     MAX_ANGLES,
     MIN_ANGLES,
@@ -30,7 +31,6 @@ from worldpose.body_fitting.pose_space import (
     differentiate_points,
 )
 from worldpose.body_fitting.settings import BodyFittingSettings
-from worldpose.compiled import compile_kernel
 
 JOINT_SPREAD: Final = np.array(COCO17_SIGMAS) / 0.08
 """Spread of each joint relative to an average one: COCO's sigmas over their mean of 0.08."""
@@ -134,7 +134,7 @@ class Evidence:
         spread = spread + settings.min_joint_std_m**2 * np.eye(3)
         # Correlated frames count as one observation.
         spread *= 1.0 + settings.noise_time_s * fps
-        information = _invert_symmetric(spread) * seen[..., None, None]
+        information = invert_symmetric(spread) * seen[..., None, None]
         return cls(np.where(seen[..., None], joints, np.nan), information)
 
     def add_rays(
@@ -245,134 +245,6 @@ _MAX_ROTATION: Final = 0.6
 """Maximum change of an angle per step [rad]; beyond it the linear model is invalid."""
 
 
-@compile_kernel
-def _invert_symmetric(matrices: Floats) -> Floats:
-    """Return the inverses of symmetric matrices (frames, points, 3, 3), much sooner than LAPACK."""
-    inverses = np.empty(matrices.shape)
-    for t in range(matrices.shape[0]):
-        for p in range(matrices.shape[1]):
-            m, out = matrices[t, p], inverses[t, p]
-            xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
-            xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
-            xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-            scale = 1.0 / (m[0, 0] * xx + m[0, 1] * xy + m[0, 2] * xz)
-            out[0, 0] = scale * xx
-            out[1, 1] = scale * (m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2])
-            out[2, 2] = scale * (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1])
-            out[0, 1] = out[1, 0] = scale * xy
-            out[0, 2] = out[2, 0] = scale * xz
-            out[1, 2] = out[2, 1] = scale * (m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2])
-    return inverses
-
-
-@compile_kernel
-def _accumulate(
-    rows: Floats, own: Floats, next_frame: Floats, second_frame: Floats, force: Floats
-) -> tuple[Floats, Floats]:
-    """Return the blocks (3, frames, 36, 36) and the gradient (frames, 36) of point terms.
-
-    Blocks on the diagonal have their lower triangle only, which is all that the factor reads. A
-    point moves with few of the angles: products skip those that leave it in place.
-
-    Args:
-        rows: (frames, points, 3, 36), derivatives of points.
-        own: (frames, points, 3, 3), their information.
-        next_frame: (frames, points), weight of the product with the point in the next frame.
-        second_frame: (frames, points), the same with the frame after.
-        force: (frames, points, 3), derivative of the cost by the points.
-    """
-    frames, points, _, size = rows.shape
-    blocks, gradient = np.zeros((3, frames, size, size)), np.zeros((frames, size))
-    scaled, active = np.empty((3, size)), np.empty(size, dtype=np.int64)
-    for t in range(frames):
-        slope = gradient[t]
-        for p in range(points):
-            r = rows[t, p]
-            for a in range(3):
-                f0, f1, f2 = own[t, p, a, 0], own[t, p, a, 1], own[t, p, a, 2]
-                pull = force[t, p, a]
-                for j in range(size):
-                    scaled[a, j] = f0 * r[0, j] + f1 * r[1, j] + f2 * r[2, j]
-                    slope[j] += pull * r[a, j]
-            _add_product(blocks[0, t], r, scaled, active, True)
-            for ahead in (1, 2):
-                weight = next_frame[t, p] if ahead == 1 else second_frame[t, p]
-                if t + ahead < frames and weight != 0.0:
-                    for a in range(3):
-                        for j in range(size):
-                            scaled[a, j] = weight * r[a, j]
-                    _add_product(blocks[ahead, t], rows[t + ahead, p], scaled, active, False)
-    return blocks, gradient
-
-
-@compile_kernel
-def propagate(rows: Floats, covariance: Floats) -> Floats:
-    """Return the covariance of points (frames, points, 3, 3) [m^2].
-
-    Args:
-        rows: (frames, points, 3, n), derivatives of points by n unknowns, most of them zero.
-        covariance: (frames, n, n), of the unknowns.
-    """
-    frames, points, _, size = rows.shape
-    spread = np.empty((frames, points, 3, 3))
-    held, active = np.empty((3, size)), np.empty(size, dtype=np.int64)
-    for t in range(frames):
-        for p in range(points):
-            r, count = rows[t, p], _list_active(rows[t, p], active)
-            held[:] = 0.0
-            for place in range(count):
-                i = active[place]
-                f0, f1, f2 = r[0, i], r[1, i], r[2, i]
-                for j in range(size):
-                    c = covariance[t, i, j]
-                    held[0, j] += f0 * c
-                    held[1, j] += f1 * c
-                    held[2, j] += f2 * c
-            xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for place in range(count):
-                i = active[place]
-                xx += held[0, i] * r[0, i]
-                xy += held[0, i] * r[1, i]
-                xz += held[0, i] * r[2, i]
-                yy += held[1, i] * r[1, i]
-                yz += held[1, i] * r[2, i]
-                zz += held[2, i] * r[2, i]
-            target = spread[t, p]
-            target[0, 0], target[1, 1], target[2, 2] = xx, yy, zz
-            target[0, 1] = target[1, 0] = xy
-            target[0, 2] = target[2, 0] = xz
-            target[1, 2] = target[2, 1] = yz
-    return spread
-
-
-@compile_kernel
-def _list_active(rows: Floats, active: NDArray[np.int64]) -> int:
-    """List the nonzero columns of a (3, n) matrix in `active`; return their number."""
-    count = 0
-    for i in range(rows.shape[1]):
-        if rows[0, i] != 0.0 or rows[1, i] != 0.0 or rows[2, i] != 0.0:
-            active[count] = i
-            count += 1
-    return count
-
-
-@compile_kernel
-def _add_product(
-    target: Floats, left: Floats, right: Floats, active: NDArray[np.int64], below: bool
-) -> None:
-    """Add `left^T right` of two (3, n) matrices; only the lower triangle where `below`.
-
-    `active` is room for n indices.
-    """
-    size = len(target)
-    for place in range(_list_active(left, active)):
-        i = active[place]
-        f0, f1, f2 = left[0, i], left[1, i], left[2, i]
-        end = i + 1 if below else size
-        for j in range(end):
-            target[i, j] += f0 * right[0, j] + f1 * right[1, j] + f2 * right[2, j]
-
-
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Unknowns of a track."""
@@ -472,7 +344,7 @@ class Track:
         held, above = self._weigh_heights(body.keypoints)
         stiff[:, ANKLES, 2, 2] += held
         force[:, ANKLES, 2] += held * above
-        blocks, gradient = _accumulate(body.pose, stiff, bands[1], bands[2], force)
+        blocks, gradient = accumulate_points(body.pose, stiff, bands[1], bands[2], force)
         cost += smooth_cost + 0.5 * float((held * above**2).sum())
         cost += self._add_angles(pose.angles, blocks[0], gradient)
         if self.monocular_prior is not None:

@@ -36,8 +36,8 @@ from worldpose.body_fitting.objective import (
     ankle_height,
     body_axes,
     find_contacts,
-    propagate,
 )
+from worldpose.body_fitting.point_equations import propagate
 from worldpose.body_fitting.pose_space import (
     PosePrior,
     interpolate_gaps,
