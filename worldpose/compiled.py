@@ -1,4 +1,4 @@
-"""Machine code for numerical kernels (Numba), and threads that run them at the same time."""
+"""Machine code for numerical kernels (Numba), threads that run them, and reading in advance."""
 
 from __future__ import annotations
 
