@@ -45,6 +45,17 @@ def test_names_are_imported_from_where_type_checkers_see_them(path):
 @pytest.mark.parametrize("name", ["tracking", "body_fitting", "bundle_adjustment", "ingest"])
 def test_the_settings_and_readers_of_a_stage_import_no_estimator(name):
     module = "worldpose.ingest.match_folder" if name == "ingest" else f"worldpose.{name}.settings"
-    script = f"import sys, {module}; print(sorted({set(HEAVY)} & set(sys.modules)))"
+    assert heavy_imports_of(module) == []
+
+
+def test_a_run_is_planned_without_an_estimator():
+    # Prefect's server and the workers start after that.
+    assert heavy_imports_of("flows.cli.run, flows.registering, flows.running") == []
+
+
+def heavy_imports_of(modules):
+    """Heavy modules that a process has after importing these."""
+    script = f"import sys, {modules}; print(*sorted({set(HEAVY)} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout == "[]\n", done.stdout + done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()

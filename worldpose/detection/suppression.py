@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import AnyFloats, Flags, Floats
+from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.conventions import COCO17_SIGMAS
 from data_contracts.keypoints import KeypointDetections
-from worldpose.compiled import compile_kernel
 from worldpose.detection.interfaces import People
 from worldpose.geometry.boxes import box_areas, box_iou
 
@@ -30,19 +29,11 @@ def nms_indices(people: People, overlap: float) -> NDArray[np.intp]:
     """
     order = _best_first(people)
     boxes = people.boxes[order]
-    return order[_keep_best(box_iou(boxes, boxes) > overlap)]
-
-
-@compile_kernel
-def _keep_best(close: Flags) -> Flags:
-    """Return whether each box, best first, is close to no better box that is kept."""
-    kept = np.ones(len(close), np.bool_)
-    for number in range(len(close)):
-        for better in range(number):
-            if kept[better] and close[number, better]:
-                kept[number] = False
-                break
-    return kept
+    close = np.tril(box_iou(boxes, boxes) > overlap, -1)
+    kept = np.ones(len(boxes), dtype=np.bool_)
+    for number in np.flatnonzero(close.any(axis=1)).tolist():
+        kept[number] = not (close[number] & kept).any()
+    return order[kept]
 
 
 def suppress(people: People, overlap: float) -> People:
