@@ -35,6 +35,8 @@ POINTS: Final = (*LANDMARKS, *FEET)
 """Points of the net in order: landmarks of the surface, then heels and toes."""
 MAX_ERROR_SHARE: Final = 0.05
 """Largest error of a correct point, as a share of the box's longer side [1]; as for joints."""
+MIN_SQUARE: Final = 1e-3
+"""Added to the mean square distance, whose logarithm is taken [px^2]."""
 MIN_VISIBLE: Final = 0.5
 """Points that are less probably visible are missing [1]."""
 
@@ -58,7 +60,10 @@ class SeenLandmarks(NamedTuple):
 
     def decode(self) -> tuple[Tensor, Tensor]:
         """Return positions (batch, points, 2) and standard deviations per axis [px of the crop]."""
-        places, extent = locate(self.maps)
+        places, square = _measure(self.maps)
+        # PyTorch rounds the last numbers of an array otherwise, which double precision makes
+        # harmless.
+        extent = 0.5 * torch.log(square.double() + MIN_SQUARE)
         return places, torch.exp(self.doubt + self.trust * extent)
 
 
@@ -72,14 +77,19 @@ def locate(maps: Tensor) -> tuple[Tensor, Tensor]:
         Positions (batch, points, 2) [px of the crop], and the logarithm of the root mean square
         distance per axis of a map's probability from there (batch, points) [log px].
     """
+    places, square = _measure(maps)
+    return places, 0.5 * torch.log(square + MIN_SQUARE)
+
+
+def _measure(maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions, and the mean square distance per axis [px^2] of a map from there."""
     places, _ = peaks(maps)
     rows, columns = maps.shape[-2:]
     chance = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
     x, y = (CELL * torch.arange(n, device=maps.device) + 0.5 * (CELL - 1) for n in (columns, rows))
     across = (chance.sum(dim=2) * (x - places[..., :1]).square()).sum(dim=-1)
     down = (chance.sum(dim=3) * (y - places[..., 1:]).square()).sum(dim=-1)
-    # PyTorch rounds the last numbers of an array otherwise, which double precision makes harmless.
-    return places, 0.5 * torch.log(0.5 * (across + down).double() + 1e-3)
+    return places, 0.5 * (across + down)
 
 
 class LandmarkNet(nn.Module):

@@ -8,8 +8,9 @@ Bystanders are never on the pitch or near it (D2, in 3D). A single camera locate
 with an error of about a metre, and given 2D poses may show any person. Several cameras locate a
 track to centimetres, and so distinguish people waiting behind the lines from players.
 
-A duplicate is a second track of a person, of detections that the first one lost for a moment. Both
-are at one place, and no camera shows both: cameras see two people beside each other apart.
+A duplicate is a second track of one person, with detections that the first track lost for a moment.
+Both are at one place, and no camera shows both; some camera shows two people next to each other as
+two detections.
 
 A shadow is a false track that follows a person in a few of the cameras that see the person. If a
 detector reports halves of two people as a third person, in two cameras at once, rays may meet. Most
