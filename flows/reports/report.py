@@ -22,11 +22,6 @@ from data_contracts.review import (
     Withdrawal,
 )
 from data_contracts.run import RunRecord
-from flows.reports.broadcast import (
-    broadcast_pictures,
-    broadcast_tables,
-    write_broadcast_videos,
-)
 from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures
@@ -143,7 +138,11 @@ def _check_film(match: Match, camera: str) -> None:
 def _write_videos(
     store: Store, run: Run, match: Match, out: Path, camera: str | None
 ) -> list[Path]:
-    films = write_broadcast_videos(run, match, out)
+    films = []
+    if broadcast_cameras(run):
+        from flows.reports.broadcast import write_broadcast_videos  # late, as below
+
+        films += write_broadcast_videos(run, match, out)
     for clip in clips_of(run.record):
         owner = camera or static_view(run, match, clip)
         if owner is not None:
@@ -193,9 +192,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             ),
         ),
         Section("Bundle adjustment", tuple(adjustment_tables(run))),
-        Section(
-            "Broadcast camera", (*broadcast_pictures(run, match), *broadcast_tables(run, match))
-        ),
+        Section("Broadcast camera", tuple(_broadcast_blocks(run, match))),
         Section(
             "Bodies",
             (
@@ -205,6 +202,15 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         ),
         Section("Who reviewed what", tuple(review_table(match))),
     ]
+
+
+def _broadcast_blocks(run: Run, match: Match) -> list[CaptionedImage | Table]:
+    if not broadcast_cameras(run):
+        return []
+    # Late: it imports the estimators of a broadcast camera.
+    from flows.reports.broadcast import broadcast_pictures, broadcast_tables
+
+    return [*broadcast_pictures(run, match), *broadcast_tables(run, match)]
 
 
 def _seconds(store: Store, record: RunRecord) -> dict[str, float]:

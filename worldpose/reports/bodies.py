@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import scipy.sparse
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
@@ -25,7 +24,14 @@ from worldpose.geometry.rasters import (
     outline_surfaces,
     resolve,
 )
-from worldpose.reports.drawing import INK, draw_label, markings, person_color, png, style
+from worldpose.reports.drawing import (
+    WIDTH,
+    draw_label,
+    markings,
+    person_color,
+    picture_panels,
+    png,
+)
 
 _SUN: Final = np.array([0.35, -0.45, 0.82], dtype=np.float32)
 """Direction to the light, world: high, from the main camera's side."""
@@ -150,8 +156,6 @@ def _unit(vectors: Singles) -> Singles:
     return np.asarray(vectors / np.maximum(lengths, np.float32(1e-12)), dtype=np.float32)
 
 
-WIDTH: Final = 1540
-"""Width of the image [px]."""
 IMAGE_SHARE: Final = 0.3
 """Share of the camera's image to show: players of 80 px are then 210 px tall."""
 _GROUND: Final = (206, 217, 202)
@@ -193,17 +197,11 @@ def plot_bodies(
     paint_bodies(canvas, near, bodies, faces, _PALE + (1.0 - _PALE) * colors)
 
     height, width = canvas.shape[:2]
-    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots()
-    axes.imshow(canvas)
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
-    style(axes)
+    figure, (axes,) = picture_panels([title], (-0.5, -0.5), (width, height), still=canvas)
     for person, body in zip(ids, bodies, strict=True):
         ((u, v),) = near.project(body[np.argmax(body[:, 2])][None]).tolist()
         if 0.0 <= u < width and 0.0 <= v < height:
             draw_label(axes, f"{person}", (u, v), (0, 8), person_color(int(person)))
-    axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 

@@ -22,6 +22,7 @@ from worldpose.reports.drawing import (
     draw_skeleton,
     markings,
     person_color,
+    picture_panels,
     png,
     style,
 )
@@ -146,20 +147,14 @@ def plot_before_after(
     gone = shown - before.project(tracks.joints[frame, person])
     moved = float(np.nanmean(np.linalg.norm(gone, axis=-1)))
     titles = ("before", f"after: moved by {moved:.1f} px")
-    figure = Figure(figsize=(14.0, 5.6), dpi=110, layout="constrained", facecolor="white")
-    for axes, camera, title in zip(figure.subplots(1, 2), (before, after), titles, strict=True):
-        axes.imshow(still, zorder=0, interpolation="nearest")
+    side = tall * np.array([2.6, 1.7])
+    figure, panels = picture_panels(titles, middle - 0.5 * side, side, still=still)
+    for axes, camera in zip(panels, (before, after), strict=True):
         for line in markings(pitch) if pitch is not None else ():
             axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
         for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
             draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
         axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
-        axes.set(
-            xlim=(middle[0] - 1.3 * tall, middle[0] + 1.3 * tall),
-            ylim=(middle[1] + 0.85 * tall, middle[1] - 0.85 * tall),
-        )
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 
@@ -196,13 +191,11 @@ def plot_flow(
         predicted: (n, 2) positions predicted by the estimated camera [px].
     """
     height, width = still.shape[:2]
-    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.5), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots()
-    axes.imshow(still, zorder=0)
     longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))
     # The longest arrow is 6 % of the image width: motion from one frame to the next is small.
     stretch = max(1.0, 0.06 * width / longest)
+    title = f"optical flow, lengthened {stretch:.0f} times"
+    figure, (axes,) = picture_panels([title], (-0.5, -0.5), (width, height), still=still)
     for chosen, color, label in (
         (~rejected, PALETTE[5], f"{int((~rejected).sum())} move with the camera"),
         (rejected, PALETTE[1], f"{int(rejected.sum())} rejected"),
@@ -222,12 +215,7 @@ def plot_flow(
         )
     goes = start + (predicted - start) * stretch
     axes.plot(*goes.T, "o", color=TEMPLATE, markersize=2.6, label="estimated camera", zorder=2)
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
-    style(axes)
     axes.legend(loc="lower right", framealpha=0.85, fontsize=11)
-    axes.set_title(
-        f"optical flow, lengthened {stretch:.0f} times", color=INK, loc="left", fontsize=12
-    )
     return png(figure)
 
 

@@ -30,6 +30,7 @@ from worldpose.reports.drawing import (
     draw_skeleton,
     markings,
     person_color,
+    picture_panels,
     png,
     style,
 )
@@ -139,21 +140,12 @@ def plot_camera_view(
         pitch: draw its markings; None without a pitch.
     """
     width, height = (int(n) for n in camera.image_size)
-    figure = Figure(figsize=(14.0, 14.0 * height / width + 0.4), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots()
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-    axes.set_facecolor(GRASS)
-    axes.set(xticks=[], yticks=[])
-    style(axes)
-    if still is not None:
-        axes.imshow(still, zorder=0)
+    figure, (axes,) = picture_panels([title], (-0.5, -0.5), (width, height), still=still)
     line_color = LINE if still is None else TEMPLATE
     for line in markings(pitch) if pitch is not None else ():
         axes.plot(*camera.project(line).T, color=line_color, linewidth=1.3, zorder=1)
     for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
         draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
-    axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 
@@ -252,6 +244,8 @@ def visible_ground(camera: Camera) -> NDArray[np.float64]:
 
 USED: Final = PALETTE[5]
 LEFT_OUT: Final = PALETTE[1]
+FLOOR: Final = "#f6f6f6"
+"""Colour of the ground without a pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,31 +294,14 @@ def plot_detections(
     boxes, joints = detections.boxes, people.joints
     whole = joints[np.isfinite(joints).all((-1, -2))]
     corner, side = crowded_part(camera, whole) if part is None else part
-    shape = side[1] / side[0]
-    figure = Figure(figsize=(14.0, 7.0 * shape + 0.5), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    before, after = figure.subplots(1, 2)
     there = np.isfinite(boxes).all(-1)
     found = np.isfinite(joints).any((-1, -2))
-    titles = ("detections", "reconstruction")
+    titles = ["detections", "reconstruction"]
     if part is None:
-        titles = (
-            f"detections: {int(there.sum())}",
-            f"reconstruction: {int(found.sum())} people",
-        )
-    for axes, title in zip((before, after), titles, strict=True):
-        axes.set(
-            xlim=(corner[0], corner[0] + side[0]),
-            ylim=(corner[1] + side[1], corner[1]),
-            aspect="equal",
-            xticks=[],
-            yticks=[],
-        )
-        axes.set_facecolor(GRASS if pitch is not None else "#f6f6f6")
-        style(axes)
-        if still is not None:
-            axes.imshow(still, zorder=0)
-        axes.set_title(title, color=INK, loc="left", fontsize=12)
+        titles[0] += f": {int(there.sum())}"
+        titles[1] += f": {int(found.sum())} people"
+    ground = GRASS if pitch is not None else FLOOR
+    figure, (before, after) = picture_panels(titles, corner, side, still=still, ground=ground)
     for number in np.flatnonzero(there):
         color = USED if number in detections.used else LEFT_OUT
         _box(before, boxes[number], color, dashed=False)

@@ -9,27 +9,30 @@ from typing import Final
 import cv2
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from data_contracts.pitch import PitchSpec
 from worldpose.geometry import Camera
 from worldpose.reports.drawing import (
-    GRASS,
     HALO,
     INK,
     LINE,
     TEMPLATE,
     draw_label,
     markings,
+    picture_panels,
     png,
+    show_image,
     style,
 )
 
 ACCEPTED: Final = "#0072b2"
 REFUSED: Final = "#d55e00"
 
+MAP_HEIGHT: Final = 790
+"""Height of the map of expected errors in its figure [px]."""
 ERROR_RANGE: Final = (0.005, 1.0)
 """Range of expected ground errors of the colour scale [m]."""
 
@@ -84,19 +87,12 @@ def plot_calibration(
         error_map: coverage map; None = no map.
     """
     width, height = (int(n) for n in camera.image_size)
-    heights = [14.0 * height / width + 0.4] + ([] if error_map is None else [7.2])
-    figure = Figure(figsize=(14.0, sum(heights)), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    below = 0 if error_map is None else MAP_HEIGHT
+    figure, (axes,) = picture_panels(
+        [title], (-0.5, -0.5), (width, height), still=still, below=below
+    )
     if error_map is not None:
-        _draw_error_map(parts[1], error_map, pitch)
-    axes = parts[0].subplots()
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-    axes.set(xticks=[], yticks=[])
-    axes.set_facecolor(GRASS)
-    style(axes)
-    if still is not None:
-        axes.imshow(still, zorder=0)
+        _draw_error_map(figure, error_map, pitch)
     for line in markings(pitch):
         color = TEMPLATE if still is not None else LINE
         axes.plot(*camera.project(line).T, color=color, linewidth=1.2, zorder=1)
@@ -115,14 +111,14 @@ def plot_calibration(
         if not click.inlier:
             x, y = click.place
             draw_label(axes, click.name, (float(x), float(y)), (9, 7), REFUSED)
-    axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
 
 
-def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) -> None:
-    axes = figure.subplots()
-    axes.set_aspect("equal")
-    axes.set_facecolor("#ececec")
+def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> None:
+    """Draw the map in the lowest `MAP_HEIGHT` pixels of a figure."""
+    high = MAP_HEIGHT / (figure.dpi * figure.get_size_inches()[1])
+    axes = figure.add_axes((0.05, 0.08 * high, 0.75, 0.84 * high))
+    axes.set(aspect="equal", anchor="E", facecolor="#ececec")
     shades = axes.pcolormesh(
         error_map.x,
         error_map.y,
@@ -137,7 +133,8 @@ def _draw_error_map(figure: SubFigure, error_map: ErrorMap, pitch: PitchSpec) ->
     axes.set_xlabel("x, along the touch line [m]", color=INK)
     axes.set_ylabel("y, across [m]", color=INK)
     style(axes)
-    bar = figure.colorbar(shades, ax=axes, extend="both", shrink=0.9)
+    beside = figure.add_axes((0.83, 0.12 * high, 0.015, 0.76 * high))
+    bar = figure.colorbar(shades, cax=beside, extend="both")
     bar.set_label("expected ground error [m]", color=INK)
     bar.set_ticks([0.01, 0.03, 0.1, 0.3, 1.0], labels=["0.01", "0.03", "0.1", "0.3", "1"])
     axes.set_title("Grey: outside the image", color=INK, loc="left", fontsize=11)
@@ -217,19 +214,15 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     distance = distance_to(paint)
     off = marking_distances(camera, pitch, distance)
     height, width = paint.shape
-    figure = Figure(figsize=(14.0, 7.0 * height / width + 0.4), dpi=110, facecolor="white")
-    figure.set_layout_engine("constrained")
-    left, right = figure.subplots(1, 2)
-    left.imshow(np.where(paint, 255, 18).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
+    figure, (left, right) = picture_panels(
+        ["detected paint", "distance to the paint: brighter is farther"],
+        (-0.5, -0.5),
+        (width, height),
+    )
+    show_image(left, np.where(paint, 255, 18).astype(np.uint8))
     # The square root makes distances of a few pixels visible.
-    right.imshow(np.sqrt(np.minimum(distance, MAX_DISTANCE_PX)), cmap="gray", vmin=0.0)
+    grey = np.sqrt(np.minimum(distance, MAX_DISTANCE_PX))
+    show_image(right, np.rint(255.0 * grey / max(float(grey.max()), 1.0)).astype(np.uint8))
     for line in markings(pitch):
         right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
-    for axes, title in (
-        (left, "detected paint"),
-        (right, "distance to the paint: brighter is farther"),
-    ):
-        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
-        style(axes)
-        axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure), float((off < ON_PAINT_PX).mean()) if len(off) else float("nan")
