@@ -205,8 +205,17 @@ def _machines(
             require_room(failure, store.url)
             raise
         if cluster is not None:
+            _import_tasks(missing)  # a core is idle until the first worker has started
             wait_for_worker(cluster)
         yield request, ask_for
+
+
+def _import_tasks(missing: Iterable[PlannedUnit]) -> None:
+    """Import what the flow would import when it starts and with each stage's first unit."""
+    stages = sorted({unit.recipe.stage for unit in missing})
+    tasks = ("batch", *stages)
+    for name in ("prefect.flow_engine", "prefect_dask", *(f"tasks.{task}" for task in tasks)):
+        importlib.import_module(name)
 
 
 def _no_more(workers: int) -> None:

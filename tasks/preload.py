@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 
 import dask
 from distributed import Scheduler, Worker
 
 from tasks.tracing import flush_spans, start_tracing
+from worldpose.compiled import load_compiler
 
 gc.disable()
 # Before Prefect is imported with the first task: it would send telemetry.
@@ -31,6 +33,9 @@ def dask_setup(node: Worker | Scheduler) -> None:
     start_tracing()
     gc.freeze()
     gc.enable()
+    if isinstance(node, Worker):
+        # Until the flow sends its first task.
+        threading.Thread(target=load_compiler, daemon=True).start()
 
 
 def dask_teardown(node: Worker | Scheduler) -> None:
