@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 import logging
+import os
 import sys
 import tempfile
 import traceback
@@ -15,6 +16,8 @@ import traceback
 
 def main() -> None:
     """Run the command line; a user error becomes one message and an exit code."""
+    # Pydantic would search all installed packages for plugins, in each process of a run.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Imported here: every process of a run imports this module again, but needs no command.
     from flows.cli.app import app
     from flows.cli.console import errors, line
