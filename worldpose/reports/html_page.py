@@ -247,7 +247,7 @@ LARGE: Final = 200_000
 QUALITY: Final = 88
 """WebP quality that keeps lines of one pixel sharp."""
 EFFORT: Final = 2
-"""Effort to find a small WebP, of 6: the usual 4 takes twice as long, for 5 % of the size."""
+"""Effort to find a small WebP, of 6: the usual 4 takes twice as long, for 2 to 4 % of the size."""
 
 SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 """Kind, content, and size (width, height) [px] of an image."""
