@@ -27,11 +27,22 @@ import zarr
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "tiny": (["--scenario", "tiny", "--seed", "11", "--no-stills"], []),
-    "tiny-broadcast": (["--scenario", "tiny-broadcast", "--seed", "12", "--no-stills"], []),
-    "penalty-box": (["--scenario", "penalty-box", "--seed", "13", "--no-stills"], []),
     "match": (
         ["--scenario", "match", "--seed", "14", "--duration", "1", "--no-stills"],
         ["--iterations", "2"],
+    ),
+    "hard": (["--scenario", "hard", "--seed", "15", "--duration", "0.6", "--no-stills"], []),
+    "penalty-box": (["--scenario", "penalty-box", "--seed", "13", "--duration", "1"], []),
+    "tiny-broadcast": (["--scenario", "tiny-broadcast", "--seed", "12", "--no-stills"], []),
+    "broadcast-pan": (["--scenario", "broadcast-pan", "--seed", "16", "--duration", "1"], []),
+    "broadcast-zoom": (["--scenario", "broadcast-zoom", "--seed", "17", "--duration", "1"], []),
+    "two-cameras": (
+        ["--scenario", "tiny", "--seed", "18", "--cameras", "2", "--duration", "1", "--no-stills"],
+        [],
+    ),
+    "rendered": (
+        "--scenario tiny --seed 19 --cameras 3 --duration 0.4 --render".split(),
+        ["--set", "detection.stride=2"],
     ),
 }
 """Options of `worldpose simulate` and `worldpose run`."""
