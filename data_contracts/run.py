@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Final, Literal
 
@@ -109,6 +110,13 @@ GatePolicy = Literal["auto", "always", "never"]
 """When results need approval: if metrics exceed their limits, always, or never."""
 
 RunState = Literal["complete", "waiting", "partial", "failed"]
+EXIT_CODES: Final[Mapping[RunState, int]] = {
+    "complete": 0,
+    "failed": 1,
+    "waiting": 3,
+    "partial": 4,
+}
+"""State of a run to the exit code of `worldpose run`."""
 
 
 BODY_STAGES: Final = ("body_fitting", "refitting")

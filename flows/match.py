@@ -28,7 +28,7 @@ from flows.orchestration.time_limits import TimeLimits, seconds_of
 from flows.progress import reporter
 from flows.registering import open_for_review, open_match
 from flows.run_plan import PlannedUnit
-from flows.run_record import RunLog
+from flows.run_record import RunLog, describe_end
 from flows.settings import selected_stages
 from flows.stage import Stage
 from worldpose.errors import WorldposeError
@@ -67,10 +67,7 @@ class IncompleteRunError(WorldposeError):
 
     def __init__(self, record: RunRecord) -> None:
         self.run_id = record.run_id
-        super().__init__(
-            f"run {record.run_id} of {record.match_id}: {len(record.failed)} units failed, "
-            f"{len(record.waiting)} wait for review, {len(record.blocked)} are blocked"
-        )
+        super().__init__(describe_end(record))
 
 
 @flow(name="match", flow_run_name="{match_id}", validate_parameters=False)

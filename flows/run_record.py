@@ -53,6 +53,19 @@ def latest_run(store: Store, match_id: str) -> RunRecord | None:
     return record.model_copy(update=renamed)
 
 
+def describe_end(record: RunRecord) -> str:
+    """Return a sentence about how a run ended that is not complete."""
+    counts = (
+        (len(record.failed), "unit failed", "units failed"),
+        (len(record.waiting), "waits for review", "wait for review"),
+        (len(record.blocked), "is blocked", "are blocked"),
+    )
+    said = [f"{count} {one if count == 1 else many}" for count, one, many in counts if count]
+    if record.state == "partial" and not record.failed:
+        said = [f"partial, not all stages have results. {' '.join(record.warnings)}", *said]
+    return f"run {record.run_id} of {record.match_id}: {', '.join(said)}"
+
+
 CLOCK_SECONDS: Final = 5.0
 """Tolerance between the clocks of a process table and of records [s]."""
 

@@ -21,7 +21,7 @@ from flows.gates import Gatekeeper
 from flows.method import METHOD
 from flows.registering import open_match
 from flows.renames import rename_settings
-from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
+from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
 from flows.run_record import latest_run
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
@@ -134,6 +134,21 @@ def unit_state(unit: PlannedUnit, record: RunRecord | None) -> UnitState:
     if unit.published:
         return UnitState.CURRENT if recorded == unit.key else UnitState.READY
     return UnitState.MISSING if recorded in (None, unit.key) else UnitState.STALE
+
+
+def list_unit_states(
+    store: Store, match: Match, latest: RunRecord | None
+) -> dict[UnitState, list[str]]:
+    """Return all units of a match, as `stage/unit`, by their state relative to its latest run.
+
+    Raises:
+        InputError: a setting of that run names a missing file.
+    """
+    asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
+    units: dict[UnitState, list[str]] = {state: [] for state in UnitState}
+    for unit in plan_run(store, match, asked, iteration=iteration):
+        units[unit_state(unit, latest)].append(unit.name)
+    return units
 
 
 def recorded_differences(

@@ -38,7 +38,10 @@ VerboseOption = Annotated[
 MatchArgument = Annotated[
     str, typer.Argument(metavar="MATCH", help="A match folder, or the id of a registered match.")
 ]
-RunOption = Annotated[str, typer.Option("--run", help="A run's number or name; latest by default.")]
+RunOption = Annotated[
+    str,
+    typer.Option("--run", help="A run's number or name; by default the latest, with results."),
+]
 StageOption = Annotated[
     str | None, typer.Option("--stage", help="Stage of the joints; the last by default.")
 ]

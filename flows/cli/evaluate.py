@@ -144,6 +144,8 @@ def evaluate(
         match_in=match_in,
         marker_map=markers,
     )
+    if scores.later_run:
+        line(scores.later_run, to=errors)
     _print_scores(scores, as_json=as_json)
 
 

@@ -20,9 +20,8 @@ from flows.cli.console import (
 )
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
-from flows.run_plan import plan_run
 from flows.run_record import latest_run
-from flows.run_status import UnitState, unit_state
+from flows.run_status import UnitState, list_unit_states
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair
 from worldpose.store import verify as verify_store
@@ -130,16 +129,14 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
     waiting: list[WaitingUnit] = []
-    asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
     try:
         match = open_match(store, match_id)
-        planned = plan_run(store, match, asked, iteration=iteration)
+        found = list_unit_states(store, match, latest)
     except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
         problem = str(failure)
     else:
         waiting = still_waiting(store, match, latest)
-        for unit in planned:
-            units[unit_state(unit, latest).value].append(unit.name)
+        units = {state.value: names for state, names in found.items()}
     return {
         "match": match_id,
         "run": None if latest is None else latest.run_id,

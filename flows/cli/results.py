@@ -16,11 +16,13 @@ from flows.cli.console import (
     ProjectOption,
     RunOption,
     StageOption,
+    errors,
     line,
     print_json,
 )
 from worldpose.errors import InputError, UsageError
-from worldpose.store import Store, open_run
+from worldpose.store import Store
+from worldpose.store.runs import LATEST
 
 
 def export(
@@ -78,7 +80,7 @@ def export(
     Example: worldpose export tiny-1 --format joints --out exported
     """
     from flows.registering import find_registration, open_match
-    from flows.results.best_results import Footage, Origin
+    from flows.results.best_results import Footage, Origin, describe_later_run, open_results
     from flows.results.export import export as export_formats
     from flows.results.export import release as write_release
 
@@ -100,8 +102,11 @@ def export(
     store = Store.open(project)
     registration = find_registration(store, match)
     name = registration.spec.match_id
+    opened = open_results(store, name, run)
+    if run == LATEST and (later := describe_later_run(store, opened.record)):
+        line(later, to=errors)
     origin = Origin(
-        open_run(project, name, run, complete=True),
+        opened,
         registration,
         stage,
         filled=filled,
@@ -188,14 +193,18 @@ def report(
     """
     from flows.registering import find_match
     from flows.reports.report import write_report
+    from flows.results.best_results import describe_later_run, open_results
 
     store = Store.open(project)
     known = find_match(store, match)
+    opened = open_results(store, known.match_id, run).record
+    if run == LATEST and (later := describe_later_run(store, opened)):
+        line(later, to=errors)
     films = write_report(
         store,
         known,
         out,
-        run_id=run,
+        run_id=opened.run_id,
         reference=reference,
         videos=videos,
         camera=camera,

@@ -13,7 +13,7 @@ import typer
 from pydantic import JsonValue
 
 from data_contracts.records import field_docstrings
-from data_contracts.run import GatePolicy, RunRecord
+from data_contracts.run import EXIT_CODES, GatePolicy, RunRecord
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -43,7 +43,6 @@ from worldpose.store import Store
 if TYPE_CHECKING:
     from flows.results.comparison import Mark
 
-EXIT_CODES = {"complete": 0, "failed": 1, "waiting": 3, "partial": 4}
 MAX_LISTED = 5
 """Number of waiting units listed by name."""
 

@@ -28,7 +28,14 @@ from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.disagreements import disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
-from flows.results.best_results import broadcast_cameras, clips_of, joint_tracks, static_cameras
+from flows.results.best_results import (
+    broadcast_cameras,
+    clip_positions,
+    clips_of,
+    joint_tracks,
+    open_results,
+    static_cameras,
+)
 from flows.results.evaluation import load_reference, score
 from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
@@ -39,7 +46,7 @@ from worldpose.reports import CaptionedImage, LinkedFile, Section, Table, report
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.drawing import keep_figures, write_figure
 from worldpose.reports.run_report import camera_table
-from worldpose.store import Run, Store, open_run
+from worldpose.store import Run, Store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,11 +84,11 @@ def write_report(
     """
     if camera is not None:
         _check_film(match, camera)
-    run = open_run(store.url, match.match_id, run_id, complete=True)
+    run = open_results(store, match.match_id, run_id)
     source = reference or _own_reference(match)
     scores: Evaluation | None = None
     if source is not None and len(clips_of(run.record)) == 1:
-        scores = score(match.match_id, source, store.url, run_id=run_id).evaluation
+        scores = score(match.match_id, source, store.url, run_id=run.record.run_id).evaluation
     with ThreadPoolExecutor(1) as painter:
         # Painting and encoding leave the interpreter to the figures for much of their time.
         filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
@@ -245,6 +252,16 @@ def extent_of(run: Run, match: Match) -> DataSetStatistics:
     return data_set_statistics(clips)
 
 
+def _placed_extent(run: Run, match: Match) -> DataSetStatistics:
+    """Count as `extent_of` does, with the people whom only their feet place."""
+    clips = {}
+    for clip in clips_of(run.record):
+        xy = clip_positions(run, clip).xy
+        places = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1)
+        clips[clip] = clip_statistics(places, match.folder.spec.fps)
+    return data_set_statistics(clips)
+
+
 def extent_section(run: Run, match: Match) -> Section:
     """Return the data set table row, its histograms, and each clip's share."""
     return counted_section(extent_of(run, match))
@@ -252,14 +269,14 @@ def extent_section(run: Run, match: Match) -> Section:
 
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
     """Return the key metrics for the top of the report."""
-    found = extent_of(run, match)
-    people = sum(clip.persons for clip in found.clips.values())
+    found, placed = extent_of(run, match), _placed_extent(run, match)
+    in_3d, people = (sum(clip.persons for clip in each.clips.values()) for each in (found, placed))
     tiles = [
         (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_count_text(found)}"),
-        (f"{people}", "people"),
+        (f"{people}", "people" if in_3d == people else f"people on the pitch, {in_3d} with joints"),
         (f"{found.poses:,}", "3D poses"),
         (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
-        (f"{1000.0 * found.distance_km:,.0f} m", "run and walked by all"),
+        (f"{1000.0 * placed.distance_km:,.0f} m", "run and walked by all"),
     ]
     if scores is not None and scores.mpjpe_mm is not None and np.isfinite(scores.mpjpe_mm):
         tiles.append((f"{scores.mpjpe_mm:.0f} mm", "mean error of a joint, against the truth"))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +12,20 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.match import MatchSpec, Registration
 from data_contracts.pitch import PitchSpec
-from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord
+from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Track
 from flows.stage import Match
 from worldpose.body import BodyModel, BodyParameters, find_body
 from worldpose.body_fitting import perceived_joints, perceived_points, random_covariance
-from worldpose.errors import InputError, UsageError, WorldposeError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats import JointTracks
 from worldpose.formats.joints_file import ExtraTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry import Camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store import Run, Store
+from worldpose.store import Run, Store, open_run
+from worldpose.store.runs import LATEST
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,20 +42,74 @@ ADJUSTED = "bundle_adjustment/cameras"
 """Result with all static cameras after adjustment."""
 
 
+def find_clips(record: RunRecord) -> tuple[str, ...]:
+    """Return the clips for which a run has joints, or people on the pitch; empty without any."""
+    units = [unit.partition("/") for unit in record.results]
+    return tuple(sorted({unit for stage, _, unit in units if stage in (*JOINT_STAGES, PLANE)}))
+
+
 def clips_of(record: RunRecord) -> tuple[str, ...]:
     """Return the clips for which a run has joints, or people on the pitch.
 
     Raises:
-        WorldposeError: there are no such clips.
+        InputError: there are no such clips.
     """
-    units = [unit.partition("/") for unit in record.results]
-    clips = tuple(sorted({unit for stage, _, unit in units if stage in (*JOINT_STAGES, PLANE)}))
+    clips = find_clips(record)
     if not clips:
-        raise WorldposeError(
-            f"run {record.run_id} of {record.match_id}: expected results of {JOINT_STAGES[0]}, "
-            f"found {', '.join(record.results) or 'none'}. Run the match to the end first."
+        stages = dict.fromkeys(name.partition("/")[0] for name in record.results)
+        todo = f"Run the match to the end first: worldpose run {record.match_id}."
+        if record.state == "waiting":
+            units = ", ".join(unit.unit for unit in record.waiting)
+            todo = f"First decide the pending review of {units}: worldpose review serve. {todo}"
+        raise InputError(
+            f"run {record.run_id} of {record.match_id}, which {RUN_ENDS[record.state]}",
+            expected="people, in 3D or on the pitch",
+            found=f"results of {', '.join(stages)}" if stages else "no results",
+            todo=todo,
         )
     return clips
+
+
+RUN_ENDS: Final[Mapping[RunState, str]] = {
+    "complete": "is complete",
+    "partial": "is partial",
+    "waiting": "waits for review",
+    "failed": "failed",
+}
+"""State of a finished run, as a predicate."""
+
+
+def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
+    """Open a run; for `latest`, the latest run with people, in 3D or on the pitch.
+
+    A run that waits for review or failed comes after all others: it can lack results that an
+    earlier run has. If no run has people, `latest` is the latest run.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    fallback = None
+    for number in reversed(store.runs(match_id)) if run_id == LATEST else ():
+        record = store.run(match_id, number)
+        if not find_clips(record):
+            continue
+        if record.state in ("complete", "partial"):
+            fallback = number
+            break
+        fallback = fallback or number
+    return open_run(store.url, match_id, fallback or run_id, complete=True)
+
+
+def describe_later_run(store: Store, record: RunRecord) -> str:
+    """Return a sentence about a match's latest run if it is later than `record`, else nothing."""
+    latest = store.run(record.match_id)
+    if latest.run_id == record.run_id:
+        return ""
+    lacks = "" if find_clips(latest) else " and has no people"
+    return (
+        f"These are results of run {record.run_id}. The later run {latest.run_id} "
+        f"{RUN_ENDS[latest.state]}{lacks}."
+    )
 
 
 def clip_title(clip: str) -> str:

@@ -13,7 +13,9 @@ from flows.registering import find_match
 from flows.results.best_results import (
     broadcast_cameras,
     clips_of,
+    describe_later_run,
     joint_tracks,
+    open_results,
     static_cameras,
 )
 from worldpose.errors import InputError, UsageError
@@ -31,7 +33,8 @@ from worldpose.formats import JointTracks, read_camera, read_joints
 from worldpose.geometry import Camera
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.pitch import PitchTemplate
-from worldpose.store import Store, open_run
+from worldpose.store import Store
+from worldpose.store.runs import LATEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,8 @@ class Scores:
     cameras: tuple[CameraScore, ...]
     alignment: ReferenceAlignment | None = None
     """Alignment of markers to the prediction, if markers are the ground truth."""
+    later_run: str = ""
+    """A sentence about a later run than that of the prediction, if there is one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,8 @@ class Side:
     """By static camera, or by clip for the broadcast camera."""
     match: MatchFolder | None = None
     """The match it belongs to, if known."""
+    later_run: str = ""
+    """A sentence about a later run of the match, if there is one."""
 
 
 def score(
@@ -74,7 +81,7 @@ def score(
         reference: a joints file, a folder with `joints.npz`, `cameras/` or both, or a C3D or TRC
             file of markers, which is aligned with the prediction in time and space.
         project: project with the runs of matches.
-        run_id: number of the match's run; only if `prediction` is a match.
+        run_id: the match's run as for `open_results`; only if `prediction` is a match.
         stage: stage whose joints are scored if `prediction` is a match; None = the last one with
             joints.
         fps: frames per second; None = the match's, if there is one.
@@ -123,7 +130,8 @@ def score(
             found=f"{_contents(estimate)} against {_contents(truth)}",
             todo="Name files or folders with the same kind of data.",
         )
-    return Scores(evaluation.model_copy(update={"cameras": errors}), people, cameras, alignment)
+    evaluation = evaluation.model_copy(update={"cameras": errors})
+    return Scores(evaluation, people, cameras, alignment, estimate.later_run)
 
 
 def _align_markers(
@@ -172,12 +180,14 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     path = Path(name)
     if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
         return reference_side(name)
-    match = find_match(Store.open(project), name)
-    run = open_run(project, match.match_id, run_id, complete=True)
+    store = Store.open(project)
+    match = find_match(store, name)
+    run = open_results(store, match.match_id, run_id)
+    later = describe_later_run(store, run.record) if run_id == LATEST else ""
     spec = match.folder.spec
     placed = any(unit.partition("/")[0] in JOINT_STAGES for unit in run)
     if not placed and truth.cameras and (cameras := static_cameras(run, spec)):
-        return Side(None, cameras, match.folder)
+        return Side(None, cameras, match.folder, later)
     clips = clips_of(run.record)
     if len(clips) > 1:
         raise UsageError(
@@ -187,7 +197,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
             todo="Export the match and score clip by clip.",
         )
     cameras = static_cameras(run, spec, stage) | broadcast_cameras(run) if truth.cameras else {}
-    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder)
+    return Side(joint_tracks(run, clips[0], stage), cameras, match.folder, later)
 
 
 def cameras_of(reference: str, truth: Side, spec: MatchSpec | None) -> dict[str, Camera]:

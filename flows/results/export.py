@@ -304,6 +304,13 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
 
     def write(place: Path) -> list[Path]:
         written = _export(origin, forms, place)
+        if not written:
+            raise InputError(
+                f"--format {' --format '.join(forms)}",
+                expected="a person with joints",
+                found="none: people have positions on the pitch only, or there are none",
+                todo="Choose a format of positions: positions, minimap or csv.",
+            )
         for clip in origin.clips if origin.filled and out.suffix != VIEWER_SUFFIX else ():
             tracks = origin.tracks(clip)
             written.append(place / "origins" / f"{clip}.npz")

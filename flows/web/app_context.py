@@ -14,10 +14,12 @@ from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 
+from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
+from flows.run_record import describe_end, latest_run
 from flows.service.match_runs import (
     AT_WORK,
     QUEUED,
@@ -154,7 +156,12 @@ class Continuing:
         last = seen.latest.get(match_id)
         if last is None or last.state not in ("FAILED", "CRASHED"):
             return None
-        return {"state": "ended", "code": 1, "lines": [last.message], "prefect": last.link}
+        code, message = 1, last.message
+        record = latest_run(self.store, match_id)
+        if record is not None and f"run {record.run_id} of {match_id}:" in message:
+            # The flow failed because its run is not complete: the record says how it ended.
+            code, message = EXIT_CODES[record.state], describe_end(record)
+        return {"state": "ended", "code": code, "lines": [message], "prefect": last.link}
 
     def links(self) -> dict[str, str]:
         """Return the page of each match's latest run at Prefect; empty without an answer."""

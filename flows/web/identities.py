@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from flows.results.best_results import static_cameras
+from flows.reports.match_pictures import frame_picture
+from flows.review.detections import detections_now
 from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext
-from worldpose.ingest import unit_frames
 from worldpose.review.identities import Identities, find_sighting
 from worldpose.store import Store, open_run
-from worldpose.video import open_video
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 TRAJECTORY_POINTS: Final = 300
 """Points of a person's trajectory that are sent."""
 HIPS: Final = (11, 12)
 """Indices of the hips in COCO-17."""
-CROP_HALF_HEIGHT_M: Final = 1.6
-"""Half the height of a person's crop [m]."""
+CROP_HALF_HEIGHT: Final = 0.9
+"""Half the height of a person's crop, as a multiple of the height of the person's box."""
 
 
 def routes(context: PageContext) -> APIRouter:
@@ -43,6 +45,7 @@ def routes(context: PageContext) -> APIRouter:
         first = int(found.frame[0])
         step = max(1, len(found.frame) // TRAJECTORY_POINTS)
         pitch = match.folder.pitch
+        ways = _ways(found, open_run(context.store.url, match_id)[f"tracking/{clip}"])
         return {
             "clip": clip,
             "fps": spec.fps,
@@ -52,7 +55,7 @@ def routes(context: PageContext) -> APIRouter:
             "pitch": None if pitch is None else {"length": pitch.length, "width": pitch.width},
             "roster": [each.id for each in spec.roster],
             "has_video": any(camera in match.folder.videos for camera in found.cameras),
-            "people": [_person(found, track.person, step) for track in found.tracks],
+            "people": [_person(found, ways, track.person, step) for track in found.tracks],
             "joins": [
                 {
                     **join.model_dump(mode="json"),
@@ -73,7 +76,7 @@ def routes(context: PageContext) -> APIRouter:
     return router
 
 
-def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
+def _person(found: Identities, ways: NDArray[np.float64], person: int, step: int) -> dict[str, Any]:
     k = found.person.tolist().index(person)
     views = np.count_nonzero(found.detection_index[:, :, k] >= 0, axis=1)
     bounds = np.flatnonzero(np.diff(np.concatenate([[0], views > 0, [0]])))
@@ -90,18 +93,33 @@ def _person(found: Identities, person: int, step: int) -> dict[str, Any]:
         "views": round(float(views[views > 0].mean()), 1),
         "way": [
             None if np.isnan(place).any() else np.round(place, 2).tolist()
-            for place in _ways(found.joints[:, k])[::step]
+            for place in ways[::step, k]
         ],
     }
 
 
-def _ways(joints: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return a person's ground position (frames, 2) [m], NaN if unknown."""
-    hips = joints[:, HIPS, :2].astype(np.float64)
-    known = np.asarray(np.isfinite(hips).all(axis=2))
-    total = np.where(known[..., None], hips, 0.0).sum(axis=1)
-    count = known.sum(axis=1)[:, None]
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def _ways(found: Identities, tracked: xr.Dataset) -> NDArray[np.float64]:
+    """Return the ground positions (frames, persons, 2) [m]: mid-hips or feet, NaN if unknown.
+
+    Args:
+        found: identities with all corrections.
+        tracked: the tracks of the latest run, which have the places of feet.
+    """
+    hips = found.joints[:, :, HIPS, :2].astype(np.float64)
+    known = np.asarray(np.isfinite(hips).all(axis=3))
+    total = np.where(known[..., None], hips, 0.0).sum(axis=2)
+    count = known.sum(axis=2)[..., None]
+    ways = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    if "ground" not in tracked:
+        return ways
+    ground, stored = tracked["ground"].values, tracked["detection_index"].values
+    for k in np.flatnonzero(found.on_plane.any(axis=0)):
+        own = found.detection_index[:, :, k, None]
+        is_same = ((stored == own) & (own >= 0)).any(axis=1)  # (frames, tracked people)
+        feet = ground[np.arange(len(ground)), is_same.argmax(axis=1)]
+        is_placed = found.on_plane[:, k] & is_same.any(axis=1) & np.isnan(ways[:, k, 0])
+        ways[is_placed, k] = feet[is_placed]
+    return ways
 
 
 def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> bytes:
@@ -113,29 +131,23 @@ def _crop(store: Store, match: Match, found: Identities, person: int, frame: int
     import cv2  # imported here: few pages decode an image
 
     k, f = found.person.tolist().index(person), int(np.searchsorted(found.frame, frame))
-    joints = found.joints[f, k].astype(np.float64)
-    known = joints[np.isfinite(joints).all(axis=1)]
-    if not len(known):
-        raise HTTPException(404, "the person is not present")
-    middle = known.mean(axis=0)
-    cameras = static_cameras(open_run(store.url, match.match_id), match.folder.spec)
-    best: tuple[float, str, NDArray[np.float64]] | None = None
+    best: tuple[float, str, NDArray[np.float32]] | None = None
     for c, name in enumerate(found.cameras):
-        if found.detection_index[f, c, k] < 0 or name not in match.folder.videos:
+        detection = int(found.detection_index[f, c, k])
+        if detection < 0 or name not in match.folder.videos:
             continue
-        ends = cameras[name].project(
-            middle + np.array([[0, 0, CROP_HALF_HEIGHT_M], [0, 0, -CROP_HALF_HEIGHT_M]])
-        )
-        tall = float(np.linalg.norm(ends[0] - ends[1]))
+        box = detections_now(store, match, name, frame).boxes[0, detection]
+        tall = float(box[3] - box[1])
         if np.isfinite(tall) and (best is None or tall > best[0]):
-            best = (tall, name, cameras[name].project(middle[None])[0])
+            best = (tall, name, box)
     if best is None:
         raise HTTPException(404, "no video shows this person")
-    tall, name, center = best
-    with open_video(match.folder.videos[name]) as video:
-        picture = video.frame(frame + unit_frames(match.folder.spec, name).offset)
-    half = max(16, round(0.5 * tall))
-    x, y = np.round(center).astype(int)
+    tall, name, box = best
+    picture = frame_picture(store, match, name, frame)
+    if picture is None:
+        raise HTTPException(404, "there is no image of this frame")
+    half = max(16, round(CROP_HALF_HEIGHT * tall))
+    x, y = np.round((box[:2] + box[2:]) / 2.0).astype(int)
     piece = picture[max(0, y - half) : y + half, max(0, x - half) : x + half]
     if not piece.size:
         raise HTTPException(404, "the person is out of the picture")

@@ -13,11 +13,13 @@ from typing import Any, Final
 from fastapi import APIRouter
 
 from data_contracts.review import ReviewRequest
+from data_contracts.run import RunRecord
 from data_contracts.static_calibration import ClickedMarkings
 from flows.gates import GATES
 from flows.review.descriptions import review_json
 from flows.review.verdicts import Review, reviews_of, still_waiting
 from flows.run_record import latest_run
+from flows.run_status import list_unit_states
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
@@ -206,8 +208,21 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
         "corrections": corrections,
         "first_clicks": first_clicks,
         "stale": len(match.stale),
+        **_units(store, match, latest),
         "at_work": _at_work(store, context, match.match_id),
     }
+
+
+def _units(store: Store, match: Match, latest: RunRecord | None) -> dict[str, Any]:
+    """Return the numbers of units by state as `worldpose status` has them; None before a run."""
+    if latest is None:
+        return {"units": None, "units_problem": None}
+    try:
+        found = list_unit_states(store, match, latest)
+    except (OSError, WorldposeError) as error:  # a setting can name a missing file
+        return {"units": None, "units_problem": describe_error(error)}
+    counts = {state.value: len(names) for state, names in found.items()}
+    return {"units": counts, "units_problem": None}
 
 
 def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any] | None:

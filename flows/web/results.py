@@ -1,4 +1,4 @@
-"""Results of a complete run in the browser: 3D view, report, overlay videos, and exports."""
+"""Results of a run in the browser: 3D view, report, overlay videos, and exports."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Annotated, Any, Final
 
+import numpy as np
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse, Response
 
@@ -18,17 +19,27 @@ from data_contracts.release import EXPORT_FORMATS, EXPORT_PURPOSES
 from flows.reports.clip_video import clip_view, write_clip_video
 from flows.reports.report import write_report
 from flows.reports.viewer import describe_video, viewer_clip
-from flows.results.best_results import Origin, clips_of, tracked_people
+from flows.results.best_results import (
+    Origin,
+    clips_of,
+    describe_later_run,
+    find_clips,
+    joint_tracks,
+    open_results,
+    tracked_people,
+)
 from flows.results.comparison import compare_runs
 from flows.results.export import export
 from flows.stage import Match
 from flows.web.app_context import PageContext
-from flows.web.browser_words import describe_error
+from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.store import Run, open_run
+from worldpose.store import Run
 
 BINARY: Final = "application/octet-stream"
+POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
+"""Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
 """Files that the server keeps; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
@@ -99,27 +110,43 @@ def _player_names(match: Match, run: Run) -> dict[str, str]:
     return found
 
 
+def why_without_joints(run: Run, clip: str) -> str | None:
+    """Return why no person of a clip has joints in 3D; None if some person has."""
+    if np.isfinite(joint_tracks(run, clip).joints).any():
+        return None
+    unit = f"tracking/{clip}"
+    said = run.manifest(unit).warnings if unit in run else ()
+    reason = " ".join(in_browser(each) for each in said)
+    return reason or "No person of this clip is triangulated, and none has a fitted body."
+
+
 def routes(context: PageContext) -> APIRouter:
-    """Create the routes of the results of a match's latest run."""
+    """Create the routes of the results of a match's latest run that has people."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
     files, shown = _Files(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
-        return match, open_run(context.store.url, match_id, complete=True)
+        return match, open_results(context.store, match_id)
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
         match, run = open_latest(match_id)
-        try:
-            clips = clips_of(run.record)
-        except WorldposeError:  # it ended on purpose before people were placed in 3D
-            return {"run": run.record.run_id, "formats": [], "clips": []}
+        record = run.record
+        clips = find_clips(record)
+        lacking = {clip: why_without_joints(run, clip) for clip in clips}
+        is_3d = not clips or None in lacking.values()
+        formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
         return {
-            "run": run.record.run_id,
-            "formats": list(EXPORT_FORMATS),
+            "run": record.run_id,
+            "state": record.state,
+            "later": describe_later_run(context.store, record),
+            "formats": list(formats),
             "purposes": EXPORT_PURPOSES,
-            "clips": [{"id": clip, "video": clip_view(run, match, clip)} for clip in clips],
+            "clips": [
+                {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
+                for clip in clips
+            ],
         }
 
     @router.get("/metrics")

@@ -22,6 +22,7 @@ from worldpose.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(1800)]  # the run is done three times
 SCRIPT = Path(__file__).with_name("mending_in_browser.mjs")
+SHORTCUTS = Path(__file__).with_name("shortcuts_in_browser.mjs")
 
 
 def say(store, *edits):
@@ -135,3 +136,33 @@ def test_a_swap_and_a_wrong_keypoint_are_mended_and_the_final_figures_improve(
     assert right["switches"] == 0
     assert right["association"] > wrong["association"]
     assert right["mpjpe_mm"] < wrong["mpjpe_mm"]
+
+
+def test_what_is_typed_is_no_shortcut_and_every_correction_can_be_undone(project_copy, tmp_path):
+    store = Store.open(str(project_copy))
+    frames = identities_now(store, open_match(store, TINY), "clip").identities.frame
+    with page_client.serving(project_copy, tmp_path) as base:
+        task = {
+            "base": base,
+            "token": page_client.TOKEN,
+            "match": TINY,
+            "middle": int(frames[len(frames) // 2]),
+        }
+        seen = drive(SHORTCUTS, task, tmp_path, 600)
+        first, number = store.run(TINY), store.reserve_run(TINY)
+        kept = {name: key for name, key in first.results.items() if name.startswith("ingest")}
+        failed = {"run_id": number, "parent": first.run_id, "results": kept, "state": "failed"}
+        store.finish_run(first.model_copy(update=failed))
+        earlier = drive(SHORTCUTS, {**task, "later": True}, tmp_path, 600)
+    assert seen["afterHelp"] == seen["undone"] == seen["unsplit"] == []
+    assert seen["names"] == [[["named_track", 1]]] * 2
+    assert seen["before"] == 0
+    units = seen["units"]
+    assert units["stale"] > 0
+    count = units["stale"] + units["missing"]
+    assert seen["note"] == f"The results are out of date: {count} units to recompute."
+    assert seen["button"] == "Recompute"
+    assert seen["home"] == f"out of date: {count} units to recompute"
+    assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
+    later = "These are results of run 0001. The later run 0002 failed and has no people."
+    assert (earlier["later"], earlier["laterIn3d"], earlier["links"]) == (later, later, 2)

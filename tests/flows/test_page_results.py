@@ -1,18 +1,22 @@
 """The page of a match shows and downloads the results of a complete run."""
 
 import io
+import shutil
 import zipfile
 
 import numpy as np
+import page_client
 import pytest
-from command_line import TINY
+from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from data_contracts.release import EXPORT_FORMATS
+from data_contracts.run import WaitingUnit
 from flows.cli.app import app
 from flows.results.best_results import fitted_bodies
+from flows.results.evaluation import score
 from worldpose.formats.viewer_file import (
     decode_bodies,
     decode_part,
@@ -26,7 +30,8 @@ def test_a_complete_run_gives_its_report_and_its_exports(ada):
     found = ada.get(f"{MATCH}/results").json()
     assert (found["run"], found["formats"]) == ("0001", list(EXPORT_FORMATS))
     assert found["purposes"]["bvh"].startswith("a skeleton in motion for Blender")
-    assert found["clips"] == [{"id": "clip", "video": None}]  # given keypoints: nothing is filmed
+    clip = {"id": "clip", "video": None, "without_joints": None}
+    assert found["clips"] == [clip]  # given keypoints: nothing is filmed
     page = ada.get(f"{MATCH}/results/report")
     assert page.headers["content-type"].startswith("text/html")
     assert "3D view" in page.text
@@ -160,3 +165,66 @@ def test_a_command_writes_one_file(project_copy, tmp_path):
     other = ["export", TINY, "--format", "joints", "--video", "--project", str(project_copy)]
     refused = CliRunner().invoke(app, [*other, "--out", str(tmp_path)])
     assert "--video: expected --format viewer" in str(refused.exception)
+
+
+def add_run(project, state, stages):
+    """Record a later run of a state, with the results of some stages of the first run."""
+    store = Store.open(str(project))
+    first, number = store.run(TINY), store.reserve_run(TINY)
+    kept = {name: key for name, key in first.results.items() if name.startswith(stages)}
+    unit = "static_calibration/cam03"
+    waiting = (WaitingUnit(request="static_calibration.cam03.1", unit=unit, reasons=("x",)),)
+    changed = {"run_id": number, "parent": first.run_id, "state": state, "results": kept}
+    changed["waiting"] = waiting if state == "waiting" else ()
+    store.finish_run(first.model_copy(update=changed))
+
+
+@pytest.mark.parametrize(
+    ("state", "stages", "says"),
+    [
+        ("waiting", ("ingest", "static_calibration"), "waits for review and has no people"),
+        ("failed", ("ingest",), "failed and has no people"),
+        ("complete", ("ingest",), "is complete and has no people"),
+        ("waiting", ("ingest", "tracking", "triangulation"), "waits for review"),
+    ],
+)
+def test_results_stay_reachable_when_a_later_run_has_none(
+    ada, project_copy, tmp_path, state, stages, says
+):
+    add_run(project_copy, state, stages)
+    found = ada.get(f"{MATCH}/results").json()
+    later = f"These are results of run 0001. The later run 0002 {says}."
+    assert (found["run"], found["later"]) == ("0001", later)
+    for path in ("metrics", "report", "scenes/clip", "exports/joints"):
+        assert ada.get(f"{MATCH}/results/{path}").status_code == 200, path
+    for command in (
+        ["report", TINY, "--no-videos", "--out", str(tmp_path / "report.html")],
+        ["export", TINY, "--format", "joints", "--out", str(tmp_path / "out")],
+    ):
+        answer = worldpose(*command, "--project", project_copy)
+        assert (answer.code, later in answer.err) == (0, True), answer.err
+    assert score(TINY, str(tmp_path / "out"), str(project_copy)).later_run == later
+
+
+def test_a_run_without_people_is_a_clear_message(ingested, tmp_path):
+    ada = page_client.log_in(page_client.served(shutil.copytree(ingested, tmp_path / "data")), "A")
+    assert ada.get(f"{MATCH}/results").json()["clips"] == []
+    for path in ("metrics", "report", "scenes/clip", "videos/clip", "exports/joints"):
+        answer = ada.get(f"{MATCH}/results/{path}")
+        assert answer.status_code == 422, path
+        assert "run 0001 of" in answer.json()["error"]
+        assert "found results of ingest" in answer.json()["error"]
+
+
+def test_pages_have_the_units_of_the_status_command_after_a_correction(ada, project_copy):
+    (person, *_) = ada.get(f"{MATCH}/identities/clip").json()["people"]
+    edit = {"kind": "named_track", "clip": "clip", "person": person["id"], "name": "smith"}
+    edit["seen"] = person["seen"]
+    for corrections in (None, {"edits": [{"id": "named_track.1", "edit": edit}]}):
+        if corrections is not None:
+            ada.post(f"{MATCH}/corrections", json=corrections).raise_for_status()
+        (row,) = succeed("status", "--json", "--project", project_copy).json["matches"]
+        units = {state: len(names) for state, names in row["units"].items()}
+        assert (units["stale"] > 0) == (corrections is not None)
+        assert ada.get(MATCH).json()["units"] == units
+        assert ada.get("/api/matches").json()["matches"][0]["units"] == units

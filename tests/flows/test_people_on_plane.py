@@ -1,17 +1,65 @@
 """A match of one camera: no person is triangulated, and every person has a pitch position."""
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
+import page_client
 from command_line import succeed, worldpose
 
 import worldpose as library
+from flows.match import IncompleteRunError
+from flows.web.app_context import Continuing
 from worldpose.formats.viewer_file import decode_part, read_viewer
+from worldpose.store import Store
+from worldpose.video import write_video
+
+
+def check_pages(folder, match):
+    """The pages reach the positions of the run, and say why there is no 3D."""
+    project = folder / "worldpose-data"
+    ada, path = page_client.log_in(page_client.served(project), "Ada"), f"/api/matches/{match}"
+    found = ada.get(f"{path}/results").json()
+    assert (found["state"], found["later"]) == ("partial", "")
+    assert set(found["formats"]) == {"positions", "minimap", "csv", "parquet", "viewer"}
+    for form in found["formats"]:
+        assert ada.get(f"{path}/results/exports/{form}").status_code == 200, form
+    assert ada.get(f"{path}/results/report").status_code == 200
+    (clip,) = found["clips"]
+    assert "one camera alone has detections" in clip["without_joints"]
+    assert "people are placed on the pitch from their feet" in clip["without_joints"]
+    # A person without joints is seen, too: the image is where the detection is.
+    person, *_ = ada.get(f"{path}/identities/clip").json()["people"]
+    assert any(person["way"])  # from above, the person is where the feet are
+    crop = {"person": person["id"], "frame": person["segments"][0][0]}
+    answer = ada.get(f"{path}/identities/clip/crop", params=crop)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png"), answer.text
+
+
+def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch):
+    store = Store.open(str(project_copy))
+    (match,) = store.matches()
+    why = "one camera alone has detections"
+    changed = {"run_id": store.reserve_run(match), "state": "partial", "warnings": (why,)}
+    record = store.run(match).model_copy(update=changed)
+    store.finish_run(record)
+    text = str(IncompleteRunError(record))
+    assert why in text
+    assert "0 " not in text
+    message = f"Flow run encountered an exception: IncompleteRunError: {text}"
+    last = SimpleNamespace(state="FAILED", message=message, link="http://prefect")
+    seen = SimpleNamespace(active=[], latest={match: last})
+    monkeypatch.setattr(Continuing, "_look", lambda self: seen)
+    state = Continuing(store).state(match)
+    assert (state["code"], state["lines"]) == (4, [text])
 
 
 def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, tmp_path):
     one = ("--scenario", "match", "--seed", 5, "--duration", 1, "--no-stills", "--cameras", 1)
     succeed("simulate", *one, "--out", tmp_path / "one")
+    (tmp_path / "one/videos").mkdir()
+    grey = (np.full((1080, 1920, 3), 90, np.uint8) for _ in range(50))
+    write_video(tmp_path / "one/videos/cam00.mp4", grey, 50.0)
     project = ("--project", tmp_path / "worldpose-data")
     answer = worldpose("run", tmp_path / "one", *project)
     assert answer.code == 4, answer.err
@@ -38,6 +86,14 @@ def test_one_camera_gives_positions_on_the_pitch_with_their_uncertainty(server, 
     page = tmp_path / "report.html"
     succeed("report", match, "--out", page, "--no-videos", *project)
     assert page.read_text().count("<td>plane</td>") == len({row["person"] for row in rows})
+    tiles = page.read_text()
+    assert f"{len(shown)}</b>" in tiles
+    assert "people on the pitch, 0 with joints" in tiles
+    assert "<b>0 m</b>" not in tiles
+    refused = worldpose("export", match, *project, "--format", "trc", "--out", tmp_path / "trc")
+    assert refused.code == 1
+    assert "expected a person with joints" in refused.err
+    check_pages(tmp_path, match)
     truth = library.read_joints(tmp_path / "one/reference/joints.npz")
     hips = truth.joints[:, :, 11:13, :2].mean(axis=2)
     errors, inside = [], []

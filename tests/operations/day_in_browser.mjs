@@ -162,7 +162,7 @@ async function mend() {
   await page.waitForSelector(".row >> text=kane");
   await page.goto(matchPage);
   const last = (await state()).run.id;
-  await page.click("button >> text=Continue the run");
+  await page.click("button >> text=Recompute");
   await until("the next run", async () => (await state()).run.id !== last || (await state()).at_work?.state === "running");
   await complete();
 }

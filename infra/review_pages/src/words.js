@@ -50,6 +50,20 @@ export function ago(moment) {
   }
 }
 
+// The state of a match as `worldpose status` has it: its latest run, and the units that differ from it.
+export function unsettled({ units }) {
+  return units ? { stale: units.stale, missing: units.missing, ready: units.ready, all: units.stale + units.missing + units.ready } : { stale: 0, missing: 0, ready: 0, all: 0 };
+}
+
+export const isOutdated = (match) => Boolean(match.run) && unsettled(match).stale + unsettled(match).ready > 0;
+
+const unitCount = (count) => `${count} ${count === 1 ? "unit" : "units"}`;
+
+export function outdated(match) {
+  const { stale, missing, ready } = unsettled(match);
+  return stale + missing ? `out of date: ${unitCount(stale + missing)} to recompute` : `out of date: ${unitCount(ready)} to take over from earlier runs`;
+}
+
 export const parts = (unit) => {
   const at = unit.indexOf("/");
   return [unit.slice(0, at), unit.slice(at + 1)];

@@ -1,0 +1,8 @@
+// Which key presses are shortcuts of a page.
+
+const FIELDS = "textarea, select, [contenteditable], input:not([type=range], [type=checkbox], [type=radio])";
+
+// Whether a key is text that a person writes, or belongs to an open dialog: then it is no shortcut.
+export function isTyping(event) {
+  return event.defaultPrevented || event.isComposing || Boolean(event.target.closest?.(FIELDS)) || document.querySelector("dialog[open]") !== null;
+}
