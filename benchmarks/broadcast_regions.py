@@ -78,6 +78,7 @@ def lines_of(
                 ),
                 seen.normals[index],
                 np.full(len(index), np.hypot(NOISE, settings.line_noise_px)),
+                settings.field_weight,
                 settings.loss_scale,
             )
         )

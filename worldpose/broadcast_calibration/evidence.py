@@ -100,7 +100,12 @@ class PointEvidence:
 
     @classmethod
     def across_lines(
-        cls, observed: ObservedPoints, normals: Floats, deviation: Floats, loss: float
+        cls,
+        observed: ObservedPoints,
+        normals: Floats,
+        deviation: Floats,
+        weight: float,
+        loss: float,
     ) -> PointEvidence:
         """Return evidence that constrains places only across a line.
 
@@ -108,11 +113,12 @@ class PointEvidence:
             observed: pixels and places.
             normals: (n, 2) unit vectors across the line.
             deviation: (n,) standard deviation [px].
+            weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
         """
         whitening = np.zeros((len(observed.frame), 2, 2))
         whitening[:, 0] = normals / deviation[:, None]
-        return cls._whiten(observed, whitening, 1.0, loss)
+        return cls._whiten(observed, whitening, weight, loss)
 
     @classmethod
     def at_points(

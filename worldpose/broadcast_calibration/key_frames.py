@@ -439,6 +439,7 @@ def _drawn_evidence(
         ),
         normal,
         np.full(len(pixels), settings.key_frame.drawn_noise_px),
+        settings.field_weight,
         settings.loss_scale,
     )
 

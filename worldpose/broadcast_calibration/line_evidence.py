@@ -167,6 +167,7 @@ def _measure_lines(
         ),
         sections.normals[found],
         deviation,
+        settings.field_weight,
         settings.loss_scale,
     )
 

@@ -59,6 +59,7 @@ def ground_points(camera, rng, each=40, noise=0.3):
         ),
         np.stack([np.cos(turn), np.sin(turn)], axis=-1),
         np.full(len(frame), noise),
+        1.0,
         np.inf,
     )
 
