@@ -16,13 +16,15 @@ from prefect.client.schemas.filters import (
     FlowRunFilterState,
     FlowRunFilterStateType,
 )
-from prefect.client.schemas.objects import StateType
+from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.flow_runs import resume_flow_run, suspend_flow_run
 from prefect.input import RunInput
 from pydantic import Field
 
 from data_contracts.review import ReviewDecision
 from data_contracts.run import WaitingUnit
+from flows.orchestration.result_pages import PAGE, page_offsets
 from flows.review.metric_words import all_reasons
 from worldpose.errors import WorldposeError
 from worldpose.review import Journal, say
@@ -106,14 +108,19 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
     paused = FlowRunFilter(
         state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.PAUSED]))
     )
+    found: list[FlowRun] = []
     with get_client(sync_client=True) as client:
-        runs = [
-            run
-            for run in client.read_flow_runs(flow_run_filter=paused)
-            if run.deployment_id is not None  # else no worker would take it up
-            and run.parameters.get("match_id") == match_id
-            and open_blobs(str(run.parameters.get("project"))).url == project
-        ]
+        for offset in page_offsets(found):
+            found += client.read_flow_runs(
+                flow_run_filter=paused, sort=FlowRunSort.ID_DESC, limit=PAGE, offset=offset
+            )
+    runs = [
+        run
+        for run in {each.id: each for each in found}.values()
+        if run.deployment_id is not None  # else no worker would take it up
+        and run.parameters.get("match_id") == match_id
+        and open_blobs(str(run.parameters.get("project"))).url == project
+    ]
     for run in runs:
         resume_flow_run(run.id, run_input={"verdict": "recorded", "who": "worldpose review"})
     return [run.name for run in runs]

@@ -16,13 +16,19 @@ import anyio
 import anyio.abc
 from prefect import Flow
 from prefect.client.orchestration import PrefectClient, get_client
-from prefect.client.schemas.actions import DeploymentUpdate, WorkPoolCreate, WorkPoolUpdate
+from prefect.client.schemas.actions import (
+    DeploymentScheduleCreate,
+    DeploymentUpdate,
+    WorkPoolCreate,
+    WorkPoolUpdate,
+)
 from prefect.client.schemas.objects import FlowRun, State
+from prefect.client.schemas.responses import DeploymentResponse
+from prefect.client.schemas.schedules import IntervalSchedule
 from prefect.exceptions import ObjectNotFound, ParameterTypeError, SignatureMismatchError
 from prefect.runner._flow_run_executor import FlowRunExecutorContext
 from prefect.runner._process_manager import ProcessHandle
 from prefect.runner._starter_engine import EngineCommandStarter
-from prefect.schedules import Interval, Schedule
 from prefect.states import Failed
 from prefect.utilities.callables import parameter_schema
 from prefect.workers.process import (
@@ -31,7 +37,7 @@ from prefect.workers.process import (
     ProcessWorkerResult,
 )
 
-from flows.service.forms import form_schema
+from flows.service.forms import form_schema, offer, offered_matches
 from flows.service.layout import PRIORITIES
 from flows.service.plan import ServePlan, deployment_name
 from worldpose.errors import InputError
@@ -52,9 +58,9 @@ class Deployed:
     Attributes:
         flow: its name at the server and in `flows.service.deployed`.
         about: description.
-        queue: default queue of its runs; None = in the pool of arrivals.
+        queue: default queue of its runs; None = that of the pool of arrivals.
         parameters: parameters from the plan.
-        schedule: schedule of its runs.
+        interval: option of the plan that is the interval of its runs [min]; None = no schedule.
         fixed: parameters of the plan that a run must not change: the project that it processes, and
             the code that its workers run.
     """
@@ -63,7 +69,7 @@ class Deployed:
     about: str
     queue: str | None
     parameters: Callable[[ServePlan], dict[str, Any]] = field(default=_of_project)
-    schedule: Callable[[ServePlan], Schedule] | None = None
+    interval: str | None = None
     fixed: tuple[str, ...] = ("project",)
 
     @property
@@ -77,18 +83,14 @@ DEPLOYED: Final = (
         "match",
         "Process a match; waits for people where a gate says so.",
         "normal",
-        lambda plan: {
-            "project": plan.project,
-            "settings": {},
-            "time_limits": plan.time_limits,
-        },
+        lambda plan: {"project": plan.project, "time_limits": plan.time_limits},
     ),
     Deployed(
         "ingest",
         "Take in the matches that have arrived in the inbox.",
         None,
         lambda plan: {"plan": plan.model_dump(mode="json")},
-        lambda plan: Interval(timedelta(minutes=plan.poll_minutes)),
+        interval="poll_minutes",
         fixed=("plan",),
     ),
     Deployed(
@@ -100,6 +102,10 @@ DEPLOYED: Final = (
     Deployed("finetune", "Train the embedded nets on reviewed labels.", "background"),
 )
 """Their names are also in `flows.service.plan.FLOWS`."""
+DEFAULT_QUEUE: Final = "default"
+"""Queue that each of Prefect's pools has."""
+POLL: Final = "poll-interval"
+"""Slug of the schedule of `Deployed.interval`; all others are the operator's."""
 
 
 def pools(plan: ServePlan) -> tuple[str, str]:
@@ -108,7 +114,9 @@ def pools(plan: ServePlan) -> tuple[str, str]:
 
 
 async def install(plan: ServePlan) -> dict[UUID, Installed]:
-    """Create or update all deployments, pools and queues at the server.
+    """Create what is absent of deployments, pools and queues, and update what differs.
+
+    Schedules, tags, pauses, limits and planned runs of a deployment stay as an operator set them.
 
     Returns:
         Flows that a worker can run, by deployment id.
@@ -124,7 +132,7 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
         await _pool(client, arrivals, 1, "What arrives, while matches run")
         for rank, queue in enumerate(PRIORITIES, 1):
             await _queue(client, matches, queue, rank)
-    return dict([await _deploy(plan, deployed) for deployed in DEPLOYED])
+        return dict([await _deploy(client, plan, deployed) for deployed in DEPLOYED])
 
 
 async def work(plan: ServePlan, installed: Mapping[UUID, Installed]) -> None:
@@ -143,33 +151,79 @@ async def work(plan: ServePlan, installed: Mapping[UUID, Installed]) -> None:
             group.start_soon(worker.start, False, False, lambda text: None)
 
 
-async def _deploy(plan: ServePlan, deployed: Deployed) -> tuple[UUID, Installed]:
+async def _deploy(
+    client: PrefectClient, plan: ServePlan, deployed: Deployed
+) -> tuple[UUID, Installed]:
     flow: Flow[..., Any] = getattr(importlib.import_module(MODULE), deployed.flow)
     matches, arrivals = pools(plan)
-    parameters = deployed.parameters(plan)
-    deployment = await flow.ato_deployment(
-        name=deployment_name(plan.name, deployed.flow).partition("/")[2],
-        description=deployed.about,
-        parameters=parameters,
-        schedule=None if deployed.schedule is None else deployed.schedule(plan),
-        work_pool_name=arrivals if deployed.queue is None else matches,
-        work_queue_name=deployed.queue,
-        enforce_parameter_schema=False,  # the worker checks, with the flow that it runs
-    )
-    deployment.entrypoint = deployed.entrypoint
-    number = await deployment.aapply()
-    async with get_client() as client:  # applying the deployment again would not update these
-        form = form_schema(parameter_schema(flow).model_dump(), deployed.fixed)
-        again = DeploymentUpdate(
-            entrypoint=deployed.entrypoint,
-            pull_steps=[],
-            job_variables={},
-            path=None,
-            parameter_openapi_schema=form,
+    parameters = json.loads(json.dumps(deployed.parameters(plan)))
+    form = form_schema(parameter_schema(flow).model_dump(), deployed.fixed)
+    wanted: dict[str, Any] = {
+        "description": deployed.about,
+        "entrypoint": deployed.entrypoint,
+        "path": None,
+        "pull_steps": [],
+        "job_variables": {},
+        "parameters": parameters,
+        "parameter_openapi_schema": offer(form, ()),
+        "work_pool_name": arrivals if deployed.queue is None else matches,
+        "work_queue_name": deployed.queue or DEFAULT_QUEUE,
+        "enforce_parameter_schema": False,  # the worker checks, with the flow that it runs
+    }
+    name = deployment_name(plan.name, deployed.flow)
+    try:
+        there = await client.read_deployment_by_name(name)
+    except ObjectNotFound:
+        schedules = []
+        if deployed.interval is not None:
+            polling = _every(plan, deployed.interval)
+            schedules = [DeploymentScheduleCreate(schedule=polling, slug=POLL)]
+        number = await client.create_deployment(
+            await client.create_flow_from_name(flow.name),
+            name.partition("/")[2],
+            schedules=schedules,
+            **wanted,
         )
-        await client.update_deployment(number, again)
-    fixed = json.loads(json.dumps({name: parameters[name] for name in deployed.fixed}))
+    else:
+        number = there.id
+        await _update(client, plan, deployed, there, wanted)
+    fixed = {name: parameters[name] for name in deployed.fixed}
     return number, Installed(deployed.entrypoint, flow, fixed)
+
+
+def _every(plan: ServePlan, option: str) -> IntervalSchedule:
+    return IntervalSchedule(interval=timedelta(minutes=getattr(plan, option)))
+
+
+async def _update(
+    client: PrefectClient,
+    plan: ServePlan,
+    deployed: Deployed,
+    there: DeploymentResponse,
+    wanted: Mapping[str, Any],
+) -> None:
+    """Update what the product decides of a deployment, if it differs.
+
+    Each update makes Prefect remove the planned runs and plan them anew.
+    """
+    before = there.parameters.get("plan") or {}
+    option = deployed.interval
+    if option is not None and before.get(option) != getattr(plan, option):
+        # Otherwise the schedule stays, also if the operator has changed it or removed it.
+        for schedule in there.schedules:
+            if schedule.slug == POLL:
+                await client.update_deployment_schedule(
+                    there.id, schedule.id, schedule=_every(plan, option)
+                )
+    form = wanted["parameter_openapi_schema"]
+    known = {name: value for name, value in there.parameters.items() if name in form["properties"]}
+    wanted = {
+        **wanted,
+        "parameters": {**known, **wanted["parameters"]},
+        "parameter_openapi_schema": offer(form, offered_matches(there.parameter_openapi_schema)),
+    }
+    if any(getattr(there, name) != value for name, value in wanted.items()):
+        await client.update_deployment(there.id, DeploymentUpdate(**wanted))
 
 
 async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:

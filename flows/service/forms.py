@@ -65,6 +65,21 @@ def _offer(field: Mapping[str, Any], choices: Sequence[str]) -> dict[str, Any]:
     return {**free, "type": "string", **({"enum": list(choices)} if choices else {})}
 
 
+def offered_matches(schema: Mapping[str, Any] | None) -> list[str]:
+    """Return the matches that a form of a deployment offers."""
+    fields = (schema or {}).get("properties", {})
+    named = [fields[name] for name in OF_MATCHES if name in fields]
+    return [match for field in named for match in field.get("items", field).get("enum", ())]
+
+
+def offer(schema: Mapping[str, Any], matches: Sequence[str]) -> dict[str, Any]:
+    """Return the schema of a form that offers the matches."""
+    fields = dict(schema.get("properties", {}))
+    choices = sorted(matches)
+    fields |= {name: _offer(fields[name], choices) for name in OF_MATCHES if name in fields}
+    return {**schema, "properties": fields}
+
+
 async def offer_matches(plan: ServePlan, matches: Sequence[str]) -> None:
     """Let the forms of the deployments offer the registered matches."""
     async with get_client() as client:
@@ -73,13 +88,8 @@ async def offer_matches(plan: ServePlan, matches: Sequence[str]) -> None:
                 found = await client.read_deployment_by_name(deployment_name(plan.name, flow))
             except ObjectNotFound:
                 continue  # the worker installs it soon
-            schema = dict(found.parameter_openapi_schema or {})
-            fields = dict(schema.get("properties", {}))
-            fields |= {
-                name: _offer(fields[name], sorted(matches)) for name in OF_MATCHES if name in fields
-            }
-            if fields != schema.get("properties"):
-                changed = {**schema, "properties": fields}
+            changed = offer(found.parameter_openapi_schema or {}, matches)
+            if changed != found.parameter_openapi_schema:
                 await client.update_deployment(
                     found.id, DeploymentUpdate(parameter_openapi_schema=changed)
                 )

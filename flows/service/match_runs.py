@@ -15,7 +15,7 @@ import time
 import urllib.error
 import urllib.request
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -26,6 +26,7 @@ from pydantic import JsonValue
 
 from data_contracts.operations import Priority, Serving
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, CLOUD_LOGIN, authorization
+from flows.orchestration.result_pages import PAGE, page_offsets
 from flows.run_record import runs_at_work
 from flows.service.layout import StateFolder, is_alive, served_state
 from flows.service.plan import deployment_name, deployment_names
@@ -35,8 +36,6 @@ from worldpose.store import Store
 LOG: Final = logging.getLogger("worldpose.operations")
 ANSWER_SECONDS: Final = 20.0
 """Timeout of Prefect's answer."""
-PAGE: Final = 200
-"""Runs per answer, Prefect's maximum."""
 LOOK_SECONDS: Final = 1.0
 """Between two looks for the end of another run [s]."""
 SOON: Final = timedelta(minutes=1)
@@ -44,6 +43,7 @@ SOON: Final = timedelta(minutes=1)
 QUEUED: Final = ("SCHEDULED", "PENDING")
 AT_WORK: Final = ("RUNNING", "CANCELLING")
 ACTIVE: Final = (*QUEUED, *AT_WORK, "PAUSED")
+ENDED: Final = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class MatchRun:
         message: message of its state.
         link: its page in Prefect's dashboard.
         is_due: whether its time has come; a run of a schedule is created long before it.
+        ended_at: when it ended; None = not yet.
     """
 
     id: str
@@ -67,6 +68,7 @@ class MatchRun:
     message: str
     link: str
     is_due: bool = True
+    ended_at: datetime | None = None
 
     @property
     def is_ahead(self) -> bool:
@@ -144,9 +146,7 @@ class MatchRuns:
             "status": ("Status of all matches", f"{self.pages}/status"),
         }
         try:
-            there = self._ask(
-                "/artifacts/filter", {"artifacts": {"flow_run_id": {"any_": [run_id]}}}
-            )
+            there = self._all("artifacts", artifacts={"flow_run_id": {"any_": [run_id]}})
             for key in links.keys() - {artifact["key"] for artifact in there}:
                 text, address = links[key]
                 artifact = {"key": key, "type": "markdown", "data": f"[{text}]({address})"}
@@ -156,41 +156,41 @@ class MatchRuns:
 
     def active(self) -> list[MatchRun]:
         """Return all runs that have not ended, first to last, without those of a later time."""
-        found: list[MatchRun] = []
-        while True:
-            some = self._list(list(ACTIVE), "EXPECTED_START_TIME_ASC", len(found))
-            found += some
-            if len(some) < PAGE:
-                return [run for run in found if run.is_due or run.state != "SCHEDULED"]
+        runs = self._list({"state": {"type": {"any_": ACTIVE}}}, "expected_start_time")
+        return [run for run in runs if run.is_due or run.state != "SCHEDULED"]
 
-    def latest(self) -> list[MatchRun]:
-        """Return the latest runs, newest first, in any state."""
-        return self._list(None, "EXPECTED_START_TIME_DESC", 0)
+    def ended_runs(self, since: datetime) -> list[MatchRun]:
+        """Return all runs that have ended since a time, first to last."""
+        end = {"after_": since.isoformat()}
+        return self._list({"state": {"type": {"any_": ENDED}}, "end_time": end}, "end_time")
 
-    def progress(self) -> dict[str, tuple[float, str]]:
-        """Return percent and description of the progress of the latest runs, by run id."""
-        asked = {"artifacts": {"type": {"any_": ["progress"]}}, "sort": "UPDATED_DESC"}
-        found = self._ask("/artifacts/filter", {**asked, "limit": PAGE})
+    def progress(self, runs: Sequence[MatchRun]) -> dict[str, tuple[float, str]]:
+        """Return percent and description of the progress of runs, by run id."""
+        ids = [run.id for run in runs]
+        wanted = {"type": {"any_": ["progress"]}, "flow_run_id": {"any_": ids}}
+        found = self._all("artifacts", artifacts=wanted) if ids else []
         return {
             each["flow_run_id"]: (float(each["data"]), each["description"] or "")
-            for each in reversed(found)
-            if each["flow_run_id"] and each["data"] is not None
+            for each in sorted(found, key=lambda each: _time(each["updated"]))
+            if each["data"] is not None
         }
 
-    def _list(self, states: list[str] | None, sort: str, offset: int) -> list[MatchRun]:
-        wanted = {} if states is None else {"flow_runs": {"state": {"type": {"any_": states}}}}
-        runs = self._ask(
-            "/flow_runs/filter",
-            {
-                "deployments": {"name": {"any_": deployment_names(self.name)}},
-                "flows": {"name": {"any_": ["match"]}},
-                "sort": sort,
-                "limit": PAGE,
-                "offset": offset,
-                **wanted,
-            },
+    def _list(self, wanted: Mapping[str, Any], order: str) -> list[MatchRun]:
+        """Return all runs that match a filter, by one of their times."""
+        runs = self._all(
+            "flow_runs",
+            deployments={"name": {"any_": deployment_names(self.name)}},
+            flows={"name": {"any_": ["match"]}},
+            flow_runs=wanted,
         )
-        return [self._run(run) for run in runs]
+        return [self._run(run) for run in sorted(runs, key=lambda run: _time(run[order]))]
+
+    def _all(self, kind: str, **filters: Mapping[str, Any]) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = []
+        for offset in page_offsets(found):
+            page = {"sort": "ID_DESC", "limit": PAGE, "offset": offset}
+            found += self._ask(f"/{kind}/filter", {**filters, **page})
+        return list({each["id"]: each for each in found}.values())
 
     def _run(self, run: Mapping[str, Any]) -> MatchRun:
         due = run["next_scheduled_start_time"]
@@ -202,6 +202,7 @@ class MatchRuns:
             message=str((run["state"] or {}).get("message") or ""),
             link=f"{self.api.removesuffix('/api')}/runs/flow-run/{run['id']}",
             is_due=not due or _time(due) <= datetime.now(UTC) + SOON,
+            ended_at=_time(run["end_time"]) if run["end_time"] else None,
         )
 
     def _ask(self, path: str, body: Mapping[str, Any] | None = None) -> Any:  # noqa: ANN401 - JSON

@@ -16,10 +16,13 @@ from prefect.client.schemas.filters import (
     DeploymentFilter,
     DeploymentFilterName,
     FlowRunFilter,
+    FlowRunFilterEndTime,
     FlowRunFilterState,
     FlowRunFilterStateType,
+    FlowRunFilterTags,
 )
 from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.events.filters import (
     EventFilter,
     EventNameFilter,
@@ -30,6 +33,7 @@ from prefect.states import Cancelled, Crashed, Scheduled
 from prefect.types import KeyValueLabels
 
 from flows.orchestration.cluster_errors import LostWorkersError
+from flows.orchestration.result_pages import PAGE, page_offsets
 from flows.service.layout import is_alive
 from flows.service.plan import TITLES, ServePlan, deployment_name, deployment_names
 
@@ -45,23 +49,28 @@ MOST_SERVICE_DEATHS: Final = 10
 DEATHS: Final = "worldpose.service_deaths"
 """Label of a run: how often the service was killed while the run was active."""
 AT_WORK: Final = (StateType.RUNNING, StateType.PENDING, StateType.CANCELLING)
+ENDED_BADLY: Final = (StateType.CRASHED, StateType.FAILED)
 KILLED: Final = "its process was killed"
+EPOCH: Final = datetime.fromtimestamp(0, UTC)
 
 LOG = logging.getLogger("worldpose.operations")
 
 
-async def restart_lost_runs(plan: ServePlan, *, at_start: bool = False) -> list[str]:
+async def restart_lost_runs(
+    plan: ServePlan, *, at_start: bool = False, since: datetime | None = None
+) -> list[str]:
     """Reschedule runs that were killed or lost their machines; return their names.
 
     Args:
         plan: the served project.
         at_start: no run is active yet, so with a Prefect server of our own even an apparently
             active run was killed with the previous service.
+        since: runs that ended earlier were seen by a previous call; None = none were.
     """
     again = []
     async with get_client() as client:
         if at_start and plan.owns_prefect:
-            for run in await _runs(client, plan, AT_WORK):
+            for run in await project_runs(client, plan, AT_WORK):
                 was_cancelled = run.state_type == StateType.CANCELLING
                 state: State[Any] = Cancelled() if was_cancelled else Crashed(message=KILLED)
                 if run.state_type == StateType.RUNNING:
@@ -69,10 +78,12 @@ async def restart_lost_runs(plan: ServePlan, *, at_start: bool = False) -> list[
                     await client.update_flow_run_labels(run.id, deaths)
                 await client.set_flow_run_state(run.id, state, force=True)
         else:
-            for run in await _runs(client, plan, (StateType.RUNNING, StateType.PENDING)):
+            active = (StateType.RUNNING, StateType.PENDING)
+            for run in await project_runs(client, plan, active):
                 if await _is_dead(client, plan, run):
                     await client.set_flow_run_state(run.id, Crashed(message=KILLED), force=True)
-        for run in await _runs(client, plan, (StateType.CRASHED, StateType.FAILED)):
+        ended = await project_runs(client, plan, ENDED_BADLY, ended_since=since)
+        for run in reversed(ended):  # those that have waited longest first
             if may_restart(run):
                 why = KILLED if run.state_type == StateType.CRASHED else "its machines were lost"
                 LOG.warning("%s: %s; it restarts", run.name, why)
@@ -86,7 +97,8 @@ async def name_scheduled_runs(plan: ServePlan) -> None:
     """Name the runs that Prefect has created for a schedule, which get random words from it."""
     async with get_client() as client:
         for flow in ("match", *TITLES):
-            for run in await _runs(client, plan, (StateType.SCHEDULED,), flow):
+            tags = FlowRunFilterTags(all_=["auto-scheduled"])
+            for run in await project_runs(client, plan, (StateType.SCHEDULED,), flow, tags=tags):
                 due = run.next_scheduled_start_time
                 if run.auto_scheduled and due is not None:
                     title = run.parameters.get("match_id") or TITLES.get(flow, flow)
@@ -132,16 +144,40 @@ async def _is_dead(client: PrefectClient, plan: ServePlan, run: FlowRun) -> bool
     return not signs.events
 
 
-async def _runs(
-    client: PrefectClient, plan: ServePlan, states: Sequence[StateType], flow: str | None = None
+async def project_runs(
+    client: PrefectClient,
+    plan: ServePlan,
+    states: Sequence[StateType],
+    flow: str | None = None,
+    *,
+    ended_since: datetime | None = None,
+    tags: FlowRunFilterTags | None = None,
 ) -> list[FlowRun]:
-    """Return the runs of the project's deployments, or that of a flow, that are in these states."""
+    """Return all runs of the project's deployments in these states, newest first.
+
+    Args:
+        client: client of the Prefect server.
+        plan: the served project.
+        states: types of their states.
+        flow: flow whose runs are returned; None = those of all flows.
+        ended_since: earliest end of a run; None = any, or none.
+        tags: condition on their tags.
+    """
     names = deployment_names(plan.name)
     if flow is not None:
         names = [deployment_name(plan.name, flow).partition("/")[2]]
-    return await client.read_flow_runs(
-        flow_run_filter=FlowRunFilter(
-            state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states)))
-        ),
-        deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=names)),
-    )
+    found: list[FlowRun] = []
+    for offset in page_offsets(found):
+        found += await client.read_flow_runs(
+            flow_run_filter=FlowRunFilter(
+                state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states))),
+                end_time=None if ended_since is None else FlowRunFilterEndTime(after_=ended_since),
+                tags=tags,
+            ),
+            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=names)),
+            sort=FlowRunSort.ID_DESC,
+            limit=PAGE,
+            offset=offset,
+        )
+    unique = {run.id: run for run in found}.values()
+    return sorted(unique, key=lambda run: run.expected_start_time or EPOCH, reverse=True)

@@ -15,15 +15,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.filters import (
-    DeploymentFilter,
-    DeploymentFilterName,
-    FlowRunFilter,
-    FlowRunFilterEndTime,
-    FlowRunFilterState,
-    FlowRunFilterStateType,
-)
-from prefect.client.schemas.objects import State, StateType
+from prefect.client.schemas.objects import FlowRun, State
 from prefect.deployments import arun_deployment
 
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
@@ -32,8 +24,14 @@ from flows.service.inbox import watch_once
 from flows.service.match_runs import run_name
 from flows.service.metrics import ProjectMetrics, metrics_server
 from flows.service.overview import Overview
-from flows.service.plan import ServePlan, deployment_names
-from flows.service.recovery import may_restart, name_scheduled_runs, restart_lost_runs
+from flows.service.plan import ServePlan
+from flows.service.recovery import (
+    ENDED_BADLY,
+    may_restart,
+    name_scheduled_runs,
+    project_runs,
+    restart_lost_runs,
+)
 from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
 from worldpose.store import Store
@@ -52,6 +50,10 @@ TROUBLE_LENGTH: Final = 500
 """Maximum length of such a line."""
 FAILED_DAYS: Final = 7
 """After so long, a failed run raises no alert."""
+RESTART_PATIENCE: Final = timedelta(minutes=5)
+"""A run that should restart and has not done so after this time raises an alert."""
+LOOK_BACK: Final = timedelta(days=1)
+"""Time before the last complete look at which runs may have ended unseen: clocks differ."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -149,13 +151,17 @@ async def _ingest(plan: ServePlan, ready: list[str]) -> None:
 
 async def _watch_lost_runs(plan: ServePlan, store: Store) -> None:
     trouble, naming = Trouble("looking for lost runs"), Trouble("naming runs and matches")
+    looked: datetime | None = None  # the first look takes all runs that ever failed
     while True:
         with naming.log_failure():
             await name_scheduled_runs(plan)
             await offer_matches(plan, await asyncio.to_thread(store.matches))
         await asyncio.sleep(ALERT_SECONDS)
         with trouble.log_failure():
-            await restart_lost_runs(plan)
+            now = datetime.now(UTC)
+            since = None if looked is None else min(looked, now) - LOOK_BACK
+            await restart_lost_runs(plan, since=since)
+            looked = now
 
 
 async def _watch_alerts(plan: ServePlan, store: Store, dispatcher: AlertDispatcher) -> None:
@@ -163,10 +169,11 @@ async def _watch_alerts(plan: ServePlan, store: Store, dispatcher: AlertDispatch
     at_prefect = Trouble("asking Prefect for failed runs")
     trouble = Trouble("looking for alerts")
     failed: list[FailedRun] = []
+    began = datetime.now(UTC)
     while True:
         await asyncio.sleep(ALERT_SECONDS)
         with at_prefect.log_failure():
-            failed = await failed_runs(plan)
+            failed = await failed_runs(plan, began)
         with trouble.log_failure():
             matches = await asyncio.to_thread(overview.look)
             arrivals = plan.state_folder.arrivals().values()
@@ -181,27 +188,36 @@ async def _deliver(dispatcher: AlertDispatcher, sender: Sender) -> None:
         await asyncio.get_running_loop().run_in_executor(pool, dispatcher.deliver, sender)
 
 
-async def failed_runs(plan: ServePlan) -> list[FailedRun]:
-    """Return failed runs of this project's deployments that are not restarted."""
-    bad = FlowRunFilterStateType(any_=[StateType.FAILED, StateType.CRASHED])
-    since = FlowRunFilterEndTime(after_=datetime.now(UTC) - timedelta(days=FAILED_DAYS))
+async def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
+    """Return failed runs of this project's deployments that do not restart, or have not in time.
+
+    Args:
+        plan: the served project.
+        began: start of the restarts; runs that ended before had to wait for it.
+    """
+    now = datetime.now(UTC)
     async with get_client() as client:
-        runs = await client.read_flow_runs(
-            flow_run_filter=FlowRunFilter(state=FlowRunFilterState(type=bad), end_time=since),
-            deployment_filter=DeploymentFilter(
-                name=DeploymentFilterName(any_=deployment_names(plan.name))
-            ),
-        )
+        since = now - timedelta(days=FAILED_DAYS)
+        runs = await project_runs(client, plan, ENDED_BADLY, ended_since=since)
+    overdue = now - RESTART_PATIENCE
+
+    def describe(run: FlowRun) -> str | None:
+        message = _describe_state(run.state)
+        if not may_restart(run):
+            return message
+        is_overdue = max(run.end_time or began, began) <= overdue
+        return f"{message}; it was not restarted" if is_overdue else None
+
     return [
         FailedRun(
             str(run.id),
             run.name,
             str(run.state_name).lower(),
-            _describe_state(run.state),
+            message,
             str(run.parameters.get("match_id") or ""),
         )
         for run in runs
-        if not may_restart(run)
+        if (message := describe(run)) is not None
     ]
 
 

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Annotated, Any
@@ -80,6 +81,9 @@ LAST_LINES = 12
 """Lines of a run's output that a page shows."""
 FRESH_SECONDS = 2.0
 """Maximum age of Prefect's answer that pages show [s]."""
+EPOCH = datetime.fromtimestamp(0, UTC)
+RECORDED_LATE = timedelta(minutes=1)
+"""Time after which Prefect's database surely has the end of a run."""
 
 
 @dataclass
@@ -96,6 +100,7 @@ class Continuing:
     store: Store
     _local: LocalRuns = field(init=False)
     _seen: _Seen | None = None
+    _ended: dict[str, MatchRun] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     def __post_init__(self) -> None:
@@ -153,7 +158,7 @@ class Continuing:
                 if ahead:
                     lines = [f"The run waits for its turn: {runs} before it."]
             return {"state": "running", "lines": lines, "percent": percent, "prefect": run.link}
-        last = seen.latest.get(match_id)
+        last = seen.ended.get(match_id)
         if last is None or last.state not in ("FAILED", "CRASHED"):
             return None
         code, message = 1, last.message
@@ -169,7 +174,10 @@ class Continuing:
             seen = self._look()
         except UnreachablePrefectError:
             return {}
-        return {} if seen is None else {each: run.link for each, run in seen.latest.items()}
+        if seen is None:
+            return {}
+        latest = {**seen.ended, **{run.match_id: run for run in seen.active}}
+        return {match_id: run.link for match_id, run in latest.items()}
 
     def _look(self) -> _Seen | None:
         """Return the runs of the service, of the last seconds; None without a service.
@@ -183,8 +191,13 @@ class Continuing:
         if self._seen is None or time.monotonic() - self._seen.at > FRESH_SECONDS:
             once = replace(served, tries=1)
             try:
-                latest = {run.match_id: run for run in reversed(once.latest())}
-                seen = _Seen(time.monotonic(), once.active(), latest, once.progress())
+                ends = [run.ended_at for run in self._ended.values() if run.ended_at is not None]
+                since = max(ends) - RECORDED_LATE if ends else EPOCH  # all only once
+                later = {run.match_id: run for run in once.ended_runs(since)}
+                self._ended = self._ended | later  # other threads read the former one
+                active = once.active()
+                progress = once.progress([run for run in active if run.state in AT_WORK])
+                seen = _Seen(time.monotonic(), active, self._ended, progress)
             except UnreachablePrefectError as error:
                 seen = _Seen(time.monotonic(), [], {}, {}, error)
             self._seen = seen
@@ -213,11 +226,11 @@ def read_progress(said: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Runs of the service at a time of the monotonic clock [s]."""
+    """Runs of the service at a time of the monotonic clock [s], and each match's last ended run."""
 
     at: float
     active: list[MatchRun]
-    latest: dict[str, MatchRun]
+    ended: dict[str, MatchRun]
     progress: dict[str, tuple[float, str]]
     problem: UnreachablePrefectError | None = None
 

@@ -4,6 +4,7 @@ import asyncio
 import importlib
 import os
 import re
+from collections import Counter
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import uuid4
@@ -12,14 +13,21 @@ import pytest
 from prefect import Flow
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.actions import DeploymentUpdate, WorkPoolUpdate
+from prefect.client.schemas.filters import (
+    FlowRunFilter,
+    FlowRunFilterDeploymentId,
+    FlowRunFilterTags,
+)
 from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.schedules import CronSchedule
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
-from prefect.states import Cancelling, Completed, Crashed, Running, Scheduled, Suspended
+from prefect.states import Cancelling, Completed, Crashed, Running, Suspended
 from prefect.workers.process import ProcessWorker
 
 from data_contracts.release import EXPORT_FORMATS
 from flows.method import METHOD
-from flows.service import recovery
+from flows.orchestration import suspension
+from flows.service import recovery, watching
 from flows.service.deployed import release_folder
 from flows.service.deployments import DEPLOYED, RefusedRunError, install, require_installed
 from flows.service.forms import offer_matches
@@ -27,6 +35,8 @@ from flows.service.match_runs import MatchRuns
 from flows.service.plan import FLOWS, ServePlan, deployment_name
 from flows.service.recovery import name_scheduled_runs, restart_lost_runs
 from flows.service.watching import failed_runs
+from flows.web import app_context
+from flows.web.app_context import Continuing
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
 
@@ -73,7 +83,7 @@ def test_deployments_have_queues_by_priority_and_limits(plan):
     assert ranks["urgent"] < ranks["normal"] < ranks["background"]
     match = deployments["match"]
     assert (match.work_pool_name, match.work_queue_name) == ("ops", "normal")
-    assert match.parameters == {"project": plan.project, "settings": {}, "time_limits": {}}
+    assert match.parameters == {"project": plan.project, "time_limits": {}}
     assert match.entrypoint == "flows.service.deployed.match"
     for each in deployments.values():  # what the worker will load
         module, _, name = each.entrypoint.rpartition(".")
@@ -110,6 +120,59 @@ def test_pools_and_deployments_that_were_changed_are_put_right(plan):
     assert len(installed) == len(DEPLOYED)
 
 
+def test_a_restart_keeps_what_an_operator_set(plan):
+    async def look(client):
+        found = {
+            flow: await client.read_deployment_by_name(deployment_name("ops", flow))
+            for flow in FLOWS
+        }
+        planned = await planned_runs(client, found["reprocess"].id)
+        return found, {run.id for run in planned}
+
+    async def set_and_restart():
+        async with get_client() as client:
+            found = {
+                flow: await client.read_deployment_by_name(deployment_name("ops", flow))
+                for flow in FLOWS
+            }
+            reprocess = found["reprocess"]
+            given = {**reprocess.parameters, "retry": True}
+            changes = DeploymentUpdate(tags=["night"], parameters=given, concurrency_limit=1)
+            await client.update_deployment(reprocess.id, changes)
+            nightly = CronSchedule(cron="0 3 * * *", timezone="Europe/Vienna")
+            await client.create_deployment_schedules(reprocess.id, [(nightly, True)])
+            (inbox,) = found["ingest"].schedules
+            await client.update_deployment_schedule(found["ingest"].id, inbox.id, active=False)
+            await client.pause_deployment(found["release"].id)
+            await offer_matches(plan, ("lab",))
+            await plan_runs(client, reprocess.id)
+            before = await look(client)
+            await install(plan)
+            after = await look(client)
+            options = {"poll_minutes": 5, "time_limits": {"detection": 1.0}}
+            await install(plan.model_copy(update=options))
+            changed = await look(client)
+            for flow in ("ingest", "release", "reprocess"):  # as other tests expect them
+                await client.delete_deployment(found[flow].id)
+            await install(plan)
+        return before, after, changed
+
+    (before, planned), (after, still_planned), (changed, planned_last) = asyncio.run(
+        set_and_restart()
+    )
+    unset = {"updated", "status", "last_polled"}
+    for flow in FLOWS:
+        assert after[flow].model_dump(exclude=unset) == before[flow].model_dump(exclude=unset)
+    assert planned <= still_planned and planned <= planned_last
+    assert changed["reprocess"].model_dump(exclude=unset) == before["reprocess"].model_dump(
+        exclude=unset
+    )
+    # New options reach the deployments, and leave the operator's pauses as they are.
+    assert changed["match"].parameters["time_limits"] == {"detection": 1.0}
+    (inbox,) = changed["ingest"].schedules
+    assert (inbox.schedule.interval, inbox.active) == (timedelta(minutes=5), False)
+
+
 def test_forms_ask_for_typed_values_and_offer_choices(plan):
     async def look():
         async with get_client() as client:
@@ -136,7 +199,7 @@ def test_forms_ask_for_typed_values_and_offer_choices(plan):
     assert "enum" not in asyncio.run(look())["ops-match"]["match_id"]
 
 
-def test_runs_have_readable_names_of_their_own(plan, monkeypatch):
+def test_runs_have_readable_names_of_their_own(plan):
     runs = MatchRuns(plan.prefect, "ops", os.environ["PREFECT_API_AUTH_STRING"])
     run = runs.start("lab", priority="urgent", key="twice", gates="never")
     assert re.fullmatch(r"lab, \d\d \w{3} \d\d:\d\d:\d\d", run.name)
@@ -146,26 +209,31 @@ def test_runs_have_readable_names_of_their_own(plan, monkeypatch):
     async def scheduled():
         async with get_client() as client:
             ingest = await client.read_deployment_by_name(deployment_name("ops", "ingest"))
-            due = datetime.now(UTC) + timedelta(hours=1)
-            made = await client.create_flow_run_from_deployment(
-                ingest.id, name="macho-mongrel", state=Scheduled(scheduled_time=due)
-            )
-            real = recovery._runs
-
-            async def of_a_schedule(*given):
-                return [
-                    each.model_copy(update={"auto_scheduled": True}) for each in await real(*given)
-                ]
-
-            monkeypatch.setattr(recovery, "_runs", of_a_schedule)
+            await plan_runs(client, ingest.id)
             await name_scheduled_runs(plan)
-            named = await client.read_flow_run(made.id)
-            await client.delete_flow_run(made.id)
             await client.delete_flow_run(run.id)
-        return named, due
+            return await planned_runs(client, ingest.id)
 
-    named, due = asyncio.run(scheduled())
-    assert named.name == f"inbox, {due.astimezone():%d %b %H:%M:%S}"
+    for each in asyncio.run(scheduled()):
+        due = each.next_scheduled_start_time.astimezone()
+        assert each.name == f"inbox, {due:%d %b %H:%M:%S}"
+
+
+async def plan_runs(client, deployment):
+    """Plan a deployment's next runs, as Prefect's scheduler does every minute."""
+    await client.request(
+        "POST", "/deployments/{id}/schedule", path_params={"id": deployment}, json={}
+    )
+
+
+async def planned_runs(client, deployment):
+    of = FlowRunFilterDeploymentId(any_=[deployment])
+    scheduled = FlowRunFilterTags(all_=["auto-scheduled"])
+    found = await client.read_flow_runs(
+        flow_run_filter=FlowRunFilter(deployment_id=of, tags=scheduled)
+    )
+    assert len(found) >= 3
+    return found
 
 
 def test_deployments_of_an_earlier_version_are_removed(plan):
@@ -321,5 +389,81 @@ def test_a_run_that_keeps_being_killed_is_left_for_a_person(plan, monkeypatch):
     run = asyncio.run(kill_thrice())
     assert (run.state_type, run.run_count) == (StateType.CRASHED, 3)
     assert "poison" not in asyncio.run(restart_lost_runs(plan))
-    failed = {each.name: each for each in asyncio.run(failed_runs(plan))}
+    failed = {each.name: each for each in asyncio.run(failed_runs(plan, datetime.now(UTC)))}
     assert (failed["poison"].state, failed["poison"].message) == ("crashed", "killed")
+
+
+@pytest.fixture(scope="module")
+def hundreds(plan):
+    """Give the server 210 failed runs of a match, 40 crashed and 210 suspended ones of others.
+
+    Prefect lists them by random ids, so that a page of 200 lacks some of each.
+    """
+
+    async def create():
+        async with get_client() as client:
+            found = await client.read_deployment_by_name(plan.match_deployment)
+            for match, count, state in HUNDREDS:
+                run = {
+                    "state": {"type": state, "message": "made"},
+                    "parameters": {"project": plan.project, "match_id": match},
+                }
+                missing = [{**run, "name": f"{match}, {number}"} for number in range(count)]
+                while missing:  # SQLite's one writer was busy
+                    answer = await client.request(
+                        "POST",
+                        "/deployments/{id}/create_flow_run/bulk",
+                        path_params={"id": found.id},
+                        json=missing,
+                    )
+                    created = [each["status"] == "CREATED" for each in answer.json()["results"]]
+                    missing = [
+                        each
+                        for each, is_there in zip(missing, created, strict=True)
+                        if not is_there
+                    ]
+
+    asyncio.run(create())
+
+
+HUNDREDS = (
+    ("old-match", 1, "FAILED"),
+    ("crashed-match", 40, "CRASHED"),
+    *[("failed-match", 70, "FAILED")] * 3,
+    *[("paused-match", 70, "PAUSED")] * 3,
+)
+
+
+def test_alerts_name_all_failed_runs_and_those_that_should_have_restarted(
+    plan, hundreds, monkeypatch
+):
+    def failed_by_match():
+        failed = asyncio.run(failed_runs(plan, datetime.now(UTC)))
+        return Counter(each.match_id for each in failed), failed
+
+    counts, _ = failed_by_match()
+    assert (counts["failed-match"], counts["crashed-match"]) == (210, 0)
+    monkeypatch.setattr(watching, "RESTART_PATIENCE", timedelta(0))
+    counts, failed = failed_by_match()
+    assert (counts["failed-match"], counts["crashed-match"]) == (210, 40)
+    (message,) = {each.message for each in failed if each.match_id == "crashed-match"}
+    assert message == "made; it was not restarted"
+
+
+def test_crashed_and_suspended_runs_are_found_among_hundreds(plan, hundreds, monkeypatch):
+    again = asyncio.run(restart_lost_runs(plan))
+    assert sorted(again) == sorted(f"crashed-match, {number}" for number in range(40))
+    resumed = []
+    monkeypatch.setattr(suspension, "resume_flow_run", lambda id, run_input: resumed.append(id))
+    suspension.resume_suspended(plan.project, "paused-match")
+    assert len(set(resumed)) == 210
+
+
+def test_pages_show_the_last_run_of_every_match_among_hundreds(plan, hundreds, monkeypatch):
+    runs = MatchRuns(plan.prefect, "ops", os.environ["PREFECT_API_AUTH_STRING"])
+    monkeypatch.setattr(app_context, "match_runs_of", lambda url: runs)
+    monkeypatch.setattr(app_context, "FRESH_SECONDS", 0.0)
+    continuing = Continuing(Store.create(plan.project))
+    for _ in range(2):  # the second look asks for later runs alone
+        assert continuing.state("old-match")["lines"] == ["made"]
+        assert continuing.links().keys() >= {match for match, _, _ in HUNDREDS}

@@ -59,7 +59,7 @@ class Server:
     async def __aexit__(self, *error):
         pass
 
-    async def read_flow_runs(self, *, flow_run_filter, deployment_filter):
+    async def read_flow_runs(self, *, flow_run_filter, **page):
         return [self.run] if self.run.state_type in flow_run_filter.state.type.any_ else []
 
     async def set_flow_run_state(self, flow_run_id, state, *, force):
