@@ -54,7 +54,7 @@ def test_who_was_missed_is_found_again_where_the_bodies_are(server, tmp_path):
     # One an image is missing; some are half hidden or cut, and not looked for.
     assert sought >= FRAMES * CAMERAS / 4
     assert found >= sought / 2
-    # As sure as what detectors find themselves: see docs/explanation/detection.md.
+    # As sure as what detectors find themselves.
     assert np.mean(right) > 0.8
 
     tracked = open_run(str(project), match, first), run

@@ -353,21 +353,3 @@ def test_the_image_is_made_of_what_is_there():
     ignored = (INFRA / "container" / "Containerfile.ignore").read_text()
     for source in re.findall(r"^COPY (\w+) \w+$", text, re.MULTILINE):
         assert f"!{source}\n" in ignored
-
-
-def test_every_line_of_the_threat_model_names_tests_that_are_there():
-    text = (INFRA.parent / "docs" / "explanation" / "security.md").read_text()
-    tests = "".join(file.read_text() for file in (INFRA.parent / "tests").rglob("test_*.py"))
-    rows = [line for line in text.splitlines() if line.startswith("|")]
-    named = {name for row in rows for name in re.findall(r"`([a-z_]{25,})`", row)}
-    assert len(named) >= 15
-    assert [name for name in sorted(named) if f"def test_{name}(" not in tests] == []
-    files = set(re.findall(r"`(?:tests/)?((?:flows/|operations/)?test_\w+\.py)`", text))
-    there = {file.name for file in (INFRA.parent / "tests").rglob("test_*.py")}
-    assert {file.rpartition("/")[2] for file in files} <= there
-    said = text.partition("## Who may do what")[2].partition("## How")[0]
-    assert all(
-        "`" in row
-        for row in said.splitlines()
-        if row.startswith("| ") and "---" not in row[:6] and not row.startswith("| who")
-    )

@@ -3,6 +3,17 @@
 A part of the payload has a length (uint32), a JSON header of that length, and arrays; the header's
 `arrays` gives type, shape and place of each. A clip has one part that describes the scene, and one
 for each range of frames. `infra/review_pages/src/viewer/payload.js` reads the same parts.
+
+- `scene`: `rest_joints` (B,24,3) [m], `parents` (24,), `surface` (B,V,3) [0.1 mm], `normals`,
+  `faces`, `coarse_faces`, `rough_faces`, `influences` and `shares` (V,4).
+- Ranges: `turns` (T,B,24,3) in `turn_units` [rad] relative to the parent joint, `place` (T,B,3)
+  [m], `joints` (T,L,17,3) in `joint_unit` [m] relative to `anchor` (T,L,3) for people `loose`
+  without a body, `ground` (T,G,3) x, y and deviation [m] of people of kind plane, `spread`
+  (T,N,17) of joints, logarithmic: 1 = 1 mm, 255 = 1 m, 0 = unknown, `views` (T,N,17), `broadcast`
+  (T,18).
+
+The file has a script of type `application/octet-stream` with base64 per part (`data-clip`,
+`data-part`: `scene`, the number of a range, or `video`).
 """
 
 from __future__ import annotations

@@ -47,8 +47,7 @@ def test_clicks_of_the_trial_cost_joints_less_than_the_papers_base_does_but_not_
         true.append(reconstructed(scene, exact, scenario.fps))
         plain.append(reconstructed(scene, from_clicks(scene), scenario.fps))
     # The detector's own part is pinned at 62 to 72 mm. The paper has 83.5 / 70.8 mm from its base
-    # calibration (docs/explanation/simulation.md); ours has to be better, and to leave something
-    # for later stages to gain.
+    # calibration; ours has to be better, and to leave something for later stages to gain.
     assert 62.0 < mean(each.g_mpjpe_mm for each in true) < 72.0
     assert 54.0 < mean(each.pa_mpjpe_mm for each in true) < 66.0
     cost = mean(each.g_mpjpe_mm for each in plain) - mean(each.g_mpjpe_mm for each in true)
