@@ -8,6 +8,7 @@ import pytest
 
 from worldpose.errors import InputError
 from worldpose.video import FrameIndex, VideoReader, index_frames, write_video
+from worldpose.video.files import cut_video
 
 SIZE = (48, 64)
 
@@ -156,11 +157,8 @@ def number_in(picture):
     return int((1 << np.flatnonzero(middle.ravel() > 125)).sum())
 
 
-@pytest.mark.parametrize(
-    ("container", "codec"), [(end, codec) for end, codecs in KEPT_IN.items() for codec in codecs]
-)
-def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
-    path = tmp_path / f"clip.{container}"
+def write_blocks(path, codec):
+    """Write 40 images that carry their numbers, with a key frame every ten at most."""
     name, pixels, options = CODECS[codec]
     with av.open(str(path), "w") as file:
         stream = file.add_stream(name, rate=25, options={"g": "10", **options})
@@ -170,6 +168,14 @@ def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
             frame = av.VideoFrame.from_ndarray(blocks(number), format="rgb24")
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(
+    ("container", "codec"), [(end, codec) for end, codecs in KEPT_IN.items() for codec in codecs]
+)
+def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
+    path = tmp_path / f"clip.{container}"
+    write_blocks(path, codec)
     with VideoReader(path) as video:
         assert video.index.fps == pytest.approx(25.0, rel=1e-3)
         assert [(n, number_in(shown)) for n, shown in video.frames(grey=True)] == [
@@ -178,6 +184,14 @@ def test_access_by_number_equals_a_whole_pass(container, codec, tmp_path):
         mixed = np.random.default_rng(0).permutation(40).tolist()
         for number in [0, 20, 39, *range(39, -1, -3), *mixed[:15]]:
             assert number_in(video.frame(number)) == number
+
+
+def test_a_stretch_cut_out_of_a_transport_stream_is_whole(tmp_path):
+    path, out = tmp_path / "clip.ts", tmp_path / "cut.ts"
+    write_blocks(path, "h264")
+    place = cut_video(path, 23, 28, out)
+    with VideoReader(out) as video:
+        assert [number_in(video.frame(place + n)) for n in range(5)] == [23, 24, 25, 26, 27]
 
 
 @pytest.mark.parametrize(
