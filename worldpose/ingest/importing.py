@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -29,7 +29,7 @@ from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video import FrameIndex, VideoReader, index_frames
+from worldpose.video import VIDEO_SUFFIXES, FrameIndex, VideoReader, index_frames, is_video
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
@@ -125,24 +125,21 @@ def import_lenses(
 
 
 def files_by_camera(
-    folder: Path, cameras: list[str], calibration: Path, suffixes: tuple[str, ...]
+    folder: Path, cameras: Sequence[str], calibration: Path, suffixes: Collection[str]
 ) -> dict[str, Path]:
     """Return the file of each camera in a folder, by the camera's name.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
     """
-    files = [
-        file
-        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if file.suffix in suffixes and not file.name.startswith(".")
-    ]
+    there = sorted(folder.glob("[!.]*"))
+    files = [file for file in there if file.suffix.lower() in suffixes]
     if sorted(file.stem for file in files) != sorted(cameras):
         raise InputError(
             str(folder),
-            expected=f"one {' or '.join(suffixes)} file for each camera in {calibration.name}: "
-            + ", ".join(cameras),
-            found=", ".join(file.name for file in files) or "no such file",
+            expected=f"one file for each camera in {calibration.name}: {', '.join(cameras)}; it "
+            f"ends with {', '.join(suffixes)}",
+            found=", ".join(file.name for file in files or there) or "no such file",
             todo="Rename the files as the cameras, and leave neither over.",
         )
     by_name = {file.stem: file for file in files}
@@ -153,9 +150,6 @@ def name_of(folder: Path) -> str:
     """Return the folder's name without characters that ids do not allow."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
     return name or "match"
-
-
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
 
 
 def import_videos(
@@ -175,7 +169,7 @@ def import_videos(
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
-        videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
+        videos: folder with a video for each camera of the calibration, called as the camera.
         out: the match folder, absent or empty.
         fps: frame rate of all videos [1/s]; None = from the videos.
         match_id: id of the match; None = the name of `out`.
@@ -233,16 +227,13 @@ def _films(folder: Path) -> list[Path]:
     Raises:
         InputError: there are fewer than two, or two of one name.
     """
-    files = [
-        file
-        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if file.suffix.lower() in VIDEO_SUFFIXES and not file.name.startswith(".")
-    ]
+    there = sorted(folder.glob("[!.]*"))
+    files = [file for file in there if is_video(file)]
     if len({file.stem for file in files}) != len(files) or len(files) < 2:
         raise InputError(
             str(folder),
             expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)})",
-            found=", ".join(file.name for file in files) or "no video",
+            found=", ".join(file.name for file in files or there) or "no video",
             todo="Name each video after its camera.",
         )
     return files
@@ -368,11 +359,7 @@ def import_pose2sim(
     cameras = {} if calibration is None else read_calibration(calibration)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = [
-        file
-        for file in sorted((project / "videos").glob("*"))
-        if file.suffix.lower() in VIDEO_SUFFIXES
-    ]
+    films = [file for file in sorted((project / "videos").glob("*")) if is_video(file)]
     if not places and not films:
         raise InputError(
             str(project),
