@@ -102,7 +102,7 @@ def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
         InputError: there are no images and no videos.
         UsageError: images of one camera without its name, or a name with several cameras.
     """
-    found = sorted(boards.iterdir()) if boards.is_dir() else []
+    found = sorted(boards.glob("[!.]*"))
     if any(file.suffix.lower() in IMAGES for file in found) or boards.is_file():
         return {camera or _camera_name(boards): boards}
     places = {

@@ -16,6 +16,7 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import camera_id
 from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
@@ -134,15 +135,15 @@ def files_by_camera(
     """
     there = sorted(folder.glob("[!.]*"))
     files = [file for file in there if file.suffix.lower() in suffixes]
-    if sorted(file.stem for file in files) != sorted(cameras):
+    if sorted(camera_id(file.stem) for file in files) != sorted(cameras):
         raise InputError(
             str(folder),
-            expected=f"one file for each camera in {calibration.name}: {', '.join(cameras)}; it "
-            f"ends with {', '.join(suffixes)}",
+            expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
+            + ", ".join(cameras),
             found=", ".join(file.name for file in files or there) or "no such file",
             todo="Rename the files as the cameras, and leave neither over.",
         )
-    by_name = {file.stem: file for file in files}
+    by_name = {camera_id(file.stem): file for file in files}
     return {name: by_name[name] for name in cameras}
 
 
@@ -185,7 +186,7 @@ def import_videos(
     """
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
-        files = {file.stem: file for file in _films(videos)}
+        files = {camera_id(file.stem): file for file in _films(videos)}
         indices = {name: index_frames(file) for name, file in files.items()}
     else:
         cameras = read_calibration(calibration)
@@ -229,7 +230,7 @@ def _films(folder: Path) -> list[Path]:
     """
     there = sorted(folder.glob("[!.]*"))
     files = [file for file in there if is_video(file)]
-    if len({file.stem for file in files}) != len(files) or len(files) < 2:
+    if len({camera_id(file.stem) for file in files}) != len(files) or len(files) < 2:
         raise InputError(
             str(folder),
             expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)})",
@@ -359,7 +360,7 @@ def import_pose2sim(
     cameras = {} if calibration is None else read_calibration(calibration)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = [file for file in sorted((project / "videos").glob("*")) if is_video(file)]
+    films = [file for file in sorted((project / "videos").glob("[!.]*")) if is_video(file)]
     if not places and not films:
         raise InputError(
             str(project),
@@ -372,7 +373,7 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        names = [file.stem for file in _films(project / "videos")]
+        names = [camera_id(file.stem) for file in _films(project / "videos")]
         source = project / "videos"
     else:
         notes = [f"cameras: {calibration}"]
@@ -552,7 +553,7 @@ def _assign(
             found=", ".join(place.name for place in places),
             todo="Add the missing ones, or take the camera out of the calibration.",
         )
-    named = {place.stem.removesuffix("_json"): place for place in places}
+    named = {camera_id(place.stem.removesuffix("_json")): place for place in places}
     if set(named) == set(cameras):
         return {camera: named[camera] for camera in cameras}
     pairs = dict(zip(cameras, places, strict=True))

@@ -207,7 +207,7 @@ def _shown_stamps(path: Path, most: int | None = None) -> list[int | None]:
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        pictures = _decoded(_packets(container, stream))
+        pictures = _decode(_packets(container, stream))
         return [picture.pts for picture in islice(pictures, most)]
 
 
@@ -230,7 +230,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Pack
         yield packet
 
 
-def _decoded(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame]:
+def _decode(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame]:
     """Yield the frames in the order shown, without those of packets that cannot be decoded."""
     for packet in packets:
         try:
@@ -244,7 +244,7 @@ def _decoded(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFram
 
 def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
     """Return width and height as displayed: an upright camera stores rotated frames."""
-    for picture in _decoded([packet]):
+    for picture in _decode([packet]):
         if picture.rotation % 180:
             return picture.height, picture.width
         return picture.width, picture.height
@@ -404,7 +404,7 @@ class VideoReader:
         keys = self._keys(start)[-TRIED_KEYS:]
         first = None
         for begin in keys[::-1].tolist():
-            shown = self._numbered(begin)
+            shown = self._number_shown(begin)
             first = next((each for each in shown if each[0] >= keys[-1]), None)
             if first is not None and first[0] == keys[-1]:
                 break
@@ -412,9 +412,9 @@ class VideoReader:
             yield first
             yield from shown
 
-    def _numbered(self, begin: int) -> Iterator[tuple[int, av.VideoFrame]]:
+    def _number_shown(self, begin: int) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield frames as decoding from frame `begin` on shows them, with their numbers or -1."""
-        for count, picture in enumerate(_decoded(self.packets_from(begin))):
+        for count, picture in enumerate(_decode(self.packets_from(begin))):
             stamp = -1 if picture.pts is None else int(picture.pts)
             yield count if self.index.is_counted else self._number.get(stamp, -1), picture
 
