@@ -48,7 +48,8 @@ INGEST = GroupLayout(
     labels=KEYPOINT_LABELS,
     attributes={
         "camera_id": "camera of the match, or clip of its broadcast camera",
-        "video": "null, or a video's time_base [1, units per second], size [px], missing_frames",
+        "video": "null, or a video's time_base [1, units per second], size [px], missing_frames, "
+        "and is_counted if frames are known only by counting from the first",
         **POINT_ATTRIBUTE,
     },
     optional=(*(array.name for array in (*KEYPOINT_ARRAYS, *VIDEO_ARRAYS)), *OPTIONAL_POINTS),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -49,7 +49,8 @@ def detection(work: Work) -> str:
         found = _open_uncorrected(store, work) if edits else None
         found = found or _detect_people(store, work, spool)
         result.figures |= found.figures
-        result.warnings += [f"{work.recipe.name}: {each}." for each in found.warnings]
+        warnings = [*found.warnings, *_warn_of_gaps(found)]
+        result.warnings += [f"{work.recipe.name}: {each}." for each in warnings]
         detections = found.detections
         if edits:
             replay = replay_detections(detections, edits)
@@ -85,6 +86,23 @@ class _Found:
     warnings: tuple[str, ...]
 
 
+MAX_UNREADABLE_SHARE: Final = 0.01
+"""Share of a clip's frames without an image from which the run warns [1]."""
+
+
+def _warn_of_gaps(found: _Found) -> list[str]:
+    """Return a sentence if the video lacks images of many frames, or cannot be decoded there."""
+    share = found.figures["unreadable_share"]
+    if share <= MAX_UNREADABLE_SHARE:
+        return []
+    gaps = [f"{first} to {last}" for first, last in found.unreadable]
+    more = f" and {len(gaps) - 3} more stretches" if len(gaps) > 3 else ""
+    return [
+        f"the video has no image, or none that can be decoded, for {share:.1%} of the frames: "
+        f"{', '.join(gaps[:3])}{more}. Check the video, and convert it with any video tool"
+    ]
+
+
 def _open_uncorrected(store: Store, work: Work) -> _Found | None:
     """Return the published detections without corrections; None if there are none."""
     published = open_uncorrected(store, work, "edits")
@@ -114,6 +132,13 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
     require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
     report = finder.report
+    if len(report.unreadable) == report.frames:
+        raise InputError(
+            str(Path(work.folder) / sources["video"]),
+            expected="images that can be decoded",
+            found=f"none in {report.frames} frames",
+            todo="Convert the video with any video tool, and give that one.",
+        )
     return _Found(
         KeypointDetections.from_arrays(
             {
@@ -195,6 +220,7 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
         footage["picture_key"].values,
         time_base,
         (width, height),
+        is_counted=video.get("is_counted", False),
     )
 
 

@@ -65,6 +65,7 @@ def _write_footage(result: ResultWriter, work: Work) -> None:
                 "time_base": None if base is None else [base.numerator, base.denominator],
                 "size": list(footage.index.size),
                 "missing_frames": footage.missing,
+                **({"is_counted": True} if footage.index.is_counted else {}),
             },
         },
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -201,7 +202,15 @@ def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
 
     with open_video(path, index) as video:
         pictures = some_pictures(video, np.unique(shown[shown >= 0]))
-        still = median_picture((each for _, each in pictures if each is not None), STILL_FRAMES)
+        sound = (each for _, each in pictures if each is not None)
+        if (one := next(sound, None)) is None:
+            raise InputError(
+                str(path),
+                expected="images that can be decoded",
+                found=f"none in {len(chosen)} frames of the clips",
+                todo="Convert the video with any video tool, and give that one.",
+            )
+        still = median_picture(chain([one], sound), STILL_FRAMES)
     require_registered(path, filmed["video_sha256"])
     return still
 

@@ -10,12 +10,12 @@ import typer
 from data_contracts.arrays import Image
 from flows.cli.console import JsonOption, line, print_json, print_table
 from worldpose.errors import InputError, UsageError
+from worldpose.video import is_video
 
 if TYPE_CHECKING:
     from worldpose.static_calibration.boards import Board, BoardView, LensFit
 
 IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-VIDEOS: Final = (".mp4", ".mov", ".mkv", ".avi")
 FEW_FIELDS: Final = 0.4
 """Share of the image with corners from which on nothing is said [1]."""
 
@@ -102,13 +102,13 @@ def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
         InputError: there are no images and no videos.
         UsageError: images of one camera without its name, or a name with several cameras.
     """
-    found = sorted(boards.iterdir()) if boards.is_dir() else []
+    found = sorted(boards.glob("[!.]*"))
     if any(file.suffix.lower() in IMAGES for file in found) or boards.is_file():
         return {camera or _camera_name(boards): boards}
     places = {
         _camera_name(place): place
         for place in found
-        if place.suffix.lower() in VIDEOS or (place.is_dir() and _images(place))
+        if is_video(place) or (place.is_dir() and _images(place))
     }
     if not places:
         raise InputError(

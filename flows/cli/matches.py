@@ -337,6 +337,9 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
     clip = spec.clips[0]
     for note in notes:
         line(note)
+    for camera in spec.cameras:
+        if camera.video is not None and (file := Path(camera.video)).stem != camera.id:
+            line(f"{file.name} is camera {camera.id}")
     line(
         f"made match {spec.match_id} in {out}: {len(spec.cameras)} cameras, frames "
         f"{clip.first_frame} to {clip.first_frame + clip.frame_count - 1}"

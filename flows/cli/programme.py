@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from flows.cli.console import JsonOption, errors, line, print_json, print_table
-from worldpose.errors import UsageError
+from worldpose.errors import InputError, UsageError
 
 ANALYSED_WIDTH = 320
 """Width of the analysed images [px]."""
@@ -52,7 +52,21 @@ def clips(
     from worldpose.video import index_frames
 
     index = index_frames(programme)
-    shots = list(find_shots(_pictures(programme), index.fps))
+    lost: list[int] = []
+    shots = list(find_shots(_pictures(programme, lost), index.fps))
+    if len(lost) == len(index):
+        raise InputError(
+            str(programme),
+            expected="images that can be decoded",
+            found=f"none in {len(index)} frames",
+            todo="Convert the video with any video tool.",
+        )
+    if lost:
+        line(
+            f"{programme}: {len(lost)} of {len(index)} images cannot be decoded, "
+            f"the first is {lost[0]}",
+            to=errors,
+        )
     proposed = [shot for shot in shots if not shot.unfit]
     if sheet is not None:
         from worldpose.formats import whole_file
@@ -96,8 +110,8 @@ def clips(
         line(f"{sum(reason in shot.unfit for shot in shots)} shots not proposed: {reason}")
 
 
-def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Yield all images, downscaled, with progress on a terminal."""
+def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Yield all images, downscaled, with progress on a terminal; add undecodable ones to `lost`."""
     from worldpose.video import VideoReader
 
     with (
@@ -106,6 +120,8 @@ def _pictures(programme: Path) -> Iterator[tuple[int, NDArray[np.uint8] | None]]
     ):
         bar = bars.add_task(programme.name, total=len(video))
         for number, picture in video.readable(width=ANALYSED_WIDTH):
+            if picture is None:
+                lost.append(number)
             yield number, picture
             bars.update(bar, completed=number + 1)
 

@@ -30,14 +30,14 @@ from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
 from flows.web.browser_words import in_browser
-from flows.web.video_folders import VIDEO_SUFFIXES, is_video, open_video
+from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats import whole_file
 from worldpose.ingest import MatchFolder, read_match
 from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.validation import list_problems, validate_record
 from worldpose.store import Store
-from worldpose.video import FrameIndex, VideoReader, index_frames
+from worldpose.video import VIDEO_SUFFIXES, FrameIndex, VideoReader, index_frames, is_video
 from worldpose.video.folder import HEADER_BYTES, declared_size
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 
@@ -183,6 +183,7 @@ class Drafts:
                 the disk is too small for it, or the draft has too many files.
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
+        title = title.lower() if title.lower() in MATCH_FILES else title
         if title not in MATCH_FILES and not _is_footage(title):
             known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
             raise _refusal(

@@ -9,15 +9,12 @@ import os
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 
 from worldpose.errors import InputError
+from worldpose.video import is_video
 
-VIDEO_SUFFIXES: Final = (
-    *(".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4"),
-    *(".mpeg", ".mpg", ".mts", ".mxf", ".ts", ".webm"),
-)
 MAX_ENTRIES: Final = 2000
 """Folders and videos of one folder that a page lists."""
 
@@ -63,11 +60,6 @@ def open_video(folders: Sequence[Path], number: int, path: str) -> Iterator[int]
         raise _refusal(path, "a video file", "another suffix")
     with _open_below(folders, number, path, is_folder=False) as descriptor:
         yield descriptor
-
-
-def is_video(name: str) -> bool:
-    """Return whether a file's name has the suffix of a video."""
-    return PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """`worldpose clips`: what it proposes of a programme, and what it cuts out."""
 
+import av
 import numpy as np
 from command_line import succeed, worldpose
 
@@ -37,3 +38,20 @@ def test_a_pan_is_proposed_and_cut_out_as_it_is(tmp_path):
         assert np.array_equal(one.frame(23), same)
     # Existing files are not overwritten.
     assert worldpose("clips", video, "--take", "23:48", "--out", out).code == 2
+
+
+def test_a_programme_that_cannot_be_decoded_is_no_empty_table(tmp_path):
+    path = tmp_path / "programme.mp4"
+    write_video(path, lawn_and_stand()[:20], FPS)
+    with av.open(str(path)) as video:
+        places = [(packet.pos, packet.size) for packet in video.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    for place, size in places[10:]:
+        content[place : place + size] = bytes(size)
+    path.write_bytes(content)
+    assert "of 20 images cannot be decoded" in succeed("clips", path).err
+    for place, size in places:
+        content[place : place + size] = bytes(size)
+    path.write_bytes(content)
+    failed = worldpose("clips", path)
+    assert failed.code == 1 and "none in 20 frames" in failed.err

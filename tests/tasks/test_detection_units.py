@@ -3,6 +3,7 @@
 from dataclasses import replace
 from datetime import UTC, datetime
 
+import av
 import numpy as np
 import pytest
 from filmed import write_filmed
@@ -106,6 +107,21 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
     )
     figures = store.manifest("filmed", "detection", "right.late", results["detection/right.late"])
     assert figures.figures["unreadable_share"] == pytest.approx(0.2)
+    assert any("no image, or none that can be decoded, for 20.0%" in w for w in figures.warnings)
+
+
+def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tmp_path, reading):
+    path = filmed / "videos" / "left.mp4"
+    with av.open(str(path)) as video:
+        places = [(packet.pos, packet.size) for packet in video.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    for place, size in places:
+        content[place : place + size] = bytes(size)
+    path.write_bytes(content)
+    store = Store.create(tmp_path / "project")
+    match, _ = register(store, filmed)
+    with pytest.raises(InputError, match=r"left\.mp4.*none in 12 frames"):
+        computed(store, match, [stage.name for stage in METHOD].index("tracking"))
 
 
 class Marking:

@@ -12,6 +12,8 @@ The reader ignores further keys.
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -113,7 +115,7 @@ def build_camera(
         rotation = u @ vt
     try:
         return CameraCalibration(
-            id=name,
+            id=camera_id(name),
             image_size=(int(size[0]), int(size[1])),
             focal_px=tuple(focal.tolist()),
             principal_point_px=tuple(principal_point.tolist()),
@@ -150,6 +152,19 @@ def require_optics(
             found=str(principal_point.tolist()),
             todo="Give it in pixels from the image's top-left corner.",
         )
+
+
+def camera_id(name: str) -> str:
+    """Return the id of a camera that a file or a calibration calls by any name.
+
+    Accents are dropped, and hyphens stand for characters that ids do not allow: "Südtribüne 1" is
+    Sudtribune-1. A path stays as it is, to be refused, and so does a name of other letters alone.
+    """
+    if re.search(r"[/\\]", name):
+        return name
+    letters = unicodedata.normalize("NFKD", name)
+    plain = "".join(letter for letter in letters if not unicodedata.combining(letter))
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", plain).strip("-._") or name
 
 
 def index_by_name(

@@ -27,6 +27,7 @@ from worldpose.formats.calibration_files import (
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_file_storage
+from worldpose.video import is_video
 
 if TYPE_CHECKING:
     from worldpose.geometry import Camera
@@ -48,9 +49,6 @@ ON_ITS_HEAD: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0
 
 LYING: Final = np.diag([1.0, -1.0, -1.0])
 """(3, 3) from a board on the ground, whose z points into it."""
-
-VIDEOS: Final = (".mp4", ".avi", ".mov", ".mkv")
-"""Ends of a video's name, which bioCV puts before its own."""
 
 
 class Form(NamedTuple):
@@ -367,7 +365,7 @@ def _read_biocv(files: tuple[Path, ...]) -> dict[str, CameraCalibration]:
             "translation of L": pose[:3, 3].tolist(),
         }
         keys = Keys("size", "K", "distortion", "rotation of L", "translation of L")
-        name = Path(file.stem).stem if Path(file.stem).suffix in VIDEOS else file.stem
+        name = Path(file.stem).stem if is_video(file.stem) else file.stem
         camera = read_camera_table(where, name, table, keys=keys, unit_m=MILLIMETRE)
         cameras.append((where, camera))
     return index_by_name(files[0].parent if len(files) > 1 else files[0], cameras, MILLIMETRE)

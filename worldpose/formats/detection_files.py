@@ -117,7 +117,7 @@ def read_openpose_folder(folder: Path) -> OpenPoseFolder:
 
 def _frame_files(folder: Path) -> dict[int, Path]:
     files: dict[int, Path] = {}
-    for file in sorted(folder.glob("*.json")):
+    for file in sorted(folder.glob("*.[jJ][sS][oO][nN]")):
         number = _NUMBER.search(file.name)
         if number is None or int(number[1]) > FRAME_LIMIT:
             raise InputError(

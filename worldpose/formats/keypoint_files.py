@@ -470,7 +470,9 @@ def read_observations(
             the error names file and place.
     """
     path = Path(path)
-    people = read_keypoint_arrays(path) if path.suffix == ".npz" else read_coco_results(path)
+    people = (
+        read_keypoint_arrays(path) if path.suffix.lower() == ".npz" else read_coco_results(path)
+    )
     seen = people.frame
     if ranges is None:
         first = int(seen[0]) if len(seen) else 0

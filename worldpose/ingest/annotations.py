@@ -111,7 +111,7 @@ def _files(folder: Path, place: str, expected: str, known: Collection[str]) -> I
     """Yield the files of a folder of the match, sorted; raise InputError for an unknown name."""
     for name in sorted(path.name for path in (folder / place).glob("[!.]*")):
         file = existing_file(folder, f"{place}/{name}", str(folder))
-        if file.suffix != ".json" or file.stem not in known:
+        if file.suffix.lower() != ".json" or file.stem not in known:
             raise InputError(
                 str(file),
                 expected=f"{expected}: {', '.join(known) or 'none here'}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,6 +16,7 @@ from data_contracts.cameras import CameraCalibration, LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import camera_id
 from worldpose.formats.calibration_forms import (
     TOML,
     calibrations_in,
@@ -29,7 +30,7 @@ from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video import FrameIndex, VideoReader, index_frames
+from worldpose.video import VIDEO_SUFFIXES, FrameIndex, VideoReader, index_frames, is_video
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""
@@ -125,27 +126,24 @@ def import_lenses(
 
 
 def files_by_camera(
-    folder: Path, cameras: list[str], calibration: Path, suffixes: tuple[str, ...]
+    folder: Path, cameras: Sequence[str], calibration: Path, suffixes: Collection[str]
 ) -> dict[str, Path]:
     """Return the file of each camera in a folder, by the camera's name.
 
     Raises:
         InputError: a camera lacks its file, or a file its camera.
     """
-    files = [
-        file
-        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if file.suffix in suffixes and not file.name.startswith(".")
-    ]
-    if sorted(file.stem for file in files) != sorted(cameras):
+    there = sorted(folder.glob("[!.]*"))
+    files = [file for file in there if file.suffix.lower() in suffixes]
+    if sorted(camera_id(file.stem) for file in files) != sorted(cameras):
         raise InputError(
             str(folder),
-            expected=f"one {' or '.join(suffixes)} file for each camera in {calibration.name}: "
+            expected=f"one file ({', '.join(suffixes)}) for each camera in {calibration.name}: "
             + ", ".join(cameras),
-            found=", ".join(file.name for file in files) or "no such file",
+            found=", ".join(file.name for file in files or there) or "no such file",
             todo="Rename the files as the cameras, and leave neither over.",
         )
-    by_name = {file.stem: file for file in files}
+    by_name = {camera_id(file.stem): file for file in files}
     return {name: by_name[name] for name in cameras}
 
 
@@ -153,9 +151,6 @@ def name_of(folder: Path) -> str:
     """Return the folder's name without characters that ids do not allow."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._")[:64]
     return name or "match"
-
-
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
 
 
 def import_videos(
@@ -175,7 +170,7 @@ def import_videos(
 
     Args:
         calibration: a file or folder that `read_calibration` reads; None = not known.
-        videos: folder with `<camera>.mp4`, .mov, .mkv or .avi for each camera of the calibration.
+        videos: folder with a video for each camera of the calibration, called as the camera.
         out: the match folder, absent or empty.
         fps: frame rate of all videos [1/s]; None = from the videos.
         match_id: id of the match; None = the name of `out`.
@@ -191,7 +186,7 @@ def import_videos(
     """
     cameras: dict[str, CameraCalibration] = {}
     if calibration is None:
-        files = {file.stem: file for file in _films(videos)}
+        files = {camera_id(file.stem): file for file in _films(videos)}
         indices = {name: index_frames(file) for name, file in files.items()}
     else:
         cameras = read_calibration(calibration)
@@ -233,16 +228,13 @@ def _films(folder: Path) -> list[Path]:
     Raises:
         InputError: there are fewer than two, or two of one name.
     """
-    files = [
-        file
-        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if file.suffix.lower() in VIDEO_SUFFIXES and not file.name.startswith(".")
-    ]
-    if len({file.stem for file in files}) != len(files) or len(files) < 2:
+    there = sorted(folder.glob("[!.]*"))
+    files = [file for file in there if is_video(file)]
+    if len({camera_id(file.stem) for file in files}) != len(files) or len(files) < 2:
         raise InputError(
             str(folder),
             expected=f"a video for each of two cameras or more ({', '.join(VIDEO_SUFFIXES)})",
-            found=", ".join(file.name for file in files) or "no video",
+            found=", ".join(file.name for file in files or there) or "no video",
             todo="Name each video after its camera.",
         )
     return files
@@ -368,11 +360,7 @@ def import_pose2sim(
     cameras = {} if calibration is None else read_calibration(calibration)
     folder = project / "pose-sync" if (project / "pose-sync").is_dir() else project / "pose"
     places = [each for each in sorted(folder.glob("*")) if each.is_dir()]
-    films = [
-        file
-        for file in sorted((project / "videos").glob("*"))
-        if file.suffix.lower() in VIDEO_SUFFIXES
-    ]
+    films = [file for file in sorted((project / "videos").glob("[!.]*")) if is_video(file)]
     if not places and not films:
         raise InputError(
             str(project),
@@ -385,7 +373,7 @@ def import_pose2sim(
             "no calibration: worldpose calibrate finds lenses, and worldpose locate-cameras the "
             "poses from people who walk"
         ]
-        names = [file.stem for file in _films(project / "videos")]
+        names = [camera_id(file.stem) for file in _films(project / "videos")]
         source = project / "videos"
     else:
         notes = [f"cameras: {calibration}"]
@@ -565,7 +553,7 @@ def _assign(
             found=", ".join(place.name for place in places),
             todo="Add the missing ones, or take the camera out of the calibration.",
         )
-    named = {place.stem.removesuffix("_json"): place for place in places}
+    named = {camera_id(place.stem.removesuffix("_json")): place for place in places}
     if set(named) == set(cameras):
         return {camera: named[camera] for camera in cameras}
     pairs = dict(zip(cameras, places, strict=True))

@@ -24,7 +24,7 @@ from worldpose.ingest.annotations import (
     read_key_frames,
 )
 from worldpose.ingest.pitch_file import read_pitch
-from worldpose.ingest.validation import existing_file, reachable, validate_record
+from worldpose.ingest.validation import existing_file, find_file, reachable, validate_record
 
 CLICKS_NEEDED: Final = "at least four points of the pitch, better 8 to 12 all over the picture,"
 """Request in messages on cameras without calibration."""
@@ -290,7 +290,7 @@ def _stills(folder: Path, spec: MatchSpec) -> dict[str, Path]:
         if camera.still is not None:
             where = f"{folder / 'match.yaml'}: cameras[{index}].still"
             stills[camera.id] = existing_file(folder, camera.still, where)
-        elif (folder / usual).exists():
+        elif find_file(folder, usual).exists():
             stills[camera.id] = existing_file(folder, usual, str(folder))
     return stills
 
@@ -301,7 +301,7 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     found: dict[str, Path] = {}
     files = sorted((folder / "detections").glob("*")) if (folder / "detections").is_dir() else []
     for file in files:
-        if file.suffix not in (".json", ".npz") or file.name.startswith("."):
+        if file.suffix.lower() not in (".json", ".npz") or file.name.startswith("."):
             continue
         if file.stem not in known:
             raise InputError(
@@ -324,7 +324,7 @@ def _detections(folder: Path, spec: MatchSpec) -> dict[str, Path]:
 def _estimates(folder: Path, spec: MatchSpec) -> dict[str, Path]:
     known = [clip.id for clip in spec.clips if clip.broadcast is not None]
     found = {}
-    for file in sorted((folder / "estimates").glob("*.npz")):
+    for file in sorted((folder / "estimates").glob("*.[nN][pP][zZ]")):
         if file.stem not in known:
             raise InputError(
                 str(file),
@@ -340,7 +340,7 @@ def _boxes(
     folder: Path, videos: Mapping[str, Path], detections: Mapping[str, Path]
 ) -> dict[str, Path]:
     found = {}
-    for file in sorted((folder / "boxes").glob("*.txt")):
+    for file in sorted((folder / "boxes").glob("*.[tT][xX][tT]")):
         if file.stem not in videos or file.stem in detections:
             raise InputError(
                 str(file),
@@ -364,11 +364,11 @@ def _videos(folder: Path, spec: MatchSpec) -> dict[str, Path]:
         usual = f"videos/{camera.id}.mp4"
         if camera.id in named:
             videos[camera.id] = named[camera.id]
-        elif (folder / usual).exists():
+        elif find_file(folder, usual).exists():
             videos[camera.id] = existing_file(folder, usual, str(folder))
     for clip in spec.clips:
         usual = f"broadcast/{clip.id}.mp4"
-        if clip.broadcast is not None and (folder / usual).exists():
+        if clip.broadcast is not None and find_file(folder, usual).exists():
             videos[clip.id] = existing_file(folder, usual, str(folder))
         elif clip.broadcast is not None and clip.broadcast in named:
             videos[clip.id] = named[clip.broadcast]

@@ -6,6 +6,7 @@ Invalid data raises `InputError` with file and key.
 from __future__ import annotations
 
 import json
+import unicodedata
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -171,6 +172,31 @@ def reachable(folder: Path) -> Iterator[None]:
         ) from error
 
 
+def find_file(folder: Path, name: str) -> Path:
+    """Return the path of a file, whose name on disk may differ as the names of `same_name` do.
+
+    Args:
+        folder: the folder.
+        name: relative to the folder; it need not exist.
+    """
+    path = folder
+    for part in PurePosixPath(name).parts:
+        if not (path / part).exists() and path.is_dir():
+            same = [each for each in path.iterdir() if same_name(each.name) == same_name(part)]
+            part = same[0].name if len(same) == 1 else part
+        path = path / part
+    return path
+
+
+def same_name(name: str) -> str:
+    """Return the form in which names of files are compared.
+
+    Cameras write endings in capitals, and macOS writes letters and their accents apart.
+    """
+    composed = PurePosixPath(unicodedata.normalize("NFC", name))
+    return composed.stem + composed.suffix.lower()
+
+
 def existing_file(folder: Path, name: str, where: str, *, folders: bool = False) -> Path:
     """Return the path of an existing file in the folder.
 
@@ -184,8 +210,8 @@ def existing_file(folder: Path, name: str, where: str, *, folders: bool = False)
         InputError: there is no such file, or it is outside.
     """
     require_local(name, where)
-    path = folder / name
     try:
+        path = find_file(folder, name)
         there = path.is_file() or (folders and path.is_dir() and any(path.iterdir()))
         inside = path.resolve().is_relative_to(folder.resolve())
     except PermissionError as error:

@@ -11,13 +11,16 @@ from worldpose.lazy_names import import_on_use
 if TYPE_CHECKING:
     from worldpose.video.files import FrameIndex, VideoReader, index_frames, write_video
     from worldpose.video.folder import ImageFolder, index_video, median_picture, open_video
+    from worldpose.video.names import VIDEO_SUFFIXES, is_video
 
 __all__ = [
+    "VIDEO_SUFFIXES",
     "FrameIndex",
     "ImageFolder",
     "VideoReader",
     "index_frames",
     "index_video",
+    "is_video",
     "median_picture",
     "open_video",
     "write_video",
@@ -38,5 +41,6 @@ __getattr__ = import_on_use(
             "median_picture",
             "open_video",
         ),
+        "worldpose.video.names": ("VIDEO_SUFFIXES", "is_video"),
     },
 )

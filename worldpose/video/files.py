@@ -5,15 +5,17 @@ Videos are written from images, or cut from another video without re-encoding.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import dropwhile, islice, pairwise
 from pathlib import Path
 from typing import Final, Self
 
 import av
 import numpy as np
 from av.container import InputContainer
+from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -23,6 +25,12 @@ MOST_FRAMES: Final = 10_000_000
 """Most frames of a video's clock, two days at 60 frames/s: one wrong stamp would fill memory."""
 RATE_SLACK: Final = 0.1
 """Share of missing or duplicate frames from which a video's rate differs from its clock's."""
+SAMPLED_FRAMES: Final = 64
+"""First frames that tell whether packets say when they are shown; no codec delays more than 16."""
+TRIED_KEYS: Final = 3
+"""Key frames from which decoding is tried until one is whole; damaged ones never are."""
+FIRST_LEAD_S: Final = 0.5
+"""Time by which seeking begins earlier where it ended too late [s]: usual codecs delay less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +45,15 @@ class FrameIndex:
         key: (pictures,) whether decoding can begin there.
         time_base: seconds per unit; None where stamps are frame numbers, as in a folder of images.
         size: width, height of the frames as displayed, after rotation [px].
+        is_counted: whether a frame is known only by counting all frames before it: the file does
+            not say when each one is shown, as AVI with B-frames of H.264.
     """
 
     stamps: NDArray[np.int64]
     key: NDArray[np.bool_]
     time_base: Fraction | None
     size: tuple[int, int]
+    is_counted: bool = False
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -60,7 +71,8 @@ class FrameIndex:
             return float("nan")
         # The median of the single steps is rounded to the time base; the whole length is not.
         step = np.diff(self.stamps)
-        usual = np.abs(step - np.median(step)) <= 1
+        away = np.abs(step - np.median(step))
+        usual = away <= max(1.0, float(away.min()))
         return float(1.0 / (step[usual].mean() * float(self.time_base)))
 
     def on_clock(self, fps: float, where: str) -> NDArray[np.int64]:
@@ -75,7 +87,7 @@ class FrameIndex:
             where: the video, for messages.
 
         Raises:
-            InputError: the video has another rate, or implausibly many frames.
+            InputError: the video has another rate or none, or implausibly many frames.
         """
         if self.time_base is None:
             exact = (self.stamps - self.stamps[0]).astype(np.float64)
@@ -97,17 +109,32 @@ class FrameIndex:
         filled = int(np.count_nonzero(picture >= 0))
         odd = (len(picture) - filled) + (len(slot) - filled)
         if self.time_base is not None and odd > RATE_SLACK * max(len(picture), len(slot)):
-            raise InputError(
+            raise self._rate_error(fps, where)
+        return picture
+
+    def _rate_error(self, fps: float, where: str) -> InputError:
+        """Return the error of a video that does not follow a clock."""
+        step = np.diff(self.times)
+        if abs(self.fps - fps) > RATE_SLACK * fps:
+            return InputError(
                 where,
                 expected=f"{fps:g} frames per second, the rate in match.yaml",
                 found=f"{self.fps:.4g}",
                 todo="Correct fps in match.yaml, or convert the video to that rate.",
             )
-        return picture
+        return InputError(
+            where,
+            expected=f"{fps:g} frames per second throughout",
+            found=f"a rate that varies: images are {step.min():.4g} to {step.max():.4g} s apart, "
+            f"most of all after {self.times[step.argmax()]:.2f} s",
+            todo="Convert the video to a constant frame rate with any video tool.",
+        )
 
 
 def index_frames(path: Path) -> FrameIndex:
     """Return the index of a file's first video stream, from its packets: it decodes one frame.
+
+    It decodes all frames of a file whose packets do not say when each frame is shown.
 
     Raises:
         InputError: no video, or frames without time stamps.
@@ -117,42 +144,111 @@ def index_frames(path: Path) -> FrameIndex:
             if not container.streams.video:
                 raise _no_video(path, "no video stream")
             stream = container.streams.video[0]
-            size = _shown_size(container, stream)
-            container.seek(0)
-            packets = [
-                (packet.pts, packet.is_keyframe)
-                for packet in _packets(container, stream)
-                if packet.size and not packet.is_discard
-            ]
+            if stream.codec_context is None:
+                raise _no_video(path, "a video stream that this program has no decoder for")
+            size: tuple[int, int] | None = None
+            packets: list[tuple[int | None, bool]] = []
+            for packet in _packets(container, stream):
+                size = _shown_size(packet) if size is None else size
+                if packet.size and not packet.is_discard:
+                    packets.append((packet.pts, packet.is_keyframe))
+            size = (stream.width, stream.height) if size is None else size
             base = stream.time_base
+            reorders = stream.codec_context.has_b_frames
+        given = [stamp for stamp, _ in packets if stamp is not None]
+        if not given or base is None:
+            raise _no_video(path, f"{len(packets)} pictures without time stamps")
+        is_told = len(set(given)) == len(packets)
+        # The order of decoding, although the codec may decode a frame before one shown earlier?
+        if is_told and reorders and given == sorted(given):
+            is_told = _rise(_shown_stamps(path, SAMPLED_FRAMES))
+        if not is_told:
+            return _count_frames(path, given, len(packets), base, size)
     except (av.error.FFmpegError, OSError) as error:
         raise _no_video(path, f"{error}") from error
-    if not packets or base is None or any(stamp is None for stamp, _ in packets):
-        raise _no_video(path, f"{len(packets)} pictures, not all with time stamps")
-    stamps = np.array([stamp for stamp, _ in packets], dtype=np.int64)
+    stamps = np.array(given, dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     key = np.array([key for _, key in packets], dtype=np.bool_)[order]
     return FrameIndex(stamps[order], key, base, size)
 
 
-def _packets(container: InputContainer, stream: VideoStream) -> list[av.Packet[VideoStream]]:
-    """Return all packets of a stream; a truncated file ends where it was cut."""
-    found: list[av.Packet[VideoStream]] = []
-    try:
-        found.extend(container.demux(stream))
-    except av.error.FFmpegError:
-        if not found:
-            raise
-    return found
+def _count_frames(
+    path: Path, given: Sequence[int], count: int, base: Fraction, size: tuple[int, int]
+) -> FrameIndex:
+    """Return the index of a video whose packets do not say when each frame is shown.
+
+    Args:
+        path: the video.
+        given: the time stamps that its packets have.
+        count: number of its packets.
+        base: unit of the time stamps [s].
+        size: width, height of its frames as shown [px].
+
+    Raises:
+        InputError: a frame cannot be decoded, or the frames with a time are not evenly spaced.
+    """
+    shown = _shown_stamps(path)
+    if len(shown) != count:
+        raise _no_video(path, f"{count} pictures without their order, {len(shown)} can be decoded")
+    stamps = np.sort(np.array(given, dtype=np.int64))
+    if len(np.unique(stamps)) < count:
+        known = np.array([number for number, stamp in enumerate(shown) if stamp is not None])
+        times = np.array([stamp for stamp in shown if stamp is not None], dtype=np.float64)
+        spans = len(known) > 1 and times[-1] > times[0]
+        step = (times[-1] - times[0]) / (known[-1] - known[0]) if spans else 0.0
+        if not spans or np.abs(times[0] + step * (known - known[0]) - times).max() > 0.5 * step:
+            raise _no_video(path, f"{count} pictures, not all with time stamps")
+        stamps = np.rint(times[0] + step * (np.arange(count) - known[0])).astype(np.int64)
+    return FrameIndex(stamps, np.arange(count) == 0, base, size, is_counted=True)
 
 
-def _shown_size(container: InputContainer, stream: VideoStream) -> tuple[int, int]:
+def _shown_stamps(path: Path, most: int | None = None) -> list[int | None]:
+    """Return the time stamps of all frames, or of the first `most`, in the order shown."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        pictures = _decode(_packets(container, stream))
+        return [picture.pts for picture in islice(pictures, most)]
+
+
+def _rise(stamps: Sequence[int | None]) -> bool:
+    """Return whether time stamps are known and rise."""
+    known = [stamp for stamp in stamps if stamp is not None]
+    return len(known) == len(stamps) and all(one < two for one, two in pairwise(known))
+
+
+def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Packet[VideoStream]]:
+    """Yield the packets of a stream; a truncated file ends where it was cut."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.error.FFmpegError:
+            return
+        if packet is None:
+            return
+        yield packet
+
+
+def _decode(packets: Iterable[av.Packet[VideoStream]]) -> Iterator[av.VideoFrame]:
+    """Yield the frames in the order shown, without those of packets that cannot be decoded."""
+    for packet in packets:
+        try:
+            shown = packet.decode()
+        except av.error.FFmpegError:
+            continue  # its frames are missing; those after the next key frame are not
+        for picture in shown:
+            assert isinstance(picture, av.VideoFrame)  # of a video stream
+            yield picture
+
+
+def _shown_size(packet: av.Packet[VideoStream]) -> tuple[int, int] | None:
     """Return width and height as displayed: an upright camera stores rotated frames."""
-    for picture in container.decode(stream):
+    for picture in _decode([packet]):
         if picture.rotation % 180:
             return picture.height, picture.width
         return picture.width, picture.height
-    return stream.width, stream.height
+    return None
 
 
 def _no_video(path: Path, found: str) -> InputError:
@@ -179,10 +275,9 @@ class VideoReader:
         """
         self.path = path
         self.index = index_frames(path) if index is None else index
-        self._container = av.open(str(path))
-        self._stream = self._container.streams.video[0]
-        self._stream.thread_type = "AUTO"
         self._number = {int(stamp): number for number, stamp in enumerate(self.index.stamps)}
+        self._lead = 0
+        self._open()
 
     def __enter__(self) -> Self:
         return self
@@ -192,6 +287,11 @@ class VideoReader:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def _open(self) -> None:
+        self._container = av.open(str(self.path))
+        self._stream = self._container.streams.video[0]
+        self._stream.thread_type = "AUTO"
 
     def close(self) -> None:
         """Close the file."""
@@ -257,26 +357,37 @@ class VideoReader:
                 found=f"{start} to {stop}",
                 todo="Ask for frames that the video has.",
             )
-        wanted, sound_from = start, start
-        for picture in self._shown_from(start) if start < stop else ():
-            number = self._number.get(-1 if picture.pts is None else int(picture.pts), -1)
+        for number, picture in self._sound_pictures(start, stop) if start < stop else ():
+            if number >= start and (only is None or number in only):
+                yield number, None if picture is None else _pixels(picture, grey, width)
+
+    def _sound_pictures(self, start: int, stop: int) -> Iterator[tuple[int, av.VideoFrame | None]]:
+        """Yield every frame from the last key frame up to `start` on; None if damaged."""
+        wanted = sound_from = self.key_before(start)
+        for number, picture in self._shown_from(start):
             if number < wanted:
                 continue
             if number > wanted or picture.is_corrupt:
                 sound_from = self._next_key(wanted)
             while wanted < min(number, stop):
-                if only is None or wanted in only:
-                    yield wanted, None
+                yield wanted, None
                 wanted += 1
             if wanted < stop:
-                if only is None or wanted in only:
-                    yield wanted, _pixels(picture, grey, width) if wanted >= sound_from else None
+                yield wanted, picture if wanted >= sound_from else None
                 wanted += 1
             if wanted == stop:
                 return
         for number in range(wanted, stop):
-            if only is None or number in only:
-                yield number, None
+            yield number, None
+
+    def key_before(self, number: int) -> int:
+        """Return the last frame up to `number` at which decoding can begin; 0 if none."""
+        return int(self._keys(number)[-1])
+
+    def _keys(self, number: int) -> NDArray[np.intp]:
+        """Return the frames up to `number` at which decoding can begin; the first if none."""
+        keys = np.flatnonzero(self.index.key[: number + 1])
+        return keys if len(keys) else np.zeros(1, dtype=np.intp)
 
     def _next_key(self, number: int) -> int:
         """Return the first frame after a damaged one that is not predicted from it."""
@@ -284,28 +395,60 @@ class VideoReader:
         after = int(np.searchsorted(keys, number, side="right"))
         return int(keys[after]) if after < len(keys) else len(self)
 
-    def _shown_from(self, start: int) -> Iterator[av.VideoFrame]:
-        """Yield displayed frames, from the last one up to `start` at which decoding can begin."""
-        before = np.flatnonzero(self.index.key[: start + 1])
-        begin = int(before[-1]) if len(before) else 0
-        self._container.seek(
-            int(self.index.stamps[begin]), stream=self._stream, backward=True, any_frame=False
-        )
-        packets = self._container.demux(self._stream)
-        while True:
-            try:
-                packet = next(packets, None)
-            except av.error.FFmpegError:  # the file is truncated here
-                packet = None
-            if packet is None:
-                return
-            try:
-                shown = packet.decode()
-            except av.error.FFmpegError:
-                continue  # its frames are missing; those after the next key frame are not
-            for picture in shown:
-                assert isinstance(picture, av.VideoFrame)  # of a video stream
-                yield picture
+    def _shown_from(self, start: int) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Yield numbers and displayed frames, from the last key frame up to `start` on.
+
+        Where the picture is refreshed stripe by stripe, a key frame itself is whole only if
+        decoding began before it.
+        """
+        keys = self._keys(start)[-TRIED_KEYS:]
+        first = None
+        for begin in keys[::-1].tolist():
+            shown = self._number_shown(begin)
+            first = next((each for each in shown if each[0] >= keys[-1]), None)
+            if first is not None and first[0] == keys[-1]:
+                break
+        if first is not None:
+            yield first
+            yield from shown
+
+    def _number_shown(self, begin: int) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Yield frames as decoding from frame `begin` on shows them, with their numbers or -1."""
+        for count, picture in enumerate(_decode(self.packets_from(begin))):
+            stamp = -1 if picture.pts is None else int(picture.pts)
+            yield count if self.index.is_counted else self._number.get(stamp, -1), picture
+
+    def packets_from(self, begin: int) -> Iterator[av.Packet[VideoStream]]:
+        """Yield the packets from a key frame, or the first frame, on.
+
+        Many containers seek by the time of decoding, or roughly: where the frame is not ahead, the
+        next try seeks earlier, in the end from the beginning of the file.
+        """
+        stamp, is_key = int(self.index.stamps[begin]), bool(self.index.key[begin])
+        lead = self._lead
+        while stamp - lead >= self.index.stamps[0] and not self.index.is_counted:
+            self._container.seek(stamp - lead, stream=self._stream, backward=True, any_frame=False)
+            before: list[av.Packet[VideoStream]] = []
+            packets = _packets(self._container, self._stream)
+            for packet in packets:
+                if packet.pts == stamp:
+                    self._lead = lead
+                    yield from before
+                    yield packet
+                    yield from packets
+                    return
+                if packet.pts is not None and packet.pts > stamp:
+                    break  # too late
+                if not is_key:
+                    before.append(packet)
+            assert self.index.time_base is not None  # of a video file
+            lead = 2 * lead or max(1, round(FIRST_LEAD_S / self.index.time_base))
+        self.close()
+        self._open()
+        packets = _packets(self._container, self._stream)
+        if is_key and not self.index.is_counted:
+            packets = dropwhile(lambda packet: packet.pts != stamp, packets)
+        yield from packets
 
     def _damage_error(self, number: int) -> InputError:
         return InputError(
@@ -324,15 +467,20 @@ def _pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np
 
 
 def _stored_pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
-    """Return RGB, or the first plane of a planar format, without the padding of its rows."""
+    """Return RGB, or luma of 8 bits as stored, without the padding of its rows."""
     if not grey and width is None:
         return np.asarray(picture.to_ndarray(format="rgb24"))
     if not grey and width is not None:
         height = round(picture.height * width / picture.width)
         small = picture.reformat(width, height, "rgb24", interpolation="AREA")
         return np.asarray(small.to_ndarray())
-    if not picture.format.name.startswith(("yuv4", "yuvj4", "gray")):
-        return np.asarray(picture.to_ndarray(format="gray"))
+    form = picture.format
+    if not form.name.startswith(("yuv4", "yuvj4", "gray")) or form.components[0].bits != 8:
+        # One range for both: luma stays as stored, as in the plane below.
+        small = picture.reformat(
+            format="gray", src_color_range=ColorRange.JPEG, dst_color_range=ColorRange.JPEG
+        )
+        return np.asarray(small.to_ndarray())
     plane = picture.planes[0]
     rows = np.frombuffer(bytes(plane), dtype=np.uint8).reshape(picture.height, plane.line_size)
     return np.ascontiguousarray(rows[:, : picture.width])
@@ -364,17 +512,19 @@ def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
             found=f"{start} to {stop}",
             todo="Request images that the video has.",
         )
-    begin = int(np.flatnonzero(index.key[: start + 1])[-1]) if index.key[: start + 1].any() else 0
-    first, end = int(index.stamps[begin]), int(index.stamps[stop - 1])
-    with av.open(str(path)) as source, av.open(str(out), "w") as target:
-        stream = source.streams.video[0]
-        written = target.add_stream_from_template(stream)
-        source.seek(first, stream=stream, backward=True, any_frame=False)
-        for packet in source.demux(stream):
+    if index.is_counted:
+        raise _no_video(path, "one that does not say when each picture is shown")
+    with VideoReader(path, index) as source, av.open(str(out), "w") as target:
+        begin = source.key_before(start)
+        first, end = int(index.stamps[begin]), int(index.stamps[stop - 1])
+        written: VideoStream | None = None
+        for packet in source.packets_from(begin):
             if packet.dts is None or packet.pts is None or packet.pts < first:
                 continue
             if packet.dts > end:
                 break
+            if written is None:
+                written = target.add_stream_from_template(packet.stream)
             packet.pts -= first
             packet.dts -= first
             packet.stream = written

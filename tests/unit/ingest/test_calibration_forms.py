@@ -432,7 +432,7 @@ BAD_TEXT = {
         ("<KeyFrame .*?/>", "", "none: the camera is not calibrated"),
         (r"(<KeyFrame .*?/>)", r"\1\1", "of a camera that does not move, found 2"),
         ('DEVICEID="b2"', 'DEVICEID="a1"', "a name of its own, found 'a1' a second time"),
-        ('DEVICEID="b2"', 'DEVICEID="b 2"', "name: expected up to 64 letters"),
+        ('DEVICEID="b2"', 'DEVICEID="b/2"', "name: expected up to 64 letters"),
         ("</Cameras>", "", "expected XML of Qualisys, Vicon or OptiTrack"),
         ("<Cameras", "<Camera", "mismatched"),
     ],

@@ -1,4 +1,5 @@
 import json
+import unicodedata
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ from worldpose.errors import InputError
 from worldpose.formats.calibration_files import write_calibration_toml
 from worldpose.formats.keypoint_files import write_keypoint_arrays
 from worldpose.ingest.footage import read_unit
-from worldpose.ingest.importing import import_match
+from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
+from worldpose.video import write_video
 
 
 def results(*frames):
@@ -130,3 +132,59 @@ def test_an_existing_match_is_left_as_it_was(tmp_path, source):
     with pytest.raises(InputError, match="left as it was"):
         run(source, tmp_path / "m")
     assert read_match(tmp_path / "m").spec.clips[0].first_frame == 300
+
+
+def film(path):
+    path.parent.mkdir(exist_ok=True)
+    write_video(path.with_suffix(".mp4"), [np.full((48, 64), 9, np.uint8)] * 3, 25.0)
+    path.with_suffix(".mp4").rename(path)
+
+
+def calibrate(folder, make_camera, names):
+    cameras = {
+        name: make_camera(f"cam{angle}", angle).model_copy(
+            update={"image_size": (64, 48), "principal_point_px": (31.5, 23.5)}
+        )
+        for angle, name in enumerate(names)
+    }
+    write_calibration_toml(folder / "calibration.toml", cameras)
+    return folder / "calibration.toml"
+
+
+@pytest.mark.parametrize("ending", ["MP4", "MOV", "Mkv", "M4V"])
+def test_endings_of_videos_and_poses_are_found_in_any_case(tmp_path, source, make_camera, ending):
+    names = ["GX010001", "GX010002"]
+    calibration = calibrate(tmp_path, make_camera, names)
+    for name in names:
+        film(tmp_path / "videos" / f"{name}.{ending}")
+    (tmp_path / "videos" / f"._{names[0]}.{ending}").write_bytes(b"of macOS")
+    for given in (calibration, None):
+        out = tmp_path / f"of {given}".replace("/", "")
+        import_videos(given, tmp_path / "videos", out)
+        match = read_match(out)
+        assert sorted(path.name for path in match.videos.values()) == [
+            f"{name}.{ending}" for name in names
+        ]
+    for file in list((source / "detections").iterdir()):
+        file.rename(file.with_suffix(".JSON"))
+    assert len(run(source, tmp_path / "m").cameras) == 2
+
+
+def test_a_file_of_another_ending_is_named(tmp_path, make_camera):
+    calibration = calibrate(tmp_path, make_camera, ["one"])
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "one.txt").write_text("none")
+    for given in (calibration, None):
+        with pytest.raises(InputError, match=r"found one\.txt"):
+            import_videos(given, tmp_path / "videos", tmp_path / "m")
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_with_accents_and_spaces_become_ids_in_either_form(tmp_path, make_camera, form):
+    names = ["S\u00fcdtrib\u00fcne", "Camera 1"]
+    calibration = calibrate(tmp_path, make_camera, names)
+    for name in names:
+        film(tmp_path / "videos" / (unicodedata.normalize(form, name) + ".mp4"))
+    spec = import_videos(calibration, tmp_path / "videos", tmp_path / "m")
+    assert [camera.id for camera in spec.cameras] == ["Sudtribune", "Camera-1"]
+    assert set(read_match(tmp_path / "m").videos) == {"Sudtribune", "Camera-1"}

@@ -116,6 +116,8 @@ def test_a_damaged_stretch_is_missing_up_to_the_next_key_frame(tmp_path):
     assert [read[n] for n in range(10)] == list(range(10))
     assert [read[n] for n in range(10, 20)] == [None] * 10
     assert [read[n] for n in range(20, 50)] == list(range(20, 50))
+    for start in (13, 16, 19):  # the same where reading begins after the damage
+        assert numbers_read(path, start, 22) == [(n, read[n]) for n in range(start, 22)]
 
 
 def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
