@@ -21,10 +21,9 @@ from typing import Any, Literal, NamedTuple
 
 from data_contracts.work import Recipe
 from worldpose.errors import StoreError
+from worldpose.parsing import parse_in_turn
 from worldpose.store.documents import canonical_json, digest
 
-PARSING_ATTEMPTS = 10
-"""Attempts to parse a source while other threads parse, too; see `_parse`."""
 DATA_SUFFIXES = (".npz", ".safetensors")
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -147,25 +146,11 @@ def parse_source(source: bytes) -> ParsedSource:
         SyntaxError: the source is not valid Python.
         ValueError: the source contains a zero byte.
     """
-    tree = _parse(source)
+    tree = parse_in_turn(lambda: ast.parse(source))
     nodes = _drop_text(tree)
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
     data = [text for text in texts if isinstance(text, str) and text.endswith(DATA_SUFFIXES)]
     return ParsedSource(digest(ast.unparse(tree).encode()), _imports(nodes), sorted(data))
-
-
-def _parse(source: bytes) -> ast.Module:
-    """Parse a source, also while another thread parses.
-
-    Python 3.11 shares its recursion depth counter between threads, and raises an error if the count
-    is wrong at the end (python/cpython issue 106905).
-    """
-    for _ in range(PARSING_ATTEMPTS - 1):
-        try:
-            return ast.parse(source)
-        except SystemError:
-            continue
-    return ast.parse(source)
 
 
 def _imports(nodes: list[ast.AST]) -> list[Import]:
