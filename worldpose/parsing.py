@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Collection
 from pathlib import Path
 from threading import RLock
-from typing import IO, Final, TypeVar
+from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -81,7 +81,7 @@ def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:
     return np.ndarray(shape, dtype, content, order="F" if is_fortran else "C")
 
 
-def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[np.generic]]:
+def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[Any]]:
     """Return those arrays of an npz file that are among `names`; others are not read.
 
     Raises:

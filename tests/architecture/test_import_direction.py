@@ -23,6 +23,7 @@ FORBIDDEN = {
 
 ORDER_IN_WORLDPOSE = (
     "errors",
+    "cache_folder",
     "lazy_names",
     "parsing",
     "compiled",

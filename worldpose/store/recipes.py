@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import functools
 import json
-import os
 import platform
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from data_contracts.work import Recipe
+from worldpose.cache_folder import find_cache_folder
 from worldpose.errors import StoreError
 from worldpose.parsing import parse_in_turn
 from worldpose.store.documents import canonical_json, digest
@@ -107,13 +107,10 @@ class SourceCache:
 
 
 def own_cache_file() -> Path | None:
-    """Return the file for the sources of this installation; None for a user without a home."""
+    """Return the file for the sources of this installation; None where none can be written."""
+    folder = find_cache_folder().path
     name = f"sources-{digest(str(_PACKAGE).encode())[:16]}.json"
-    try:
-        root = _PACKAGE if os.access(_PACKAGE, os.W_OK) else Path.home() / ".cache" / "worldpose"
-    except RuntimeError:
-        return None
-    return root / "__pycache__" / name
+    return None if folder is None else folder / name
 
 
 def _load(path: Path) -> dict[str, tuple[str, ParsedSource]]:

@@ -433,7 +433,7 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             size = sum(file.getinfo(f"{name}.npy").file_size for name in names)
         if size > FILE_BYTES:
             raise format_error(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
-        return dict(read_npz_members(path, names))
+        return read_npz_members(path, names)
     except KeyError as error:
         raise format_error(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
