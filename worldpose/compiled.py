@@ -16,6 +16,8 @@ from typing import Final, TypeVar, cast
 from numba import njit
 from numba.core import config
 
+from worldpose.cache_folder import find_cache_folder
+
 Function = TypeVar("Function", bound=Callable[..., object])
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -33,16 +35,18 @@ _OWN = ("worldpose", "data_contracts")
 
 
 def compile_kernel(function: Function) -> Function:
-    """Return `function`, compiled to machine code on its first call and cached on disk.
+    """Return `function`, compiled to machine code on its first call and cached on disk if possible.
 
     No fast-math and no parallel loops: the same input gives the same bits on any number of
     threads. The interpreter lock is released, and division by zero gives infinity as in numpy.
     """
     given = config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = given or _cache_folder(_module_of(function))
     # Numba reads this setting while it decorates.
-    config.CACHE_DIR = given or str(_cache_folder(_module_of(function)))  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
+    is_cached = folder is not None
     try:
-        return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
+        return cast(Function, njit(cache=is_cached, nogil=True, error_model="numpy")(function))
     finally:
         config.CACHE_DIR = given  # type: ignore[attr-defined]
 
@@ -89,13 +93,18 @@ def _module_of(function: Function) -> str:
 
 
 @functools.cache
-def _cache_folder(module: str) -> Path:
+def _cache_folder(module: str) -> Path | None:
     """Return a cache folder that is unique to the sources on which a module's kernels can depend.
+
+    None where no folder can be written to.
 
     Numba recompiles a kernel when its own file changes, but not when a kernel or constant from
     another file changes: it would then run machine code of the old source. Kernels of a module can
     depend on all modules that it imports, and on those that these import.
     """
+    root = find_cache_folder().path
+    if root is None:
+        return None
     sources, waiting = dict[str, str](), [module]
     while waiting:
         name = waiting.pop()
@@ -103,8 +112,7 @@ def _cache_folder(module: str) -> Path:
             sources[name] = _source(name) or ""
             waiting.extend(_imports(name))
     digest = hashlib.sha256("\0".join(text for _, text in sorted(sources.items())).encode())
-    root = _PACKAGE if os.access(_PACKAGE, os.W_OK) else Path.home() / ".cache" / "worldpose"
-    return root / "__pycache__" / f"kernels-{digest.hexdigest()[:16]}"
+    return root / f"kernels-{digest.hexdigest()[:16]}"
 
 
 @functools.cache

@@ -21,8 +21,9 @@ from typing import Any, ClassVar, Final, Self, cast
 
 import numpy as np
 import scipy.sparse
-from numpy.lib import format as npy
 from numpy.typing import NDArray
+
+from worldpose.parsing import read_npy, read_npy_header
 
 FILE_BYTES: Final = 8 << 30
 """Maximum unpacked size of a file [byte]: whole results without surfaces are a hundredth."""
@@ -483,12 +484,10 @@ def _decompress(path: Path) -> io.BytesIO:
 def _load_stream(stream: io.BytesIO) -> object:
     if stream.getvalue()[: len(_NUMPY)] != _NUMPY:
         return _Unpickler(stream).load()
-    if npy.read_magic(stream) != (1, 0):
-        raise ValueError("another version than npy 1.0")
-    _, _, kind = npy.read_array_header_1_0(stream)
+    _, _, kind = read_npy_header(stream)
     if not kind.hasobject:
         stream.seek(0)
-        return npy.read_array(stream, allow_pickle=False)
+        return read_npy(stream)
     found = plain(_Unpickler(stream).load())
     # numpy stores any object as an array of objects without dimensions.
     return found["item"] if isinstance(found, dict) and set(found) == {"item"} else found

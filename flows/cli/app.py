@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
@@ -14,6 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from flows import renames
+from worldpose.cache_folder import find_cache_folder
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -171,3 +173,18 @@ def worldpose(
     ] = False,
 ) -> None:
     """Reconstruct metric 3D poses of every player from many cameras."""
+    cache = find_cache_folder()
+    if cache.is_lasting:
+        return
+    effect = "each process compiles its code again, which takes minutes"
+    if cache.path is not None:
+        effect = f"compiled code is kept in {cache.path}"
+        os.environ.setdefault("MPLCONFIGDIR", str(cache.path / "matplotlib"))
+    if not os.environ.get("NUMBA_CACHE_DIR"):
+        from flows.cli.console import errors, line  # late: it takes 0.1 s
+
+        line(
+            f"warning: neither the package nor the home folder is writable: {effect}. "
+            "Set NUMBA_CACHE_DIR to a folder that stays, so that it is compiled only once.",
+            to=errors,
+        )

@@ -14,6 +14,8 @@ from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 
+from worldpose.cache_folder import user_cache
+
 DATABASE = "prefect.db"
 """Name of the database file in PREFECT_HOME."""
 
@@ -34,7 +36,7 @@ def begin_database(home: Path) -> bool:
     kept = kept_database()
     if (home / DATABASE).exists():
         return False
-    if not kept.exists():
+    if kept is None or not os.access(kept, os.R_OK):
         return True
     with storage_errors(str(home / DATABASE)), whole_file(home / DATABASE) as draft:
         try:
@@ -48,20 +50,20 @@ def keep_database(home: Path) -> None:
     """Keep a copy of the unused database that a server has created in `home`."""
     from worldpose.formats import whole_file
 
-    if not (home / DATABASE).exists():
-        return  # the environment names another database
+    kept = kept_database()
+    if kept is None or not (home / DATABASE).exists():
+        return  # no home, or the environment names another database
     # If the cache is not writable, every project creates its own.
     with (
         suppress(OSError, sqlite3.Error),
-        whole_file(kept_database()) as draft,
+        whole_file(kept) as draft,
         closing(sqlite3.connect(home / DATABASE)) as made,
         closing(sqlite3.connect(draft)) as copy,
     ):
         made.backup(copy)
 
 
-def kept_database() -> Path:
-    """Return the path of the kept empty database of this Prefect version."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    cache = Path(given) if Path(given).is_absolute() else Path("~/.cache").expanduser()
-    return cache / "worldpose" / f"prefect-{version('prefect')}.db"
+def kept_database() -> Path | None:
+    """Return the path of the kept empty database of this Prefect version; None without a home."""
+    cache = user_cache()
+    return None if cache is None else cache / "worldpose" / f"prefect-{version('prefect')}.db"

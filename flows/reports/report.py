@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -89,6 +90,7 @@ def write_report(
     scores: Evaluation | None = None
     if source is not None and len(clips_of(run.record)) == 1:
         scores = score(match.match_id, source, store.url, run_id=run.record.run_id).evaluation
+    _load_late_modules(run)
     with ThreadPoolExecutor(1) as painter:
         # Painting and encoding leave the interpreter to the figures for much of their time.
         filming = painter.submit(_write_videos, store, run, match, out, camera) if videos else None
@@ -114,6 +116,17 @@ def write_report(
     with whole_file(out) as draft:
         draft.write_text(page, encoding="utf-8")
     return films
+
+
+def _load_late_modules(run: Run) -> None:
+    """Import what both the videos and the sections import late, before two threads make them.
+
+    Modules of large libraries import each other in a circle. If two threads enter the circle at
+    different places, one of them gets a module without its names.
+    """
+    import_module("worldpose.store.groups")
+    if broadcast_cameras(run):
+        import_module("flows.reports.broadcast")
 
 
 def _write_figures(sections: list[Section], kept: Mapping[bytes, Figure], folder: Path) -> None:
@@ -147,7 +160,7 @@ def _write_videos(
 ) -> list[Path]:
     films = []
     if broadcast_cameras(run):
-        from flows.reports.broadcast import write_broadcast_videos  # late, as below
+        from flows.reports.broadcast import write_broadcast_videos  # late: it imports estimators
 
         films += write_broadcast_videos(run, match, out)
     for clip in clips_of(run.record):

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +23,9 @@ FORBIDDEN = {
 
 ORDER_IN_WORLDPOSE = (
     "errors",
+    "cache_folder",
     "lazy_names",
+    "parsing",
     "compiled",
     "geometry",
     "pickles",
@@ -126,6 +129,18 @@ def test_only_the_object_store_module_reaches_for_the_network_library():
         if "obstore" in {module.partition(".")[0] for module in imported_modules(path)}
     }
     assert users == {"worldpose/store/objects.py"}
+
+
+def test_only_one_module_reads_npy_arrays():
+    reads = re.compile(r"\b(np\.load|load_npz|(npy|format)\.read_\w+|literal_eval)\(")
+    users = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("worldpose", "tasks", "flows")
+        for path in (ROOT / package).rglob("*.py")
+        for line in path.read_text().splitlines()
+        if reads.search(line) and "parse_in_turn(" not in line
+    }
+    assert users == {"worldpose/parsing.py"}
 
 
 @pytest.mark.parametrize("package", ["worldpose", "worldpose.tracking", "worldpose.store"])

@@ -1,6 +1,7 @@
-"""Kernels kept on disk are those of the source as it is now; items computed in advance."""
+"""Kernels kept on disk are those of the source as it is now, and only this user's; items ahead."""
 
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import worldpose.compiled
+from worldpose.cache_folder import own_temporary_folder
 
 ROOT = Path(worldpose.compiled.__file__).parents[1]
 
@@ -38,7 +40,8 @@ def test_an_edit_in_another_file_reaches_the_kernels_that_can_depend_on_it(tmp_p
     for folder in ("callers", "callees", "others"):
         (package / folder).mkdir(parents=True)
         (package / folder / "__init__.py").touch()
-    shutil.copy(worldpose.compiled.__file__, package / "compiled.py")
+    for module in ("cache_folder.py", "compiled.py"):
+        shutil.copy(Path(worldpose.compiled.__file__).with_name(module), package)
     (package / "__init__.py").touch()
     (package / "callees" / "__init__.py").write_text(
         "from worldpose.callees.callee import (\n    callee,\n)\n"
@@ -88,6 +91,68 @@ def test_the_modules_whose_change_compiles_a_kernel_again_include_all_that_it_us
                 if str(origin).startswith(("worldpose.", "data_contracts.")):
                     assert origin in reached, f"{name} uses {used} of {origin}"
     assert kernels > 100
+
+
+LIST_SCENARIOS = """
+import sys
+from pathlib import Path
+
+import worldpose.cache_folder
+
+worldpose.cache_folder._PACKAGE = Path("/dev/null")  # no folder can be created in it, even by root
+from flows.cli import main
+from worldpose.compiled import load_compiler
+
+load_compiler()
+sys.argv = ["worldpose", "simulate", "--scenario", "list", "--out", "unused"]
+main()
+"""
+
+
+def list_scenarios(home, temporary):
+    around = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
+    return subprocess.run(
+        [sys.executable, "-c", LIST_SCENARIOS],
+        env={**around, "HOME": str(home)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stderr
+
+
+def test_kernels_of_a_package_that_cannot_be_written_to_are_kept_at_home(tmp_path):
+    assert list_scenarios(tmp_path, tmp_path / "none") == ""
+    assert list((tmp_path / ".cache" / "worldpose" / "__pycache__").rglob("*.nbc"))
+
+
+def test_kernels_of_a_user_without_a_home_are_kept_in_a_temporary_folder(tmp_path):
+    told = list_scenarios("/dev/null", tmp_path)
+    folder = tmp_path / f"worldpose-{os.getuid()}"
+    assert told.count("warning: ") == 1
+    assert f"compiled code is kept in {folder}. Set NUMBA_CACHE_DIR" in told
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert list(folder.rglob("*.nbc"))
+
+
+def test_a_folder_in_which_others_can_write_machine_code_is_not_used(tmp_path):
+    folder = tmp_path / f"worldpose-{os.getuid()}"
+    folder.mkdir()
+    folder.chmod(0o777)
+    assert "each process compiles its code again" in list_scenarios("/dev/null", tmp_path)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("planted", ["link", "of another user"])
+def test_a_temporary_folder_that_another_user_planted_is_not_used(tmp_path, monkeypatch, planted):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    user = os.getuid()
+    if planted == "link":
+        (tmp_path / "theirs").mkdir(mode=0o700)
+        (tmp_path / f"worldpose-{user}").symlink_to(tmp_path / "theirs")
+    else:
+        (tmp_path / f"worldpose-{user + 1}").mkdir(mode=0o700)
+        monkeypatch.setattr(os, "getuid", lambda: user + 1)
+    assert own_temporary_folder() is None
 
 
 def test_items_read_ahead_come_in_order_and_no_further_than_asked():

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from worldpose.body.model import POSE_FEATURES, SMPL_VERTICES, BodyModel
 from worldpose.errors import InputError, UsageError
+from worldpose.parsing import read_npz_members
 
 OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
@@ -113,14 +114,10 @@ def read_npz_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[np.g
         InputError: the file is missing or damaged, or lacks a key.
     """
     try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("a single array")
-        with file:
-            return {key: file[key] for key in keys}
+        arrays = read_npz_members(path, keys)
+        return {key: arrays[key] for key in keys}
     except KeyError as error:
-        missing = str(error.args[0]).removesuffix(" is not a file in the archive")
-        raise _body_file_error(path, f"no array named {missing}") from None
+        raise _body_file_error(path, f"no array named {error.args[0]}") from None
     except (OSError, EOFError, ValueError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise _body_file_error(path, f"a file that cannot be read ({error})") from None
 

@@ -26,6 +26,7 @@ from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BODY_POSE
 from worldpose.compiled import compile_kernel
 from worldpose.geometry import Rigid
+from worldpose.parsing import read_npz_members
 
 COORDINATES: Final = (
     ("spine1", "spine2", "spine3"),
@@ -137,8 +138,8 @@ def load_pose_prior() -> PosePrior:
     0.15 rad, 0.1 rad in knees and elbows, is added in quadrature to every standard deviation:
     simulated people are stiffer than real people.
     """
-    with np.load(Path(__file__).parent / "pose_prior.npz", allow_pickle=False) as file:
-        mean, covariance = file["mean"], file["covariance"]
+    file = read_npz_members(Path(__file__).parent / "pose_prior.npz", ("mean", "covariance"))
+    mean, covariance = file["mean"], file["covariance"]
     widening = np.full(SIZE, 0.15)
     widening[12:18] = 0.1
     widening[24:30] = 0.1

@@ -9,10 +9,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Final
 
 from data_contracts.checkpoint import Checkpoint
+from worldpose.cache_folder import user_cache
 from worldpose.detection.interfaces import Detector, PoseEstimator, ScoreMap
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
-from worldpose.errors import InputError
+from worldpose.errors import InputError, UsageError
 from worldpose.formats.files import read_json
 from worldpose.ingest.registration import digest_of_files
 from worldpose.ingest.validation import validate_record
@@ -50,12 +51,23 @@ PULLED_FILES: Final = "files"
 
 
 def model_folder() -> Path:
-    """Return the folder of pulled checkpoints: WORLDPOSE_MODEL_FOLDER, or in the user's cache."""
+    """Return the folder of pulled checkpoints: WORLDPOSE_MODEL_FOLDER, or in the user's cache.
+
+    Raises:
+        UsageError: neither is there.
+    """
     given = os.environ.get("WORLDPOSE_MODEL_FOLDER")
     if given:
         return Path(given).expanduser().resolve()
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(cache).expanduser().resolve() / "worldpose" / "models"
+    cache = user_cache()
+    if cache is None:
+        raise UsageError(
+            "WORLDPOSE_MODEL_FOLDER",
+            expected="the folder of models, as this user has no home folder",
+            found="no such variable",
+            todo="Set it, for example to /data/models.",
+        )
+    return cache.resolve() / "worldpose" / "models"
 
 
 def read_pulled(name: str, folder: Path) -> Checkpoint | None:

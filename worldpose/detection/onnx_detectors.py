@@ -16,6 +16,7 @@ from worldpose.detection.interfaces import MIN_SCORE, Detector, People
 from worldpose.detection.onnx_nets import IMAGENET_MEAN, IMAGENET_STD, OnnxNet
 from worldpose.detection.suppression import suppress
 from worldpose.errors import InputError
+from worldpose.parsing import parse_in_turn
 
 VIEW_SIZE: Final = (640, 640)
 """Input size for a net that takes any size [px]."""
@@ -190,7 +191,7 @@ def _grid(size: tuple[int, int], count: int) -> tuple[Floats, Floats]:
 def _class_names(metadata: Mapping[str, str]) -> dict[int, str]:
     """Return the class names that an exporter wrote into the file; {} if there are none."""
     try:
-        names = ast.literal_eval(metadata.get("names", "{}"))
+        names = parse_in_turn(lambda: ast.literal_eval(metadata.get("names", "{}")))
     except (SyntaxError, ValueError):
         return {}
     if isinstance(names, list | tuple):

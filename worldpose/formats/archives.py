@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.lib import format as npy
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
+from worldpose.parsing import Header, read_npy, read_npy_header
 
 ARRAY_BYTES: Final = 16 << 30
 """Maximum size of one file's arrays [byte]: two hours of 25 people with covariance at 50
@@ -113,9 +114,7 @@ def _check_headers(
         where, member = f"{path}: {name}", members[name]
         try:
             with file.open(info) as stream:
-                if npy.read_magic(stream) != (1, 0):
-                    raise ValueError("another version than npy 1.0")  # others allow 4 GB headers
-                shape, _, dtype = npy.read_array_header_1_0(stream)
+                shape, _, dtype = read_npy_header(stream)
                 start = stream.tell()
         except Exception as error:  # a hostile header can raise nearly any exception
             raise wrong(where, "an npy array", f"{error}" or type(error).__name__) from error
@@ -137,7 +136,7 @@ def _array(
 ) -> NDArray[Any]:
     try:
         with file.open(info) as stream:
-            array = npy.read_array(stream, allow_pickle=False)
+            array = read_npy(stream)
             stream.read()  # to the end, where the checksum is verified
     except MemoryError:
         raise
@@ -151,9 +150,6 @@ PACKED_RATIO: Final = 200
 
 PACKED_BYTES: Final = 1 << 26
 """Unpacked bytes up to which any ratio is allowed."""
-
-Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
-"""Shape, whether in Fortran order, type."""
 
 
 def read_npz(path: Path, limit: int) -> dict[str, NDArray[np.generic]]:
@@ -197,7 +193,7 @@ def read_header(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> Hea
     where = f"{path}: {info.filename}"
     try:
         with file.open(info) as member:
-            shape, fortran, dtype = _declared_header(member)
+            shape, fortran, dtype = read_npy_header(member)
             start = member.tell()
     except Exception as error:  # a hostile header can raise nearly anything in numpy and zipfile
         raise npz_error(where, "an npy array", _brief(error)) from error
@@ -241,8 +237,7 @@ def read_array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
     """
     try:
         with file.open(info) as member:
-            array: NDArray[np.generic] = npy.read_array(member, allow_pickle=False)
-            return np.ascontiguousarray(array)
+            return np.ascontiguousarray(read_npy(member))
     except MemoryError:
         raise
     except Exception as error:  # damaged bytes can raise nearly anything, as in read_header
@@ -252,12 +247,6 @@ def read_array(path: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
 def npz_error(where: str, expected: str, found: str) -> InputError:
     """Return the error about a place of an npz file."""
     return InputError(where, expected=expected, found=found, todo="Write or export it again.")
-
-
-def _declared_header(member: IO[bytes]) -> Header:
-    if npy.read_magic(member) != (1, 0):
-        raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
-    return npy.read_array_header_1_0(member)
 
 
 def _brief(error: Exception) -> str:

@@ -5,7 +5,6 @@ Camera files hold K, k, R and t over time; the challenge adds boxes and skeleton
 
 from __future__ import annotations
 
-import io
 import tempfile
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
@@ -26,6 +25,7 @@ from worldpose.formats.archives import Member, read_archive, write_archive, wron
 from worldpose.formats.files import whole_file
 from worldpose.geometry import Camera, Rigid
 from worldpose.geometry.rigid import nearest_rotation
+from worldpose.parsing import read_npy
 
 MEMBERS: Final = {
     "K": Member(("rows", 3, 3), "float"),
@@ -441,7 +441,8 @@ def _by_clip(
 def _read_npy(path: Path, kind: str) -> Floats:
     """Read and validate a clip's array of one kind."""
     try:
-        array = npy.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)
+        with path.open("rb") as stream:
+            array = read_npy(stream)
     except (OSError, ValueError, EOFError) as error:
         raise wrong(str(path), "an npy array", f"{error}") from error
     tail = KINDS[kind]

@@ -36,7 +36,6 @@ from worldpose.errors import InputError
 from worldpose.formats.archives import (
     PACKED_BYTES,
     PACKED_RATIO,
-    Header,
     npz_error,
     open_npz,
     read_array,
@@ -44,6 +43,7 @@ from worldpose.formats.archives import (
     require_size,
 )
 from worldpose.formats.files import JsonItems, require_file
+from worldpose.parsing import Header
 
 JSON_BYTES: Final = 1 << 30
 """Maximum size of a JSON file [byte], about two million people; npz holds more and is faster."""

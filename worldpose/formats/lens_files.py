@@ -26,6 +26,7 @@ from worldpose.formats.calibration_files import (
     require_optics,
 )
 from worldpose.formats.files import SETTINGS_BYTES, require_file
+from worldpose.parsing import read_npy
 
 FOCAL_STD: Final = 0.01
 """Relative deviation of a focal length whose file states none [1]: board calibrations with a dozen
@@ -140,7 +141,8 @@ def _read_file(file: Path) -> dict[str, Any]:
     require_file(file, SETTINGS_BYTES)
     try:
         if suffix == ".npy":
-            array = np.load(file, allow_pickle=False)
+            with file.open("rb") as stream:
+                array = read_npy(stream)
             return {"K" if array.shape == (3, 3) else "dist": array}
     except (OSError, ValueError, EOFError) as error:
         raise calibration_error(str(file), "arrays of numbers", str(error)) from error

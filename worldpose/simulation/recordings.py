@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
 from worldpose.errors import InputError
+from worldpose.parsing import read_npz_members
 from worldpose.simulation.paths import MARGIN, STEP, Clip, GroundPath
 from worldpose.simulation.skeletons import Body, unit
 
@@ -234,8 +235,7 @@ def read_trajectories(
 
 def _read_tracking_archive(path: Path) -> tuple[Floats, Floats, Floats]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {name: np.asarray(file[name]) for name in file.files if name in _MEMBERS}
+        content = read_npz_members(path, _MEMBERS)
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise _unusable_tracking(path, f"{error}") from error
     xy = content.get("xy", np.empty(0))
@@ -472,9 +472,9 @@ def _select_points(path: Path, capture: Capture) -> Floats:
 
 def _read_capture_archive(path: Path) -> Capture:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            joints, fps = np.asarray(file["joints"], dtype=np.float64), float(file["fps"])
-            names = tuple(str(name) for name in file["joint_names"])
+        file = read_npz_members(path, ("joints", "fps", "joint_names"))
+        joints, fps = np.asarray(file["joints"], dtype=np.float64), float(file["fps"].item())
+        names = tuple(str(name) for name in file["joint_names"])
     except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(
             str(path),

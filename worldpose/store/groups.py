@@ -41,6 +41,10 @@ from worldpose.store.paths import ResultId
 
 Arrays = Mapping[str, NDArray[Any]]
 
+# xarray imports Dask on its first use. Dask's modules import each other in a circle, and two
+# threads that enter it at different places fail. Only one thread imports this module.
+xr.Variable((), 0).chunksizes  # noqa: B018
+
 CODEC: Final[dict[str, Any]] = {"cname": "lz4", "clevel": 5}
 """Compression of chunks by Blosc."""
 NO_CHUNK: Final = (1 << 64) - 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import functools
 import json
-import os
 import platform
 import sys
 import tempfile
@@ -20,11 +19,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from data_contracts.work import Recipe
+from worldpose.cache_folder import find_cache_folder
 from worldpose.errors import StoreError
+from worldpose.parsing import parse_in_turn
 from worldpose.store.documents import canonical_json, digest
 
-PARSING_ATTEMPTS = 10
-"""Attempts to parse a source while other threads parse, too; see `_parse`."""
 DATA_SUFFIXES = (".npz", ".safetensors")
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -108,13 +107,10 @@ class SourceCache:
 
 
 def own_cache_file() -> Path | None:
-    """Return the file for the sources of this installation; None for a user without a home."""
+    """Return the file for the sources of this installation; None where none can be written."""
+    folder = find_cache_folder().path
     name = f"sources-{digest(str(_PACKAGE).encode())[:16]}.json"
-    try:
-        root = _PACKAGE if os.access(_PACKAGE, os.W_OK) else Path.home() / ".cache" / "worldpose"
-    except RuntimeError:
-        return None
-    return root / "__pycache__" / name
+    return None if folder is None else folder / name
 
 
 def _load(path: Path) -> dict[str, tuple[str, ParsedSource]]:
@@ -147,25 +143,11 @@ def parse_source(source: bytes) -> ParsedSource:
         SyntaxError: the source is not valid Python.
         ValueError: the source contains a zero byte.
     """
-    tree = _parse(source)
+    tree = parse_in_turn(lambda: ast.parse(source))
     nodes = _drop_text(tree)
     texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
     data = [text for text in texts if isinstance(text, str) and text.endswith(DATA_SUFFIXES)]
     return ParsedSource(digest(ast.unparse(tree).encode()), _imports(nodes), sorted(data))
-
-
-def _parse(source: bytes) -> ast.Module:
-    """Parse a source, also while another thread parses.
-
-    Python 3.11 shares its recursion depth counter between threads, and raises an error if the count
-    is wrong at the end (python/cpython issue 106905).
-    """
-    for _ in range(PARSING_ATTEMPTS - 1):
-        try:
-            return ast.parse(source)
-        except SystemError:
-            continue
-    return ast.parse(source)
 
 
 def _imports(nodes: list[ast.AST]) -> list[Import]:

@@ -90,7 +90,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load_body(tmp_path / "none.npz")
     np.save(tmp_path / "array.npy", np.zeros(3))
-    with pytest.raises(InputError, match="single array"):
+    with pytest.raises(InputError, match="not a zip file"):
         load_body(tmp_path / "array.npy")
 
 

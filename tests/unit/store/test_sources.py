@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import ast
-import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -133,13 +132,3 @@ def test_writers_at_once_leave_a_whole_file(path: Path) -> None:
     assert len(kept) == 20
     assert len({identity for identity, _ in kept.values()}) == 1
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_package_that_cannot_be_written_to_keeps_its_file_at_home(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    found = recipes.own_cache_file()
-    assert found is not None
-    assert found.parent == tmp_path / ".cache" / "worldpose" / "__pycache__"

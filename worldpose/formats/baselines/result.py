@@ -20,6 +20,7 @@ from worldpose.formats import JointTracks
 from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
 from worldpose.geometry import Camera, Rigid
+from worldpose.parsing import read_npz_members
 from worldpose.pickles import FILE_BYTES, plain, read_notes
 
 Y_DOWN: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -432,8 +433,7 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             size = sum(file.getinfo(f"{name}.npy").file_size for name in names)
         if size > FILE_BYTES:
             raise format_error(path, f"at most {FILE_BYTES} bytes of arrays", f"{size}")
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in names}
+        return read_npz_members(path, names)
     except KeyError as error:
         raise format_error(path, f"the arrays {', '.join(names)}", str(error.args[0])) from None
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:

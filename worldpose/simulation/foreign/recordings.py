@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from data_contracts.arrays import Floats
 from worldpose.errors import InputError
+from worldpose.parsing import read_npz_members
 from worldpose.simulation.foreign.skeletons import Posture, Skeleton
 from worldpose.simulation.foreign.trajectories import LEAD, Trajectory
 
@@ -122,8 +123,7 @@ def read_recordings(folder: Path) -> Recordings:
 def _read(path: Path) -> dict[str, NDArray[np.generic]]:
     names = ("joints", "joint_names", "fps", "xy", "time", "segment")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in names if name in file.files}
+        return read_npz_members(path, names)
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(
             str(path),

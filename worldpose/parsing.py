@@ -1,0 +1,98 @@
+"""Python literals and sources, and npy arrays, parsed also while other threads parse.
+
+Python 3.11 keeps one recursion depth for the syntax trees of all threads (python/cpython issue
+106905). If a thread begins a tree while another thread is within one, the other one ends with a
+SystemError. The header of an npy array is a literal, so that a good file would be refused. All
+readers of npy arrays and of Python text are here, or parse through `parse_in_turn`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Callable, Collection
+from pathlib import Path
+from threading import RLock
+from typing import IO, Any, Final, TypeVar
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+Result = TypeVar("Result")
+
+ATTEMPTS: Final = 10
+"""Attempts to parse; where a library parsed without pause, two failed one after another at most."""
+BLOCK_BYTES: Final = 1 << 18
+"""Bytes read at a time: an unpacked block fits into a processor's cache."""
+
+Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
+"""Shape, whether in Fortran order, type."""
+
+# Reentrant: garbage collection can run any code while a tree is made.
+_TURN = RLock()
+
+
+def parse_in_turn(parse: Callable[[], Result]) -> Result:
+    """Return the result of `parse`, which makes a syntax tree; threads take turns here.
+
+    A library can still parse in another thread, so a SystemError leads to another attempt.
+    """
+    for _ in range(ATTEMPTS - 1):
+        try:
+            with _TURN:
+                return parse()
+        except SystemError:
+            continue
+    with _TURN:
+        return parse()
+
+
+def read_npy_header(stream: IO[bytes]) -> Header:
+    """Return the header of the npy array at the start of a stream; the array's bytes follow.
+
+    Raises:
+        ValueError: this is no npy array, or not one of version 1.0.
+    """
+    if npy.read_magic(stream) != (1, 0):
+        raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
+    length = stream.read(2)
+    text = length + stream.read(int.from_bytes(length, "little"))
+    return parse_in_turn(lambda: npy.read_array_header_1_0(io.BytesIO(text)))
+
+
+def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:
+    """Return the npy array at the start of a stream; Python objects are refused unread.
+
+    Raises:
+        ValueError: this is no npy array of plain values, or it is truncated.
+    """
+    shape, is_fortran, dtype = read_npy_header(stream)
+    if dtype.hasobject:
+        raise ValueError("Python objects, which are never loaded")
+    content = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)
+    for start in range(0, len(content), BLOCK_BYTES):
+        part = content[start : start + BLOCK_BYTES]
+        block = stream.read(len(part))
+        if len(block) < len(part):
+            raise ValueError(f"the array ends after {start + len(block)} of {len(content)} bytes")
+        part[:] = np.frombuffer(block, np.uint8)
+    return np.ndarray(shape, dtype, content, order="F" if is_fortran else "C")
+
+
+def read_npz_members(path: Path, names: Collection[str]) -> dict[str, NDArray[Any]]:
+    """Return those arrays of an npz file that are among `names`; others are not read.
+
+    Raises:
+        ValueError: an array is damaged or holds Python objects.
+        zipfile.BadZipFile: the file is no npz file, or damaged.
+    """
+    with zipfile.ZipFile(path) as file:
+        found = {info.filename.removesuffix(".npy"): info for info in file.infolist()}
+        arrays = {}
+        for name in names:
+            if name in found:
+                with file.open(found[name]) as member:
+                    arrays[name] = read_npy(member)
+        return arrays
