@@ -21,7 +21,7 @@ from flows.cli.console import (
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
 from flows.run_plan import plan_run
-from flows.run_record import latest_run
+from flows.run_record import latest_run, resolve_settings
 from flows.run_status import UnitState, unit_state
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair
@@ -130,7 +130,8 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
     waiting: list[WaitingUnit] = []
-    asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
+    asked, _ = resolve_settings(store, match_id, latest, {})
+    iteration = 1 if latest is None else latest.iteration
     try:
         match = open_match(store, match_id)
         planned = plan_run(store, match, asked, iteration=iteration)
@@ -149,7 +150,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
         "left_out": {} if latest is None else latest.left_out,
         "warnings": [] if latest is None else list(latest.warnings),
         "waiting": [unit.unit for unit in waiting],
-        "settings": {} if latest is None else latest.overrides,
+        "settings": asked,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
         "problem": problem,
