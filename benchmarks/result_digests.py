@@ -41,7 +41,7 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
         [],
     ),
     "rendered": (
-        "--scenario tiny --seed 19 --cameras 3 --duration 0.4 --render".split(),
+        ["--scenario", "tiny", "--seed", "19", "--cameras", "3", "--duration", "0.4", "--render"],
         ["--set", "detection.stride=2"],
     ),
 }

@@ -47,3 +47,5 @@ class Work(Record):
     run_id: Name
     seconds: Amount | None = None
     """Time limit; None = no limit [s]."""
+    body_folder: str | None = None
+    """Folder of installed body models; None = that of the worker."""

@@ -27,8 +27,7 @@ def main() -> None:
 
     tracks = wp.track_people(cameras, seen, float(fps))
     people = seen.assign_people(tracks.detection_index)
-    found = wp.reconstruct_joints(cameras, people, float(fps))
-    joints = found.triangulation
+    joints = wp.reconstruct_joints(cameras, people, float(fps))  # smoothed over time
 
     wp.write_joints(
         out,

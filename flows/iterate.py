@@ -19,7 +19,7 @@ from flows.registering import open_match
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead
 from flows.run_record import latest_run
-from flows.running import RunRequest, run_match, shared_machines
+from flows.running import RunRequest, keep_settings, run_match, shared_machines
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.store import Store
@@ -95,6 +95,8 @@ def iterate_match(store: Store, match: Match, request: RunRequest, most: int | N
             found="--from or --until",
             todo="Omit --from and --until, or omit --iterations.",
         )
+    latest = latest_run(store, match.match_id)
+    request = keep_settings(store, match.match_id, latest, request)
     while True:
         try:
             return _iterate(store, match, request, most)

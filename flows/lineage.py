@@ -8,7 +8,7 @@ from data_contracts.run import RunRecord
 from flows.method import METHOD
 from flows.registering import open_match
 from flows.run_plan import plan_run
-from flows.run_record import latest_run
+from flows.run_record import latest_run, resolve_settings
 from flows.run_status import recorded_differences, recorded_recipe, unit_status
 from flows.settings import Overrides
 from worldpose.errors import InputError
@@ -91,7 +91,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     Args:
         store: the store.
         name: unit as `match/stage/unit`.
-        overrides: requested settings; empty = those of the latest run.
+        overrides: requested settings beyond those of the latest run.
 
     Raises:
         InputError: no such unit.
@@ -99,7 +99,7 @@ def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
     match_id, _, unit_name = name.partition("/")
     match = open_match(store, match_id)
     latest = latest_run(store, match_id)
-    asked = overrides or ({} if latest is None else latest.overrides)
+    asked, _ = resolve_settings(store, match_id, latest, overrides)
     iteration = 1 if latest is None else latest.iteration
     planned = {unit.name: unit for unit in plan_run(store, match, asked, iteration=iteration)}
     if unit_name not in planned:

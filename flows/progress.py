@@ -111,6 +111,10 @@ class Reporter:
         """Report any other slow operation."""
         logger.info(text)
 
+    def tell_kept_settings(self, text: str) -> None:
+        """Report the settings that a run takes over from the latest one."""
+        logger.info(text)
+
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
         """Report that a stage starts, with the numbers of its units and of those to compute."""
         self.left, self.every = missing, max(1, math.ceil(missing / MOST_TOLD))

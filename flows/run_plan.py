@@ -7,6 +7,7 @@ would do, plans stage by stage with the `RunPlan` of this module.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Self
@@ -18,6 +19,7 @@ from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
+from worldpose.body import BODY_FOLDER_VARIABLE, body_folder
 from worldpose.errors import StoreError, UsageError
 from worldpose.store import Store, code_version, libraries, recipe_key
 
@@ -52,6 +54,7 @@ class PlannedUnit:
             key=self.key,
             run_id=run_id,
             seconds=seconds,
+            body_folder=str(body_folder()) if BODY_FOLDER_VARIABLE in os.environ else None,
         )
 
 
@@ -232,6 +235,8 @@ class RunPlan:
     def is_recorded_by(self, latest: RunRecord | None) -> bool:
         """Return whether the latest run's record equals that of a run made now."""
         if latest is None or latest.failed or latest.state == "failed" or self.missing:
+            return False
+        if self.overrides != latest.overrides:  # the next run is to know them
             return False
         is_asked = {unit.request for unit in self.waiting} == {u.request for u in latest.waiting}
         return is_asked and self.results.items() <= latest.results.items()

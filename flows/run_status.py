@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from pydantic import JsonValue
-
 from data_contracts.run import RunRecord, UnitFailure
 from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
@@ -22,7 +20,7 @@ from flows.method import METHOD
 from flows.registering import open_match
 from flows.renames import rename_settings
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
-from flows.run_record import latest_run
+from flows.run_record import latest_run, resolve_settings
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
@@ -144,7 +142,8 @@ def list_unit_states(
     Raises:
         InputError: a setting of that run names a missing file.
     """
-    asked, iteration = ({}, 1) if latest is None else (latest.overrides, latest.iteration)
+    asked, _ = resolve_settings(store, match.match_id, latest, {})
+    iteration = 1 if latest is None else latest.iteration
     units: dict[UnitState, list[str]] = {state: [] for state in UnitState}
     for unit in plan_run(store, match, asked, iteration=iteration):
         units[unit_state(unit, latest)].append(unit.name)
@@ -223,7 +222,7 @@ def run_status(
     if latest is None:
         return None
     match = open_match(store, match_id)
-    requested = merge_settings(latest.overrides, settings or {})
+    requested, _ = resolve_settings(store, match_id, latest, settings or {})
     until = _last_stage(match, latest)
     stages = selected_stages(None, until)
     gatekeeper = Gatekeeper(store, match, latest.gates)
@@ -245,12 +244,6 @@ def run_status(
         units=tuple(units),
         is_stale=bool(units) or (is_settled and not plan.is_recorded_by(latest)),
     )
-
-
-def merge_settings(before: Overrides, further: Overrides) -> dict[str, dict[str, JsonValue]]:
-    """Return settings overridden by further ones."""
-    names = before.keys() | further.keys()
-    return {name: {**before.get(name, {}), **further.get(name, {})} for name in sorted(names)}
 
 
 def _stale_units(

@@ -26,7 +26,7 @@ from flows.orchestration.prefect_environment import has_server, prefect_server
 from flows.orchestration.time_limits import TimeLimits
 from flows.progress import reporter
 from flows.run_plan import PlannedUnit, plan_ahead
-from flows.run_record import RunLog, expected_work, latest_run
+from flows.run_record import RunLog, expected_work, latest_run, resolve_settings
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
@@ -48,7 +48,8 @@ class RunRequest:
     """Options of a run.
 
     Attributes:
-        settings: stage to the settings that differ from their defaults.
+        settings: stage to the settings that the run states; the others are those of the latest run
+            of the match (`keep_settings`).
         from_stage: first stage; the latest run supplies earlier results.
         until_stage: last stage.
         dask: address of a running Dask scheduler; None starts workers on this machine.
@@ -59,6 +60,8 @@ class RunRequest:
             iterations have their results.
         time_limits: stage to the time limit of a unit [min], if not the default.
         security: TLS certificate for the scheduler at `dask`; None = Dask's configuration.
+        default_settings: whether settings that are not stated have their defaults, whatever the
+            latest run had.
     """
 
     settings: Overrides
@@ -70,11 +73,51 @@ class RunRequest:
     iteration: int = 1
     time_limits: TimeLimits = field(default_factory=dict)
     security: Security | None = None
+    default_settings: bool = False
 
     def gate_policy(self, latest: RunRecord | None) -> GatePolicy:
         """Return when results need review, for a match with this latest run."""
         waits = latest is not None and latest.state == "waiting"
         return self.gates or (latest.gates if latest is not None and waits else "never")
+
+
+def keep_settings(
+    store: Store, match_id: str, latest: RunRecord | None, request: RunRequest
+) -> RunRequest:
+    """Return the request with all settings of the run, and report the kept ones.
+
+    Every way to start a run calls this: none may change a setting of the latest run silently.
+
+    Args:
+        store: the project.
+        match_id: the match.
+        latest: its latest finished run.
+        request: options of the run.
+    """
+    if request.default_settings:
+        return request
+    settings, kept = resolve_settings(store, match_id, latest, request.settings)
+    if kept is not None:
+        reporter().tell_kept_settings(kept)
+    return replace(request, settings=settings)
+
+
+def kept_iterations(latest: RunRecord | None, request: RunRequest) -> int:
+    """Return the number of iterations of a run that states none: that of the latest run.
+
+    A part of the method, or a run with default settings, has one.
+
+    Args:
+        latest: the match's latest finished run.
+        request: options of the run.
+    """
+    is_part = request.from_stage is not None or request.until_stage is not None
+    if latest is None or latest.iteration == 1 or is_part or request.default_settings:
+        return 1
+    reporter().tell_kept_settings(
+        f"iterations of run {latest.run_id}: {latest.iteration}; for one: --iterations 1"
+    )
+    return latest.iteration
 
 
 def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
@@ -90,6 +133,7 @@ def run_match(store: Store, match: Match, request: RunRequest) -> RunRecord:
     """
     stages = selected_stages(request.from_stage, request.until_stage)
     latest = latest_run(store, match.match_id)
+    request = keep_settings(store, match.match_id, latest, request)
     policy = request.gate_policy(latest)
     gatekeeper = Gatekeeper(store, match, policy)
     plan = plan_ahead(gatekeeper, stages, request.settings, latest, request.iteration)

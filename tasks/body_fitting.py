@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,7 @@ from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from data_contracts.work import Recipe, Work
+from data_contracts.work import Work
 from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
 from tasks.spool import open_spool
 from tasks.triangulation import camera_errors, load_triangulation_settings
@@ -51,7 +52,7 @@ def body_fitting(work: Work) -> str:
     store = Store.open(work.project)
     with store.publish(work) as result:
         people = open_people(store, work)
-        fit = publish_fit(store, result, BODY_FITTING, people, work.recipe)
+        fit = publish_fit(store, result, BODY_FITTING, people, work)
         result.figures.update(_compare_with_joints(store, work, people, fit))
     return work.key
 
@@ -66,7 +67,7 @@ def _compare_with_joints(
     )
     clip = people.clip
     held_out = compare_held_out(
-        *_fitting_basis(people, recipe),
+        *_fitting_basis(people, work),
         SeenClip(
             clip.cameras,
             camera_errors(work, clip),
@@ -227,17 +228,17 @@ def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
 
 
 def _fitting_basis(
-    people: ClipPeople, recipe: Recipe
+    people: ClipPeople, work: Work
 ) -> tuple[BodyModel, BodyFittingSettings, Ground | None]:
-    """Return the body model, the settings and the ground of a recipe."""
-    sources: dict[str, Any] = recipe.sources
+    """Return the body model, the settings and the ground of a fit."""
+    sources: dict[str, Any] = work.recipe.sources
     pitch = sources["pitch"]
     ground = None
     if pitch is not None:
         template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
         ground = people.clip.raise_pitch(template).height
-    settings = BodyFittingSettings.model_validate(recipe.settings)
-    return find_same_body(settings.body_model, sources["body_model_sha256"]), settings, ground
+    settings = BodyFittingSettings.model_validate(work.recipe.settings)
+    return find_same_body(work), settings, ground
 
 
 @dataclass
@@ -263,7 +264,7 @@ def publish_fit(
     result: ResultWriter,
     layout: GroupLayout,
     people: ClipPeople,
-    recipe: Recipe,
+    work: Work,
     further: FurtherArrays | None = None,
 ) -> BodyFit:
     """Fit the bodies of a clip in windows, and write them with their metrics.
@@ -273,13 +274,13 @@ def publish_fit(
         result: writer of the result.
         layout: its layout.
         people: people of the clip.
-        recipe: recipe of `body_fitting`: its settings, body model and pitch.
+        work: work order with a recipe of `body_fitting`: its settings, body model and pitch.
         further: what a result has besides bodies.
 
     Returns:
         Shapes and offsets of the clip, without bodies of any frame.
     """
-    model, settings, ground = _fitting_basis(people, recipe)
+    model, settings, ground = _fitting_basis(people, work)
     known = {} if further is None else further.known_shapes
     metrics = FitMetrics(people.fps, people.stride)
     windows = fit_in_windows(model, people, settings, ground, known)
@@ -343,13 +344,20 @@ def _part_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def find_same_body(name: str, sha256: str | None) -> BodyModel:
-    """Return the body model of the run plan."""
-    if sha256 is not None and digest_of_body(name) != sha256:
+def find_same_body(work: Work) -> BodyModel:
+    """Return the body model of a work order.
+
+    Raises:
+        InputError: this worker has another file of that name.
+        UsageError: this worker has none.
+    """
+    name, sha256 = str(work.recipe.settings["body_model"]), work.recipe.sources["body_model_sha256"]
+    folder = None if work.body_folder is None else Path(work.body_folder)
+    if sha256 is not None and digest_of_body(name, folder) != sha256:
         raise InputError(
             f"body model {name}",
             expected="the file that the run was planned with",
             found="another",
             todo="Install the same body model on all workers, and run again.",
         )
-    return find_body(name)
+    return find_body(name, folder)

@@ -35,7 +35,7 @@ def publish_plane_bodies(store: Store, work: Work, result: ResultWriter) -> None
     path = Path(work.folder) / sources["estimates"]
     estimates = read_monocular(path)
     require_registered(path, sources["estimates_sha256"])
-    model = find_same_body(str(work.recipe.settings["body_model"]), sources["body_model_sha256"])
+    model = find_same_body(work)
     filmed = open_broadcast(store, work)
     tracked = open_input(store, work, f"broadcast_tracking/{work.recipe.unit}")
     evidence = _observe_people(filmed, tracked, work)

@@ -81,7 +81,9 @@ def refitting(work: Work) -> str:
             return {"recognised": seen}
 
         others = FurtherArrays(further, {"pooled": pooled}, {"without_body": {}}, known)
-        publish_fit(store, result, REFITTING, people, before, others)
+        publish_fit(
+            store, result, REFITTING, people, work.model_copy(update={"recipe": before}), others
+        )
         result.figures["recognised"] = float(recognised)
         result.figures["pooled"] = float(pooled.sum())
         for person, own in zip(people.person, moved, strict=True):

@@ -7,7 +7,7 @@ All take and return plain arrays and frozen records, and need neither Prefect, D
 - calibrate: `calibrate_camera` from clicks on pitch markings, `calibrate_broadcast` a moving
   camera from clicks in key frames;
 - people: `detect_people` in images, `track_people` over all cameras;
-- 3D: `triangulate_joints` per frame, `reconstruct_joints` also over time, `adjust_cameras` to
+- 3D: `triangulate_joints` per frame, `reconstruct_joints` smoothed over time, `adjust_cameras` to
   people and markings, `fit_bodies`;
 - results: `open_run` of a project, `read_joints`, `write_joints`, `evaluate_joints`.
 

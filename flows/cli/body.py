@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from flows.cli.console import JsonOption, line, print_json
-from worldpose.body import BODY_FOLDER, body_path, install_body
+from flows.cli.options import BodyFolderOption
+from worldpose.body import body_path, install_body
 
 commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
@@ -19,9 +20,7 @@ def install(
     name: Annotated[
         str | None, typer.Option(help="Name of the body; from the file's name by default.")
     ] = None,
-    body_folder: Annotated[
-        Path, typer.Option(envvar="WORLDPOSE_BODY_FOLDER", help="Folder of installed bodies.")
-    ] = BODY_FOLDER,
+    body_folder: BodyFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Convert your licensed SMPL file once to a safe one; nothing in it is run.

@@ -64,6 +64,7 @@ def calibrate(
 
     Example: worldpose calibrate boards --columns 4 --rows 7 --square 0.06 --out lenses.toml
     """
+    from flows.results.outputs import claim_file, require_new
     from worldpose.formats.files import whole_file
     from worldpose.formats.lens_files import write_lens_toml
     from worldpose.reports.drawing import draw_lens_fits, require_plot
@@ -78,6 +79,8 @@ def calibrate(
             found="one of them",
             todo="Give both, or neither for a checkerboard.",
         )
+    require_new(out)
+    claim_file(plot, str(boards.resolve()))
     board = Board(columns, rows, square, charuco, marker)
     fits = {}
     files: dict[str, list[str]] = {}

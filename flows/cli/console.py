@@ -117,6 +117,10 @@ class ConsoleReporter(Reporter):
             self._tenths = tenth
             self.say(f"{done / 1e6:.1f} of {total / 1e6:.1f} MB checked")
 
+    def tell_kept_settings(self, text: str) -> None:
+        """Print the settings in full, on a narrow terminal too."""
+        line(text, to=errors)
+
     def stage_started(self, stage: str, about: str, *, units: int, missing: int) -> None:
         """Print the stage and how many of its units are already published."""
         super().stage_started(stage, about, units=units, missing=missing)

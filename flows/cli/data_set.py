@@ -35,7 +35,11 @@ def statistics(
     Example: worldpose statistics exported --picture lengths.png
     """
     from flows.results.dataset import count
+    from flows.results.outputs import claim_file
 
+    source = ", ".join(str(folder.resolve()) for folder in folders)
+    claim_file(picture, source)
+    claim_file(page, source)
     for folder in folders:
         tell_unstated_rate(folder, fps)
     found = count(folders, fps=fps)

@@ -110,7 +110,7 @@ def why(
         typer.Option(
             "--set",
             metavar="STAGE.NAME=VALUE",
-            help="Settings; those of the latest run by default.",
+            help="A setting beyond those of the latest run; repeatable.",
         ),
     ] = None,
     project: ProjectOption = DEFAULT_PROJECT,

@@ -21,9 +21,10 @@ from flows.cli.console import (
     progress,
 )
 from flows.cli.options import WorkersOption
-from flows.cli.synchronize import choose_clip, load_detections, until_detection
+from flows.cli.synchronize import choose_clip, load_detections
 from flows.registering import find_match
-from flows.run_record import latest_run, require_no_other_run
+from flows.results.outputs import require_new
+from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.stage import Match
 from worldpose.errors import InputError, UsageError
@@ -83,6 +84,7 @@ def locate_cameras(
             found="neither" if stature is None else "both",
             todo="Measure the person who walks, or the distance of two cameras.",
         )
+    require_new(out)
     store = Store.open_or_new(project)
     with progress(verbose=False):
         opened = find_match(store, match, unfinished=True)
@@ -108,12 +110,10 @@ def locate_cameras(
             known = _distance(distance, names)
         chosen = choose_clip(folder.spec, clip)
         require_no_other_run(store, opened.match_id)
-        latest = latest_run(store, opened.match_id)
-        settings = {} if latest is None else until_detection(latest)
         # Cameras without a calibration are left out once it is computed: it is passed over.
         for first, last in (("ingest", "ingest"), ("detection", "detection")):
             request = RunRequest(
-                settings, from_stage=first, until_stage=last, workers=workers, gates="never"
+                {}, from_stage=first, until_stage=last, workers=workers, gates="never"
             )
             record = run_match(store, opened, request)
     detections = load_detections(Run(store, record), opened, chosen, names)

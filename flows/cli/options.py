@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,23 @@ TimeLimitOption = Annotated[
         "up. Repeatable; 360 in every stage by default.",
     ),
 ]
+
+BodyFolderOption = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="WORLDPOSE_BODY_FOLDER",
+        show_envvar=True,
+        help="Folder of installed bodies (worldpose body install); by default "
+        "~/.local/share/worldpose/bodies.",
+    ),
+]
+
+
+def set_body_folder(folder: Path | None) -> None:
+    """Look for installed bodies in a folder, in this process and in workers that it starts."""
+    if folder is not None:
+        os.environ["WORLDPOSE_BODY_FOLDER"] = str(folder.expanduser().absolute())
+
 
 PAGES_PORT = 8571
 

@@ -48,8 +48,11 @@ def clips(
     if take is not None and out is not None:
         _take(programme, take, out, as_json=as_json)
         return
+    from flows.results.outputs import claim_file
     from worldpose.broadcast_calibration.shots import find_shots
     from worldpose.video import index_frames
+
+    claim_file(sheet, str(programme.resolve()))
 
     index = index_frames(programme)
     lost: list[int] = []

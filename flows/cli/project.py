@@ -20,7 +20,7 @@ from flows.cli.console import (
 )
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
-from flows.run_record import latest_run
+from flows.run_record import latest_run, resolve_settings
 from flows.run_status import UnitState, list_unit_states
 from worldpose.errors import WorldposeError
 from worldpose.store import Store, collect, list_pins, plan_gc, repair
@@ -129,6 +129,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
     units: dict[str, list[str]] = {state: [] for state in STATES}
     problem = None
     waiting: list[WaitingUnit] = []
+    asked, _ = resolve_settings(store, match_id, latest, {})
     try:
         match = open_match(store, match_id)
         found = list_unit_states(store, match, latest)
@@ -146,7 +147,7 @@ def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
         "left_out": {} if latest is None else latest.left_out,
         "warnings": [] if latest is None else list(latest.warnings),
         "waiting": [unit.unit for unit in waiting],
-        "settings": {} if latest is None else latest.overrides,
+        "settings": asked,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
         "problem": problem,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from glob import escape
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +24,11 @@ from flows.cli.console import (
 from worldpose.errors import InputError, UsageError
 from worldpose.store import Store
 from worldpose.store.runs import LATEST
+
+OverwriteOption = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Also replace files of another match, or of unknown origin."),
+]
 
 
 def export(
@@ -72,10 +78,13 @@ def export(
         bool,
         typer.Option("--video", help="With viewer, also embed the clip's overlay video."),
     ] = False,
+    overwrite: OverwriteOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
     """Write a run's results as files that other tools read.
+
+    Files of an earlier export of the same match are replaced, those of another match are not.
 
     Example: worldpose export tiny-1 --format joints --out exported
     """
@@ -116,7 +125,7 @@ def export(
         licence=None if licence is None else _read_licence(licence),
     )
     if release is None or origin.licence is None:
-        written = export_formats(origin, forms, out)
+        written = export_formats(origin, forms, out, overwrite=overwrite)
     else:
         written = write_release(store, origin, forms, out, release, origin.licence)
     if as_json:
@@ -184,6 +193,7 @@ def report(
         ),
     ] = None,
     run: RunOption = "latest",
+    overwrite: OverwriteOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -194,9 +204,18 @@ def report(
     from flows.registering import find_match
     from flows.reports.report import write_report
     from flows.results.best_results import describe_later_run, open_results
+    from flows.results.outputs import record_owner, require_own
 
     store = Store.open(project)
     known = find_match(store, match)
+    clips = [clip.id for clip in known.folder.spec.clips] if videos else []
+    films = [f for c in clips for f in out.parent.glob(f"{escape(out.stem)}-{c}*.mp4")]
+    places = {out.parent: [out, *films]}
+    if figures is not None:
+        places[figures] = [*places.get(figures, ()), *figures.glob("[0-9][0-9]-*.*")]
+    for place, files in places.items():
+        names = {file.name: None for file in files}
+        require_own(place, names, (known.match_id,), overwrite=overwrite)
     opened = open_results(store, known.match_id, run).record
     if run == LATEST and (later := describe_later_run(store, opened)):
         line(later, to=errors)
@@ -210,6 +229,11 @@ def report(
         camera=camera,
         figures=figures,
     )
+    written_files = {file.name: None for file in (out, *films)}
+    record_owner(out.parent, written_files, known.match_id)
+    if figures is not None:
+        names = {file.name: None for file in figures.glob("[0-9][0-9]-*.*")}
+        record_owner(figures, names, known.match_id)
     if as_json:
         written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
         folder = {} if figures is None else {"figures": str(figures.resolve())}

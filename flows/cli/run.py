@@ -26,7 +26,13 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.cli.options import DaskOption, TimeLimitOption, WorkersOption
+from flows.cli.options import (
+    BodyFolderOption,
+    DaskOption,
+    TimeLimitOption,
+    WorkersOption,
+    set_body_folder,
+)
 from flows.iterate import Iteration, Iterations, iterate_match
 from flows.method import METHOD
 from flows.orchestration.time_limits import parse_time_limits
@@ -34,8 +40,8 @@ from flows.registering import find_match
 from flows.review.advice import click_advice, clock_advice
 from flows.review.metric_words import all_reasons
 from flows.review.verdicts import warnings_of
-from flows.run_record import require_no_other_run
-from flows.running import RunRequest, run_match
+from flows.run_record import latest_run, require_no_other_run
+from flows.running import RunRequest, kept_iterations, run_match
 from flows.settings import parse_overrides, selected_stages
 from worldpose.errors import UsageError
 from worldpose.store import Store
@@ -59,9 +65,17 @@ def run(
         typer.Option(
             "--set",
             metavar="STAGE.NAME=VALUE",
-            help="A setting for this run; repeatable; `list` shows all settings.",
+            help="A setting for this run and later ones; repeatable; `list` shows all settings. "
+            "A run keeps the settings of the match's latest run that it does not state.",
         ),
     ] = None,
+    default_settings: Annotated[
+        bool,
+        typer.Option(
+            "--default-settings",
+            help="Keep no setting of the latest run: what --set does not state has its default.",
+        ),
+    ] = False,
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
@@ -74,14 +88,15 @@ def run(
         ),
     ] = None,
     iterations: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="N",
             help="Number of iterations. Each one leaves out the keypoints that the bodies of the "
             "previous one contradict. With auto, the run iterates until the error in held-out "
-            "cameras stops decreasing.",
+            "cameras stops decreasing. By default as many as the latest run.",
         ),
-    ] = "1",
+    ] = None,
+    body_folder: BodyFolderOption = None,
     verbose: VerboseOption = False,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -97,7 +112,8 @@ def run(
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
     policy = None if gates is None else _policy(gates)
-    most = parse_iterations(iterations)
+    stated = None if iterations is None else parse_iterations(iterations)
+    set_body_folder(body_folder)
     request = RunRequest(
         overrides,
         from_stage,
@@ -106,12 +122,16 @@ def run(
         workers,
         policy,
         time_limits=parse_time_limits(time_limits or ()),
+        default_settings=default_settings,
     )
     with progress(verbose=verbose):
         opened = find_match(store, match)
         require_no_other_run(store, opened.match_id)
         for text in warnings_of(opened):
             line(f"warning: {text}", to=errors)
+        most = stated
+        if iterations is None:
+            most = kept_iterations(latest_run(store, opened.match_id), request)
         passes = None if most == 1 else iterate_match(store, opened, request, most)
         record = run_match(store, opened, request) if passes is None else passes.record
     seconds = time.monotonic() - started

@@ -10,7 +10,6 @@ import typer
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import MatchSpec
-from data_contracts.run import RunRecord
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
@@ -24,9 +23,9 @@ from flows.cli.console import (
 from flows.cli.options import WorkersOption
 from flows.registering import find_match
 from flows.results.best_results import static_cameras
-from flows.run_record import latest_run, require_no_other_run
+from flows.results.outputs import claim_file
+from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
-from flows.settings import Overrides, selected_stages
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, UsageError
@@ -94,10 +93,9 @@ def synchronize(
         opened = find_match(store, match)
         spec = opened.folder.spec
         chosen = choose_clip(spec, clip)
+        claim_file(plot, opened.match_id)
         require_no_other_run(store, opened.match_id)
-        latest = latest_run(store, opened.match_id)
-        settings = {} if latest is None else until_detection(latest)
-        request = RunRequest(settings, until_stage="detection", workers=workers, gates="never")
+        request = RunRequest({}, until_stage="detection", workers=workers, gates="never")
         record = run_match(store, opened, request)
     cameras, names, detections = load_clip(Run(store, record), opened, chosen)
     pitch = opened.folder.pitch
@@ -156,12 +154,6 @@ def choose_clip(spec: MatchSpec, clip: str | None) -> str:
             todo="Correct the name.",
         )
     return clip or max(spec.clips, key=lambda each: each.frame_count).id
-
-
-def until_detection(latest: RunRecord) -> Overrides:
-    """Return the settings of an earlier run that this command's stages have."""
-    stages = {stage.name for stage in selected_stages(None, "detection")}
-    return {name: given for name, given in latest.overrides.items() if name in stages}
 
 
 def load_clip(run: Run, match: Match, clip: str) -> tuple[Camera, list[str], KeypointDetections]:

@@ -29,6 +29,7 @@ from flows.results.best_results import (
     placed_joints,
     static_cameras,
 )
+from flows.results.outputs import RELEASE, record_owner, require_own
 from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset.manifest import (
     FRAME_RATES,
@@ -282,22 +283,30 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
+SHARED = {FRAME_RATES, KINDS}
+"""Files to which exports of further clips are added."""
 VIEWER_SUFFIX = ".html"
 """An output that ends so is one viewer file, not a folder."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
 
-def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
+def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = False) -> list[Path]:
     """Write a run in several formats into one folder; return the files.
 
     Formats that `check` and `statistics` read also get frame_rates.json, and filled joints get
-    origins/<clip>.npz, which flags them.
+    origins/<clip>.npz, which flags them. Earlier files of the same match are replaced.
+
+    Args:
+        origin: the run.
+        forms: names of the formats.
+        out: the folder, or a file of the viewer.
+        overwrite: also replace files of another match or of unknown origin.
 
     Raises:
         UsageError: an unknown format, two with the same file names, or a file in place of a folder.
-        InputError: the folder cannot be written, or a format's results are missing. Nothing is
-            written then.
+        InputError: the folder cannot be written, holds a file of the same name of another match, or
+            a format's results are missing. Nothing is written then.
     """
     if out.suffix == VIEWER_SUFFIX and set(forms) != {"viewer"}:
         raise _file_for_folder(out, forms)
@@ -320,10 +329,20 @@ def export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
         rates = dict.fromkeys(origin.clips, origin.spec.fps)
         return [*written, write_frame_rates(place, rates)]
 
-    return _write_whole(out, write)
+    match_id = origin.spec.match_id
+
+    def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
+        require_own(folder, drafts, (match_id,), overwrite=overwrite)
+        record_owner(folder, drafts, match_id)
+
+    return _write_whole(out, write, claim)
 
 
-def _write_whole(out: Path, write: Callable[[Path], list[Path]]) -> list[Path]:
+def _write_whole(
+    out: Path,
+    write: Callable[[Path], list[Path]],
+    claim: Callable[[Path, Mapping[str, Path]], None],
+) -> list[Path]:
     """Write files to a temporary place next to `out`, then move all of them; return them there.
 
     An error while they are written leaves `out` as it was.
@@ -331,6 +350,7 @@ def _write_whole(out: Path, write: Callable[[Path], list[Path]]) -> list[Path]:
     Args:
         out: a folder, or a file of the viewer.
         write: writes into a folder, or a file, and returns the files.
+        claim: refuses to replace files of a folder, given their drafts by name.
 
     Raises:
         InputError: `out` cannot be written, or one of its files is a folder.
@@ -363,8 +383,17 @@ def _write_whole(out: Path, write: Callable[[Path], list[Path]]) -> list[Path]:
             for target in targets.values():
                 if target.is_dir():
                     raise _unwritable(target, "a folder")
-                target.parent.mkdir(parents=True, exist_ok=True)
+            above_files = out.parent if is_file else out
+            claim(
+                above_files,
+                {
+                    target.relative_to(above_files).as_posix(): path
+                    for path, target in targets.items()
+                    if target.name not in SHARED
+                },
+            )
             for path, target in targets.items():
+                target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
     except OSError as error:
         _remove_empty(absent)
@@ -482,7 +511,12 @@ def release(
         )
     # First, so that the run cannot be collected while its files are written.
     _keep(store, origin, name)
-    return _write_whole(out, lambda place: _write_release(origin, forms, place, ours))
+
+    def claim(folder: Path, drafts: Mapping[str, Path]) -> None:
+        released = f"{RELEASE}{name} of {spec.match_id}"
+        require_own(folder, drafts, (released, spec.match_id), overwrite=False)
+
+    return _write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
 
 
 def _write_release(

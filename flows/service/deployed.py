@@ -31,7 +31,7 @@ from flows.registering import open_match
 from flows.reprocess import reprocess_matches
 from flows.run_plan import plan_ahead
 from flows.run_record import RunLog, expected_work, latest_run
-from flows.running import RunRequest
+from flows.running import RunRequest, keep_settings, kept_iterations
 from flows.service.artifacts import show_at_prefect
 from flows.service.inbox import take_in
 from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name
@@ -64,7 +64,7 @@ def match(
     from_stage: str | None = None,
     until_stage: str | None = None,
     gates: GatePolicy = "auto",
-    iterations: int = 1,
+    iterations: int | None = None,
     time_limits: dict[str, float] | None = None,
 ) -> str:
     """Process a match and return the number of its run; suspended while results need review.
@@ -74,11 +74,12 @@ def match(
     Args:
         project: folder or URL of the store.
         match_id: a registered match.
-        settings: stage to its settings that differ from their defaults.
+        settings: stage to the settings that this run changes; it keeps the others of the latest
+            run of the match.
         from_stage: first stage to run; the latest run supplies earlier results.
         until_stage: last stage to run.
         gates: when results need review.
-        iterations: number of iterations, the best of which is kept.
+        iterations: number of iterations, the best of which is kept; as in the latest run if None.
         time_limits: stage to the time limit of a unit [min], if not the default.
 
     Raises:
@@ -99,12 +100,26 @@ def match(
     if runs is not None and context is not None and context.flow_run is not None:
         runs.link_pages(str(context.flow_run.id), match_id)  # a run of Prefect's form has none
     with alone_with(store, match_id):
+        latest = latest_run(store, match_id)
+        request = keep_settings(store, match_id, latest, request)
+        iterations = iterations or kept_iterations(latest, request)
         if iterations == 1:
             return require_complete(_run_until_decided(store, match_id, request))
+        return require_complete(_iterate_until_decided(store, match_id, request, iterations))
+
+
+def _iterate_until_decided(
+    store: Store, match_id: str, request: RunRequest, iterations: int
+) -> RunRecord:
+    """Iterate a match now and after each verdict."""
+    request = _on_own_workers(request)
+    while True:
         with show_at_prefect(store, match_id):
-            given = open_match(store, match_id)
-            request = _on_own_workers(request)
-            return require_complete(iterate_match(store, given, request, iterations).record)
+            record = iterate_match(store, open_match(store, match_id), request, iterations).record
+        open_questions = waiting_for_verdicts(record.waiting)
+        if record.failed or not open_questions:
+            return record
+        take_verdict(store, match_id, open_questions)
 
 
 def _run_until_decided(store: Store, match_id: str, request: RunRequest) -> RunRecord:

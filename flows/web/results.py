@@ -30,6 +30,7 @@ from flows.results.best_results import (
 )
 from flows.results.comparison import compare_runs
 from flows.results.export import export
+from flows.results.outputs import OWNERS
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
@@ -227,6 +228,7 @@ def routes(context: PageContext) -> APIRouter:
         def draw(file: Path) -> None:
             folder = file.with_suffix("")
             export(Origin(run, match.registration), [form], folder)
+            (folder / OWNERS).unlink()  # of folders on a disk; a download has one export
             shutil.make_archive(str(folder), "zip", folder)
 
         name = f"{match.match_id}-{run.record.run_id}-{form}.zip"

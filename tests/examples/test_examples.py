@@ -79,13 +79,24 @@ def test_keypoints_in_coco_form_become_joints(script, coco, bodies, tmp_path):
     assert farthest(worldpose.read_joints(out).joints, bodies) < 0.02
 
 
-def test_the_script_in_the_readme_triangulates(coco, bodies, monkeypatch):
+def test_the_script_in_the_readme_gives_smoothed_joints(coco, bodies, monkeypatch):
+    noise = np.random.default_rng(7)
+    for file in coco.glob("cam*.json"):
+        content = json.loads(file.read_text())
+        for person in content["annotations"]:
+            keypoints = np.reshape(person["keypoints"], (17, 3))
+            keypoints[:, :2] += noise.normal(0.0, 2.0, (17, 2))
+            person["keypoints"] = keypoints.ravel().tolist()
+        file.write_text(json.dumps(content))
     readme = (EXAMPLES.parent / "README.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     monkeypatch.chdir(coco)
     names = {}
     exec(example, names)
-    assert farthest(names["joints"].joints, bodies) < 0.02
+    found = names["found"]
+    assert farthest(found.joints, bodies) < 0.8 * farthest(found.triangulation.joints, bodies)
+    assert farthest(found.joints, bodies) < 0.04
+    assert np.isfinite(found.covariance[np.isfinite(found.joints[..., 0])]).all()
 
 
 def test_joints_are_evaluated_against_the_truth(script, tiny):

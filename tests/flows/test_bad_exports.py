@@ -15,6 +15,7 @@ from test_release_formats import bodies, match_folder, origin, tracked
 
 from flows.results import export as export_module
 from flows.results.export import EXPORTS, export
+from flows.results.outputs import OWNERS
 from worldpose.errors import InputError, UsageError, WorldposeError
 
 __all__ = ["match_folder"]  # a fixture
@@ -83,8 +84,8 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert form == "tracks" or all(path.stat().st_size for path in written)
         assert len(set(written)) == len(written)
         assert all(path.is_relative_to(out) for path in written)
-        there = [path for path in out.rglob("*") if path.is_file()]
-        assert set(there) == set(written), "no draft is left"
+        there = {path for path in out.rglob("*") if path.is_file()}
+        assert there == {*written, out / OWNERS}, "no draft is left"
 
 
 @pytest.mark.parametrize("form", EXPORTS)
@@ -124,6 +125,32 @@ def test_an_export_is_repeated_into_its_folder_and_joined_by_others(match_folder
     assert stat.S_IMODE((tmp_path / "out" / "tables").stat().st_mode) == stat.S_IMODE(
         (tmp_path / "folder").stat().st_mode
     )
+
+
+def test_an_export_replaces_no_file_of_another_match(match_folder, tmp_path):
+    ours = origin(match_folder, **whole())
+    theirs = origin(match_folder, **whole())
+    theirs.registration.spec = ours.spec.model_copy(update={"match_id": "another"})
+    out = tmp_path / "out"
+    for path in export(theirs, ["positions", "joints"], out):
+        if path.name != "frame_rates.json":
+            path.write_bytes(b"other content")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"A_1\.csv.*a file of another.*--overwrite"):
+        export(ours, ["csv", "positions"], out)
+    with pytest.raises(InputError, match="Nothing was written"):
+        export(ours, ["viewer"], _foreign(tmp_path / "view.html"))
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    export(ours, ["csv"], out)  # files of other names are no obstacle
+    export(ours, ["positions"], out, overwrite=True)
+    export(ours, ["positions"], out)
+    with pytest.raises(InputError, match=r"joints\.npz.*a file of another"):
+        export(ours, ["joints"], out)
+
+
+def _foreign(path):
+    path.write_text("a page of unknown origin")
+    return path
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])

@@ -63,7 +63,10 @@ def test_images_and_a_video_become_lenses(boards, tmp_path):
     for lens in lenses.values():
         assert lens.focal_px == pytest.approx(FOCAL, abs=max(3.0, 4.0 * lens.focal_std_px))
     assert "<svg" in plot.read_text()
-    shown = calibrate(boards, *OPTIONS, "--out", out, "--camera", "a").stdout
+    refused = calibrate(boards, *OPTIONS, "--out", out)
+    assert "a new file" in str(refused.exception), "people edit lenses"
+    other = tmp_path / "a.toml"
+    shown = calibrate(boards, *OPTIONS, "--out", other, "--camera", "a").stdout
     assert "a: 9.png is left out: no whole board found" in shown
 
 

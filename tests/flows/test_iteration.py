@@ -151,7 +151,10 @@ def looped(monkeypatch):
         monkeypatch.setattr(iterate, "run_match", run)
         monkeypatch.setattr(iterate, "_plan", lambda *_: SimpleNamespace(missing=[]))
         monkeypatch.setattr(iterate, "_recorded_run", lambda *_: None)
-        monkeypatch.setattr(iterate, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1]))
+        monkeypatch.setattr(iterate, "keep_settings", lambda *given: given[-1])
+        monkeypatch.setattr(
+            iterate, "latest_run", lambda *_: record(ran[-1], errors[ran[-1] - 1]) if ran else None
+        )
 
         class Anything:
             match_id = "m"

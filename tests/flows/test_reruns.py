@@ -3,14 +3,22 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import TINY, WORLDPOSE, succeed, worldpose
 
+from flows.iterate import iterate_match
+from flows.registering import open_match
+from flows.reprocess import reprocess_matches
 from flows.results.best_results import joint_tracks
+from flows.run_record import latest_run, resolve_settings
+from flows.running import RunRequest, kept_iterations, run_match
+from flows.service import deployed
 from worldpose import open_run
+from worldpose.body import load_open_body, save_body
 from worldpose.store import Store, verify
 
 pytestmark = pytest.mark.usefixtures("server")
@@ -78,10 +86,58 @@ def test_a_triangulation_setting_leaves_tracking_alone(tiny, stricter_copy):
     assert any("min_views" in reason for reason in why["reasons"])
 
     # Back to the defaults: all results are there, so a new run is recorded without any task.
-    back = run_json(tiny, "--project", stricter_copy, environment=NO_ORCHESTRATOR)
+    defaults = (tiny, "--project", stricter_copy, "--default-settings")
+    back = run_json(*defaults, environment=NO_ORCHESTRATOR)
     assert (back["run"], back["executed"]) == ("0003", 0)
     store = Store.open(str(stricter_copy))
     assert store.run(TINY, "0003").results == store.run(TINY, "0001").results
+
+
+def test_every_way_to_start_a_run_keeps_the_settings_of_the_latest(tiny, stricter_copy):
+    again = succeed("run", tiny, "--project", stricter_copy, environment=NO_ORCHESTRATOR)
+    assert "settings of run 0002: triangulation.min_views=3; without them: --d" in again.err
+    store = Store.open(str(stricter_copy))
+    match, plain = open_match(store, TINY), RunRequest({})
+    assert run_match(store, match, plain).run_id == "0002"
+    assert iterate_match(store, match, plain, 1).record.run_id == "0002"
+    assert deployed.match.fn(str(stricter_copy), TINY, gates="never") == "0002"
+    assert [each.state for each in reprocess_matches(store, [TINY], plain)] == ["current"]
+    assert store.runs(TINY) == ("0001", "0002")
+
+    # A run that states another setting keeps this one, too; so does one after a killed run.
+    store.reserve_run(TINY, {"tracking": {"gate_m": 0.4}, "triangulation": {"min_views": 4}})
+    latest = latest_run(store, TINY)
+    found, line = resolve_settings(store, TINY, latest, {"tracking": {"gate_m": 0.6}})
+    assert found == {"tracking": {"gate_m": 0.6}, "triangulation": {"min_views": 4}}
+    assert line is not None and line.startswith("settings of run 0003: triangulation.min_views=4;")
+
+
+def test_a_run_keeps_the_number_of_iterations_of_the_latest(stricter_run):
+    latest = latest_run(Store.open(str(stricter_run)), TINY).model_copy(update={"iteration": 2})
+    assert kept_iterations(latest, RunRequest({})) == 2
+    assert kept_iterations(None, RunRequest({})) == 1
+    for part in ({"until_stage": "tracking"}, {"default_settings": True}):
+        assert kept_iterations(latest, RunRequest({}, **part)) == 1
+
+
+def test_a_run_finds_an_installed_body_and_keeps_it(tiny, project_copy, tmp_path, monkeypatch):
+    folder = tmp_path / "bodies"
+    folder.mkdir()
+    save_body(folder / "smpl-neutral.npz", replace(load_open_body(), name="smpl-neutral"))
+    asked = (tiny, "--project", project_copy, "--until", "body_fitting")
+    mine = ("--set", "body_fitting.body_model=smpl-neutral")
+    refused = worldpose("run", *asked, *mine)
+    assert refused.code == 2 and "WORLDPOSE_BODY_FOLDER" in refused.err
+    # The worker, another process, was started without this folder.
+    answer = run_json(*asked, *mine, "--body-folder", folder)
+    assert answer["executed"] == 1
+    where = {"WORLDPOSE_BODY_FOLDER": str(folder)}
+    again = run_json(*asked, environment={**NO_ORCHESTRATOR, **where})
+    assert (again["run"], again["executed"]) == (answer["run"], 0)
+    monkeypatch.setenv(*where.popitem())
+    bodies = open_run(project_copy, TINY).bodies("clip")
+    assert open_run(project_copy, TINY)["body_fitting/clip"].attrs["body_model"] == "smpl-neutral"
+    assert bodies is not None
 
 
 def test_more_views_leave_fewer_joints(stricter_run):

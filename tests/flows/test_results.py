@@ -228,6 +228,17 @@ def test_report_is_one_page_that_asks_for_nothing(tiny, tiny_run, tmp_path):
         assert file.name.startswith(f"{number:02d}-")
         assert escape(shown["caption"], quote=False).partition("'")[0] in page
         assert any(panel["series"] for panel in shown["panels"])
+    # Neither a page nor figures of another origin are replaced.
+    other, plot = tmp_path / "other.html", tmp_path / "others" / "01-plot.svg"
+    plot.parent.mkdir()
+    for file, asked in (
+        (other, ("--out", other)),
+        (plot, ("--out", out, "--figures", plot.parent)),
+    ):
+        file.write_text("other")
+        answer = worldpose("report", tiny, "--project", tiny_run, "--no-videos", *asked)
+        assert answer.code == 1 and "a file of unknown origin" in answer.err
+        assert (file.read_text(), out.read_text()) == ("other", page)
 
 
 def test_a_run_without_joints_cannot_be_exported(ingested, tmp_path):

@@ -11,8 +11,9 @@ from worldpose.lazy_names import import_on_use
 
 if TYPE_CHECKING:
     from worldpose.body.body_file import (
-        BODY_FOLDER,
+        BODY_FOLDER_VARIABLE,
         OPEN_BODY,
+        body_folder,
         body_path,
         digest_of_body,
         find_body,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BODY25",
-    "BODY_FOLDER",
+    "BODY_FOLDER_VARIABLE",
     "CHALLENGE15",
     "EVALUATED14",
     "OPEN_BODY",
@@ -43,6 +44,7 @@ __all__ = [
     "BodyModel",
     "BodyParameters",
     "FoldedKeypoints",
+    "body_folder",
     "body_path",
     "digest_of_body",
     "find_body",
@@ -59,8 +61,9 @@ __getattr__ = import_on_use(
     __name__,
     {
         "worldpose.body.body_file": (
-            "BODY_FOLDER",
+            "BODY_FOLDER_VARIABLE",
             "OPEN_BODY",
+            "body_folder",
             "body_path",
             "digest_of_body",
             "find_body",

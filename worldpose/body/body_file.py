@@ -44,7 +44,9 @@ KEYS: Final = (
 """Names of a model's arrays in SMPL's files."""
 
 BODY_FOLDER: Final = Path("~/.local/share/worldpose/bodies")
-"""Default folder of installed bodies."""
+"""Folder of installed bodies, unless the environment names another one."""
+BODY_FOLDER_VARIABLE: Final = "WORLDPOSE_BODY_FOLDER"
+"""Environment variable with the folder of installed bodies."""
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
@@ -197,13 +199,19 @@ def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Pat
         ) from None
 
 
-def install_body(file: Path, folder: Path = BODY_FOLDER, name: str | None = None) -> BodyModel:
+def body_folder() -> Path:
+    """Return the folder of installed bodies: WORLDPOSE_BODY_FOLDER, or else the user's."""
+    return Path(os.environ.get(BODY_FOLDER_VARIABLE) or BODY_FOLDER).expanduser().absolute()
+
+
+def install_body(file: Path, folder: Path | None = None, name: str | None = None) -> BodyModel:
     """Return a model read from SMPL's own file, after saving it as a safe npz file.
 
     Args:
         file: SMPL's .pkl or .npz, as downloaded. Only its first 10 shape directions are used. The
             pickle's content is read, never run (`read_pickled_arrays`).
-        folder: where `<name>.npz` is written; one of the same name is replaced.
+        folder: where `<name>.npz` is written, `body_folder()` by default; one of the same name is
+            replaced.
         name: name of the model in results; from the file's name by default, so that
             SMPL_NEUTRAL.pkl becomes smpl-neutral.
 
@@ -235,22 +243,30 @@ def install_body(file: Path, folder: Path = BODY_FOLDER, name: str | None = None
     return load_body(path)
 
 
-def body_path(name: str, folder: Path = BODY_FOLDER) -> Path:
-    """Return the path of the installed model of that name."""
-    return folder.expanduser() / f"{name}.npz"
+def body_path(name: str, folder: Path | None = None) -> Path:
+    """Return the path of the installed model of that name, in `body_folder()` by default."""
+    return (body_folder() if folder is None else folder.expanduser()) / f"{name}.npz"
 
 
-def digest_of_body(name: str) -> str:
+def digest_of_body(name: str, folder: Path | None = None) -> str:
     """Return the SHA-256 of an installed model's file.
+
+    Args:
+        name: name of the model.
+        folder: folder of installed bodies; `body_folder()` by default.
 
     Raises:
         UsageError: no body of that name is installed.
     """
-    return hashlib.sha256(_find_installed(name, BODY_FOLDER).read_bytes()).hexdigest()
+    return hashlib.sha256(_find_installed(name, folder).read_bytes()).hexdigest()
 
 
-def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
+def find_body(name: str = OPEN_BODY, folder: Path | None = None) -> BodyModel:
     """Return the open body or an installed one.
+
+    Args:
+        name: name of the model.
+        folder: folder of installed bodies; `body_folder()` by default.
 
     Raises:
         UsageError: no body of that name is installed.
@@ -261,14 +277,16 @@ def find_body(name: str = OPEN_BODY, folder: Path = BODY_FOLDER) -> BodyModel:
     return load_body(_find_installed(name, folder))
 
 
-def _find_installed(name: str, folder: Path) -> Path:
-    path = body_path(name, folder)
+def _find_installed(name: str, folder: Path | None) -> Path:
+    place = body_path("", folder).parent
+    path = body_path(name, place)
     if not _NAME.fullmatch(name) or not path.is_file():
-        installed = sorted(each.stem for each in folder.expanduser().glob("*.npz"))
+        installed = sorted(each.stem for each in place.glob("*.npz"))
         raise UsageError(
             f"body model {name!r}",
             expected=f"one of {', '.join([OPEN_BODY, NARROW_OPEN_BODY, *installed])}",
-            found="none of that name",
-            todo="Install one with worldpose body install FILE, or take the open body.",
+            found=f"none of that name in {place}",
+            todo="Install it with worldpose body install FILE, name its folder with --body-folder "
+            f"or {BODY_FOLDER_VARIABLE}, or take the open body.",
         )
     return path

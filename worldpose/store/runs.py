@@ -10,6 +10,8 @@ import platform
 import re
 from datetime import UTC, datetime
 
+from pydantic import JsonValue
+
 from data_contracts.pin import Pin
 from data_contracts.run import Reservation, RunRecord
 from worldpose.errors import InputError, StoreError
@@ -113,8 +115,16 @@ def list_runs(blobs: Blobs, match_id: str) -> tuple[list[str], list[str]]:
     return sorted(finished, key=run_order), sorted(reserved - finished, key=run_order)
 
 
-def reserve_run(blobs: Blobs, match_id: str) -> str:
-    """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ..."""
+def reserve_run(
+    blobs: Blobs, match_id: str, overrides: dict[str, dict[str, JsonValue]] | None = None
+) -> str:
+    """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ...
+
+    Args:
+        blobs: the store's files.
+        match_id: the match.
+        overrides: stage to the requested settings, which outlast a killed run.
+    """
     number = 0
     while True:
         # A record that was set aside keeps its number: reviews may name the run. A number that
@@ -129,6 +139,7 @@ def reserve_run(blobs: Blobs, match_id: str) -> str:
             started_at=datetime.now(UTC),
             host=platform.node(),
             pid=os.getpid(),
+            overrides=overrides,
         )
         if not blobs.put_new(path, seal(reservation)):
             continue

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import JsonValue
+
 from data_contracts.match import Registration
 from data_contracts.run import (
     BODY_STAGES,
@@ -248,9 +250,16 @@ class Store:
         """Remove a result, manifest first, so that the next run recomputes it."""
         self.blobs.delete_tree(result.path, MANIFEST)
 
-    def reserve_run(self, match_id: str) -> str:
-        """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ..."""
-        return reserve_run(self.blobs, match_id)
+    def reserve_run(
+        self, match_id: str, overrides: dict[str, dict[str, JsonValue]] | None = None
+    ) -> str:
+        """Reserve a run number that no other run of the match has or gets: `0001`, `0002`, ...
+
+        Args:
+            match_id: the match.
+            overrides: stage to the requested settings, which outlast a killed run.
+        """
+        return reserve_run(self.blobs, match_id, overrides)
 
     def finish_run(self, record: RunRecord) -> None:
         """Write the record of a run, only once.

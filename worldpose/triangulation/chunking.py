@@ -30,6 +30,7 @@ from worldpose.triangulation.passes import (
     sample_frames,
     triangulate_joints,
 )
+from worldpose.triangulation.reports import TriangulationReport
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import (
     MotionModel,
@@ -230,17 +231,37 @@ def _add_margins(
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Joints and clock offsets of one clip.
+    """Joints of one clip over time, what they were made from, and clock offsets.
 
     Attributes:
-        triangulation: joints of each frame on its own.
-        smoothing: whole tracks.
+        triangulation: joints of each frame on its own, as `triangulate_joints` gives them.
+        smoothing: the same joints smoothed over time.
         clocks: clock offsets; corrected if the settings say so.
     """
 
     triangulation: Triangulation
     smoothing: Smoothing
     clocks: CameraClocks
+
+    @property
+    def joints(self) -> Floats:
+        """(frames, persons, 17, 3) [m], world, smoothed over time; NaN where not determined."""
+        return self.smoothing.joints
+
+    @property
+    def covariance(self) -> Floats:
+        """(frames, persons, 17, 3, 3) [m^2], of `joints`."""
+        return self.smoothing.covariance
+
+    @property
+    def views(self) -> NDArray[np.uint8]:
+        """(frames, persons, 17), inlier cameras; 0 where a joint is interpolated or missing."""
+        return self.triangulation.views
+
+    @property
+    def report(self) -> TriangulationReport:
+        """The metrics of the triangulation in each frame."""
+        return self.triangulation.report
 
 
 def reconstruct_joints(
@@ -250,7 +271,10 @@ def reconstruct_joints(
     settings: TriangulationSettings = TriangulationSettings(),  # noqa: B008
     camera_covariance: NDArray[np.float64] | None = None,
 ) -> Reconstruction:
-    """Return a clip's triangulated and smoothed joints, and its cameras' clock offsets.
+    """Return a clip's joints smoothed over time, and its cameras' clock offsets.
+
+    `Reconstruction.joints` and `.covariance` are smoothed; `.triangulation` has each frame on its
+    own.
 
     Args:
         cameras: batch (cameras,).
