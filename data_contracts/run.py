@@ -149,6 +149,8 @@ class RunRecord(Record):
     """Stage to all its settings."""
     overrides: dict[str, dict[str, JsonValue]]
     """Stage to the requested settings; the others are defaults."""
+    body_folder: str | None = None
+    """Folder of installed bodies that the run was given; None = the default."""
     executed: tuple[str, ...]
     """Units, as `stage/unit`, that this run computed."""
     reused: tuple[str, ...]

@@ -7,7 +7,6 @@ would do, plans stage by stage with the `RunPlan` of this module.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Self
@@ -19,7 +18,7 @@ from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from worldpose.body import BODY_FOLDER_VARIABLE, body_folder
+from worldpose.body.body_file import given_body_folder
 from worldpose.errors import StoreError, UsageError
 from worldpose.store import Store, code_version, libraries, recipe_key
 
@@ -54,7 +53,7 @@ class PlannedUnit:
             key=self.key,
             run_id=run_id,
             seconds=seconds,
-            body_folder=str(body_folder()) if BODY_FOLDER_VARIABLE in os.environ else None,
+            body_folder=given_body_folder(),
         )
 
 

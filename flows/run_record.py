@@ -29,6 +29,7 @@ from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
 from flows.stages import body_fitting, broadcast_tracking, tracking, triangulation
 from tasks.tracing import add_unit_span, stage_span
+from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
 from worldpose.ingest import MatchFolder
 from worldpose.store import Store, libraries
@@ -371,6 +372,7 @@ class RunLog:
             results=dict(sorted(self.results.items())),
             settings=settings,
             overrides=overrides,
+            body_folder=given_body_folder(),
             executed=tuple(sorted(self.executed)),
             reused=tuple(sorted(self.reused)),
             failed=tuple(sorted(self.failed, key=lambda failure: failure.unit)),

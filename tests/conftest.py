@@ -1,6 +1,7 @@
 """Fixtures that tests of the whole system share: one match, one project, one Prefect server."""
 
 import fcntl
+import functools
 import importlib
 import multiprocessing.util
 import os
@@ -67,6 +68,12 @@ def make_once(tmp_path_factory, name, make):
             make(folder / name)
             (folder / "made").touch()
     return folder / name
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory):
+    """A function that makes a folder once for all processes of a test run."""
+    return functools.partial(make_once, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

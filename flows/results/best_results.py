@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -167,16 +168,17 @@ def joint_tracks(
         joints=joints,
         covariance=covariance,
         views=views,
-        extra=_extra_tracks(result, seen, definition),
+        extra=_extra_tracks(run, result, seen, definition),
     )
 
 
 def _extra_tracks(
-    result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
+    run: Run, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
 ) -> ExtraTracks | None:
     """Return the points besides COCO-17 of a result; None without any.
 
     Args:
+        run: the run of these results.
         result: bodies or triangulated joints.
         seen: the triangulation of the same people.
         definition: definition of the points of bodies.
@@ -190,7 +192,7 @@ def _extra_tracks(
             np.broadcast_to(result["betas"].values, (*joints.shape[:2], result["betas"].shape[-1])),
             *(result[name].values for name in ("global_orient", "body_pose", "transl")),
         )
-        model = find_body(result.attrs["body_model"])
+        model = fitted_model(run, result)
         offsets = result["extra_offsets"].values
         joints = joints + perceived_points(model, points, bodies, offsets)
     views = seen["extra_views"].sel(point=list(points)).values.astype(np.int64)
@@ -242,6 +244,16 @@ def bodies_unit(run: Run, clip: str) -> str:
     return again if again in run else first
 
 
+def fitted_model(run: Run, fits: xr.Dataset) -> BodyModel:
+    """Return the body model of a run's bodies, from the folder that the run was given.
+
+    Raises:
+        UsageError: no body of that name is installed there.
+    """
+    folder = run.record.body_folder
+    return find_body(fits.attrs["body_model"], None if folder is None else Path(folder))
+
+
 def body_tracks(run: Run, clip: str) -> BodyTracks | None:
     """Return the best fitted bodies of a clip; None if the run has none."""
     from worldpose.reports.bodies import BodyTracks  # late: it imports matplotlib
@@ -255,7 +267,7 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
         poses=BodyParameters(
             *(fits[name].values for name in ("betas", "global_orient", "body_pose", "transl"))
         ),
-        model=find_body(fits.attrs["body_model"]),
+        model=fitted_model(run, fits),
     )
 
 
@@ -315,7 +327,7 @@ def fitted_bodies(run: Run, clip: str) -> tuple[BodyModel, BodyParameters, NDArr
         fits["betas"].values[:, None],
         *(fits[name].values.swapaxes(0, 1) for name in ("global_orient", "body_pose", "transl")),
     )
-    return find_body(fits.attrs["body_model"]), poses, fits["person"].values
+    return fitted_model(run, fits), poses, fits["person"].values
 
 
 def broadcast_camera(run: Run, clip: str) -> Camera:

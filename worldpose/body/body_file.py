@@ -201,7 +201,13 @@ def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Pat
 
 def body_folder() -> Path:
     """Return the folder of installed bodies: WORLDPOSE_BODY_FOLDER, or else the user's."""
-    return Path(os.environ.get(BODY_FOLDER_VARIABLE) or BODY_FOLDER).expanduser().absolute()
+    return Path(given_body_folder() or BODY_FOLDER).expanduser().absolute()
+
+
+def given_body_folder() -> str | None:
+    """Return the folder that WORLDPOSE_BODY_FOLDER names, absolute; None if it is not set."""
+    given = os.environ.get(BODY_FOLDER_VARIABLE)
+    return str(Path(given).expanduser().absolute()) if given else None
 
 
 def install_body(file: Path, folder: Path | None = None, name: str | None = None) -> BodyModel:

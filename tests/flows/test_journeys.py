@@ -1,0 +1,239 @@
+"""Journeys of users without truth: from files to a report and an export, by the command line.
+
+No match here has a folder `reference`. Every command but `simulate` and `run` is a process of its
+own, as users start it: one that has imported the libraries before hides errors of their imports.
+"""
+
+import csv
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from command_line import succeed, worldpose
+from test_broadcast_run import remove_static_cameras
+
+import worldpose as library
+from worldpose.body import load_open_body, save_body
+
+NEW_PROCESS = {"COLUMNS": "200"}
+"""An environment of its own makes a command a new process."""
+NOISE_PX = 1.0
+RING = [(16.0 * np.cos(angle), 16.0 * np.sin(angle)) for angle in (0.4, 2.0, 3.6, 5.2)]
+MAST = [(-0.3, -30.0), (0.3, -30.0)]
+
+
+@dataclass(frozen=True)
+class Journey:
+    """A folder with a finished run of `match` in `project`, and what its user does next."""
+
+    folder: Path
+
+    def command(self, name, *arguments):
+        match = library.read_match(self.folder / "match").spec.match_id
+        project = ("--project", self.folder / "project")
+        return worldpose(name, match, *arguments, *project, environment=NEW_PROCESS)
+
+    def report(self, out):
+        answer = self.command("report", "--out", out)
+        assert answer.code == 0, answer.err
+        return out.read_text()
+
+    def export(self, kind, out):
+        answer = self.command("export", "--format", kind, "--out", out)
+        assert answer.code == 0, answer.err
+        return out
+
+    def median_error(self, out):
+        """Median distance [m] of an exported person's joints from those of the nearest true one."""
+        found = library.read_joints(self.export("joints", out) / "joints.npz")
+        truth = np.load(self.folder / "truth.npy")[found.frames]
+        distances = np.linalg.norm(found.joints[:, :, None] - truth[:, None], axis=-1).mean(-1)
+        return np.nanmedian(np.nanmin(distances, axis=2))
+
+
+def travel(folder, *options, accepted=0):
+    """Run the match of a folder, which has no truth; return what the command said."""
+    assert not (folder / "match" / "reference").exists()
+    answer = worldpose("run", folder / "match", "--project", folder / "project", *options)
+    assert answer.code == accepted, answer.err
+    (folder / "said.txt").write_text(answer.err + answer.out)
+    return Journey(folder)
+
+
+def simulate(folder, *scenario):
+    """Make the input of a journey, and put its true joints aside."""
+    succeed("simulate", *scenario, "--no-stills", "--out", folder / "match")
+    truth = library.read_joints(folder / "match/reference/joints.npz").joints
+    np.save(folder / "truth.npy", truth)
+    shutil.rmtree(folder / "match/reference")
+    return truth
+
+
+def camera_at(x, y, *, aim=(0.0, 0.0), height=3.0, focal=900.0, size=(1280, 720)):
+    """Return a camera that looks at a point 1 m above the ground."""
+    center = np.array([x, y, height])
+    ahead = np.array([*aim, 1.0]) - center
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(ahead, right), ahead])
+    middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
+    matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+    return {"size": size, "K": matrix, "R": rotation, "t": -rotation @ center}
+
+
+def write_calibration(file, cameras):
+    """Write cameras in Anipose's form."""
+    tables = ""
+    for number, (name, camera) in enumerate(cameras.items()):
+        turn = cv2.Rodrigues(camera["R"])[0].ravel().tolist()
+        tables += (
+            f'[cam_{number}]\nname = "{name}"\nsize = {list(camera["size"])}\n'
+            f"matrix = {camera['K'].tolist()}\ndistortions = [0.0, 0.0, 0.0, 0.0, 0.0]\n"
+            f"rotation = {turn}\ntranslation = {camera['t'].tolist()}\n\n"
+        )
+    file.write_text(tables)
+
+
+def write_poses(folder, cameras, joints):
+    """Write COCO keypoint results of true joints and noise, in files with names in capitals."""
+    folder.mkdir()
+    random = np.random.default_rng(1)
+    for name, camera in cameras.items():
+        seen = joints @ camera["R"].T + camera["t"]
+        pixels = seen / seen[..., 2:] @ camera["K"].T
+        points = pixels[..., :2] + NOISE_PX * random.standard_normal((*seen.shape[:-1], 2))
+        results = [
+            {
+                "image_id": frame,
+                "category_id": 1,
+                "keypoints": np.c_[person, np.full(17, 0.9)].round(2).ravel().tolist(),
+                "score": 0.9,
+            }
+            for frame, people in enumerate(points)
+            for person in people
+        ]
+        (folder / f"{name}.JSON").write_text(json.dumps(results))
+
+
+TINY = ("--scenario", "tiny", "--seed", 77, "--duration", 0.6, "--no-video")
+
+
+def import_people(folder, places, **lens):
+    """Import calibration and 2D poses of five people who walk at the centre of the world."""
+    folder.mkdir()
+    joints = simulate(folder, *TINY)
+    shutil.rmtree(folder / "match")
+    joints[..., :2] -= joints[..., :2].mean(axis=(0, 1, 2))
+    np.save(folder / "truth.npy", joints)
+    cameras = {f"cam{n}": camera_at(*place, **lens) for n, place in enumerate(places)}
+    write_calibration(folder / "calibration.toml", cameras)
+    write_poses(folder / "poses", cameras, joints)
+    given = ("--calibration", folder / "calibration.toml", "--detections", folder / "poses")
+    name = ("--match-id", folder.name)
+    succeed(
+        "import", *given, "--fps", 25, "--out", folder / "match", *name, environment=NEW_PROCESS
+    )
+
+
+@pytest.fixture(scope="session")
+def pitch(server, shared_folder):
+    """Six static cameras with clicked markings."""
+
+    def make(folder):
+        folder.mkdir()
+        simulate(folder, *TINY)
+        travel(folder)
+
+    return Journey(shared_folder("pitch", make))
+
+
+@pytest.fixture(scope="session")
+def hall(server, shared_folder):
+    """Four calibrated cameras around people, no pitch, and a body file of the user's own.
+
+    Only the first run names the body.
+    """
+
+    def make(folder):
+        import_people(folder, RING)
+        (folder / "bodies").mkdir()
+        save_body(folder / "bodies/mine.npz", replace(load_open_body(), name="mine"))
+        bodies = ("--body-folder", folder / "bodies")
+        travel(folder, *bodies, "--set", "body_fitting.body_model=mine")
+        travel(folder, *bodies)
+
+    return Journey(shared_folder("hall", make))
+
+
+def test_static_cameras(pitch, tmp_path):
+    pitch.report(tmp_path / "report.html")
+    assert pitch.median_error(tmp_path / "out") < 0.05
+
+
+def test_a_hall_without_a_pitch(hall, tmp_path):
+    said = (hall.folder / "said.txt").read_text()
+    assert "body_fitting.body_model=mine" in said
+    assert " 0 computed" in said
+    assert (
+        library.open_run(hall.folder / "project", "hall")["body_fitting/clip"].attrs["body_model"]
+        == "mine"
+    )
+    hall.report(tmp_path / "report.html")
+    assert hall.median_error(tmp_path / "out") < 0.03
+
+
+def test_a_second_match_does_not_replace_the_first_one_s_export(hall, pitch, tmp_path):
+    file = hall.export("joints", tmp_path / "out") / "joints.npz"
+    before = file.read_bytes()
+    answer = pitch.command("export", "--format", "joints", "--out", tmp_path / "out")
+    assert answer.code == 1
+    assert str(tmp_path / "out") in answer.err
+    assert file.read_bytes() == before
+
+
+def test_two_cameras_on_a_mast(server, tmp_path):
+    import_people(tmp_path / "mast", MAST, focal=2500.0)
+    spec = tmp_path / "mast/match/match.yaml"
+    spec.write_text(spec.read_text().replace("pitch: none\n", ""))  # they stand on a pitch
+    mast = travel(tmp_path / "mast", accepted=4)
+    page = mast.report(tmp_path / "report.html")
+    assert "<td>plane</td>" in page
+    rows = mast.export("positions", tmp_path / "out") / "positions/clip.csv"
+    with rows.open() as file:
+        found = [(float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(file)]
+    assert len(found) > 50
+    refused = mast.command("export", "--format", "joints", "--out", tmp_path / "none")
+    assert refused.code == 0, refused.err
+
+
+def write_ten_bits(file):
+    """Encode a video again with 10 bits per sample and a name in capitals."""
+    draft = file.with_name("draft.mp4")
+    with av.open(str(file)) as given, av.open(str(draft), "w") as target:
+        source = given.streams.video[0]
+        stream = target.add_stream("libx264", rate=source.average_rate, options={"crf": "16"})
+        stream.width, stream.height = source.width, source.height
+        stream.pix_fmt = "yuv420p10le"
+        for frame in given.decode(source):
+            target.mux(stream.encode(frame.reformat(format="yuv420p10le")))
+        target.mux(stream.encode())
+    draft.rename(file.with_suffix(".MP4"))
+    file.unlink()
+
+
+def test_a_broadcast_camera_alone_in_ten_bits(server, tmp_path):
+    pan = ("--scenario", "broadcast-pan", "--seed", 2, "--duration", 0.3, "--cameras", 1)
+    folder = tmp_path / "broadcast"
+    folder.mkdir()
+    simulate(folder, *pan)
+    remove_static_cameras(folder / "match")
+    write_ten_bits(folder / "match/broadcast/clip.mp4")
+    journey = travel(folder)
+    assert "Broadcast camera" in journey.report(tmp_path / "report.html")
+    journey.export("joints", tmp_path / "out")
