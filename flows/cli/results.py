@@ -101,7 +101,7 @@ def export(
     registration = find_registration(store, match)
     name = registration.spec.match_id
     origin = Origin(
-        open_run(project, name, run, complete=True),
+        open_run(project, name, run),
         registration,
         stage,
         filled=filled,

@@ -77,7 +77,7 @@ def write_report(
     """
     if camera is not None:
         _check_film(match, camera)
-    run = open_run(store.url, match.match_id, run_id, complete=True)
+    run = open_run(store.url, match.match_id, run_id)
     source = reference or _own_reference(match)
     scores: Evaluation | None = None
     if source is not None and len(clips_of(run.record)) == 1:

@@ -173,7 +173,7 @@ def _prediction(name: str, project: str, truth: Side, *, run_id: str, stage: str
     if path.is_file() or (path / "joints.npz").is_file() or (path / "cameras").is_dir():
         return reference_side(name)
     match = find_match(Store.open(project), name)
-    run = open_run(project, match.match_id, run_id, complete=True)
+    run = open_run(project, match.match_id, run_id)
     spec = match.folder.spec
     placed = any(unit.partition("/")[0] in JOINT_STAGES for unit in run)
     if not placed and truth.cameras and (cameras := static_cameras(run, spec)):

@@ -106,7 +106,7 @@ def routes(context: PageContext) -> APIRouter:
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
-        return match, open_run(context.store.url, match_id, complete=True)
+        return match, open_run(context.store.url, match_id)
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
