@@ -207,18 +207,20 @@ MAX_DISTANCE_M: Final = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """Classification of results; one of no kind is another person's, or a duplicate.
+    """Classification of results; each is of one kind.
 
     Attributes:
         found: (n,) the pose is the person's.
         unsure: (n,) the pose has low confidence, or there was no frame.
         elsewhere: (n,) the pose is not where the body is.
+        another: (n,) the pose is another person's, or a duplicate.
         rejected: (n, 17) keypoints of the pose that are not where the body is.
     """
 
     found: Flags
     unsure: Flags
     elsewhere: Flags
+    another: Flags
     rejected: Flags
 
 
@@ -311,7 +313,7 @@ def judge_search_results(
         for k, row in enumerate(here):
             before = same[k, :k] & ~another[here[:k]]
             another[row] = before.any() or same[k, len(here) :].any()
-    return Verdicts(open_ & ~another, unsure, elsewhere, rejected)
+    return Verdicts(open_ & ~another, unsure, elsewhere, another, rejected)
 
 
 def _compare_with_bodies(
