@@ -1,4 +1,4 @@
-# Verbs: install, develop, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, docs, schemas, pages, clean. All work from a
+# Verbs: install, develop, demo, demo-quick, demo-match, real-demo, check, format, test, test-all, docs, schemas, pages, size, clean. All work from a
 # fresh clone; real-demo and pages need npm.
 PYTHON ?= python3
 BIN := .venv/bin
@@ -18,7 +18,7 @@ IMPORTS = $(BIN)/python -c 'import flows.reports.report, flows.results.evaluatio
 # Where it is set, each of the hundreds of processes of the tests would compile all sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install develop demo demo-quick demo-match real-demo check format test test-all docs schemas pages clean
+.PHONY: install develop demo demo-quick demo-match real-demo check format test test-all docs schemas pages size clean
 
 # What the commands need. What checks, tests and the documentation need besides is added before the first of them.
 install: $(INSTALLED)
@@ -102,6 +102,10 @@ schemas: install
 # The review pages as they ship, from their sources.
 pages:
 	cd infra/review_pages && npm ci && npm run build
+
+# Lines by part, constants, settings, long functions and files.
+size: install
+	$(BIN)/python infra/code_size.py
 
 clean:
 	rm -rf .venv demo real-demo build dist *.egg-info

@@ -28,7 +28,6 @@ from worldpose.geometry import Camera, Rigid
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
 """COCO-17 with left and right swapped."""
-MOCAP_JOINTS = ("head", "lShldr", "lForeArm", "lHand", "lThigh", "lShin", "lFoot")
 
 
 @dataclass

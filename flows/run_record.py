@@ -21,7 +21,6 @@ from flows.gates import GATES, Gatekeeper
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD
 from flows.progress import reporter
-from flows.renames import rename_settings
 from flows.review.edit_conflicts import EditedMeanwhileError
 from flows.review.metric_words import all_reasons
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
@@ -43,18 +42,8 @@ with its exception if it failed."""
 
 
 def latest_run(store: Store, match_id: str) -> RunRecord | None:
-    """Return the match's latest finished run, None before the first.
-
-    Its settings have their present names, whichever version of worldpose wrote the record.
-    """
-    if not store.runs(match_id):
-        return None
-    record = store.run(match_id)
-    renamed = {
-        "settings": rename_settings(record.settings),
-        "overrides": rename_settings(record.overrides),
-    }
-    return record.model_copy(update=renamed)
+    """Return the match's latest finished run, None before the first."""
+    return store.run(match_id) if store.runs(match_id) else None
 
 
 def describe_end(record: RunRecord) -> str:
@@ -90,7 +79,7 @@ def resolve_settings(
     run_id, before = ("", {}) if latest is None else (latest.run_id, latest.overrides)
     for run in store.unfinished_runs(match_id):
         if run.overrides is not None and run_order(run.run_id) > run_order(run_id):
-            run_id, before = run.run_id, rename_settings(run.overrides)
+            run_id, before = run.run_id, run.overrides
     settings = {
         stage: {**before.get(stage, {}), **requested.get(stage, {})}
         for stage in sorted(before.keys() | requested.keys())
@@ -437,8 +426,7 @@ class RunLog:
         overrides = {name: dict(values) for name, values in self.plan.overrides.items()}
         if self.latest is not None:
             for stage in METHOD[:first]:
-                if stage.name in self.latest.settings:  # else that run is older than the stage
-                    settings[stage.name] = self.latest.settings[stage.name]
+                settings[stage.name] = self.latest.settings[stage.name]
                 if stage.name in self.latest.overrides:
                     overrides[stage.name] = self.latest.overrides[stage.name]
         return settings, overrides

@@ -18,12 +18,11 @@ from data_contracts.work import Recipe
 from flows.gates import Gatekeeper
 from flows.method import METHOD
 from flows.registering import open_match
-from flows.renames import rename_settings
 from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
 from flows.run_record import latest_run, resolve_settings
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
-from worldpose.errors import InputError, StoreError
+from worldpose.errors import StoreError
 from worldpose.store import RecipeDifference, Store, recipe_differences
 
 TEMPORARY_ERRORS: Final = frozenset(
@@ -161,17 +160,12 @@ def recorded_differences(
 
 
 def recorded_recipe(store: Store, record: RunRecord, unit: str) -> Recipe | None:
-    """Return the recipe of a run's result; None if the result was withdrawn or removed.
-
-    Its settings have their present names, so that no difference is a former name.
-    """
+    """Return the recipe of a run's result; None if the result was withdrawn or removed."""
     stage, _, name = unit.partition("/")
     key = record.results[unit]
     if not store.has(record.match_id, stage, name, key):
         return None
-    recipe = store.manifest(record.match_id, stage, name, key).recipe
-    settings = rename_settings({stage: recipe.settings})[stage]
-    return recipe.model_copy(update={"settings": settings})
+    return store.manifest(record.match_id, stage, name, key).recipe
 
 
 @dataclass(frozen=True)
@@ -263,25 +257,18 @@ def _stale_units(
 
 def _last_stage(match: Match, latest: RunRecord) -> str | None:
     """Return the last stage of the run; None = the method's last."""
-    planned = {*latest.results, *latest.blocked, *(failure.unit for failure in latest.failed)}
-    planned_stages = {name.partition("/")[0] for name in planned}
-    known = [stage for stage in METHOD if stage.name in latest.settings and stage.units(match)]
-    reached = [stage for stage in known if stage.name in planned_stages]
-    if not reached:
-        raise InputError(
-            f"run {latest.run_id} of {match.match_id}",
-            expected="results of a stage that this version knows",
-            found=", ".join(sorted(planned)) or "none",
-            todo=f"Run the match again: worldpose run {match.match_id}.",
-        )
-    return None if reached[-1] is known[-1] else reached[-1].name
+    units = [*latest.results, *latest.blocked, *(failure.unit for failure in latest.failed)]
+    planned = {name.partition("/")[0] for name in units}
+    stages = [stage for stage in METHOD if stage.units(match)]
+    reached = [stage for stage in stages if stage.name in planned] or stages
+    return None if reached[-1] is stages[-1] else reached[-1].name
 
 
 def _run_of_iteration(store: Store, latest: RunRecord, number: int) -> RunRecord | None:
     """Return the newest run of an earlier iteration, preferably with the latest run's settings."""
     records = [store.run(latest.match_id, run_id) for run_id in store.runs(latest.match_id)]
     passes = [record for record in reversed(records) if record.iteration == number]
-    same = (record for record in passes if rename_settings(record.overrides) == latest.overrides)
+    same = (record for record in passes if record.overrides == latest.overrides)
     return next(same, passes[0] if passes else None)
 
 

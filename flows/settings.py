@@ -10,7 +10,6 @@ from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record
 from flows.method import METHOD
-from flows.renames import REMOVED, former_names
 from flows.stage import Stage
 from worldpose.errors import UsageError
 
@@ -64,7 +63,6 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
             value = json.loads(text)
         except (ValueError, RecursionError):  # not JSON, or unclosed brackets
             value = text
-        _refuse_former_name(assignment, stage_name, field, value)
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
@@ -88,26 +86,6 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
             found=repr(first["input"]),
             todo="List all settings: worldpose run MATCH --set list.",
         ) from None
-
-
-def _refuse_former_name(assignment: str, stage: str, field: str, value: JsonValue) -> None:
-    replacement = REMOVED.get(stage, {}).get(field)
-    if replacement is not None:
-        raise UsageError(
-            f"--set {assignment}",
-            expected=f"{replacement}, which replaces this setting",
-            found=f"{stage}.{field}",
-            todo=f"Write --set {replacement}=VALUE.",
-        )
-    for former, present in former_names(stage, field, value):
-        group, dot, name = present.partition(".")
-        written = f'{group}={{"{name}": VALUE}}' if dot else f"{present}=VALUE"
-        raise UsageError(
-            f"--set {assignment}",
-            expected=f"the present name of the setting, {present}",
-            found=f"its former name {former}",
-            todo=f"Write --set {stage}.{written}.",
-        )
 
 
 def _place(where: str, name: str, names: list[str]) -> int:

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
-from flows import renames
 from worldpose.cache_folder import find_cache_folder
 
 if TYPE_CHECKING:
@@ -70,19 +69,6 @@ group with `commands`."""
 COMMANDS: Final = {name: place for group in GROUPS.values() for name, place in group.items()}
 
 
-class RenamingCommand(TyperCommand):
-    """A command that refuses a former option name with the present one."""
-
-    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
-        """Parse the arguments; fail if an option has another name now."""
-        renamed = renames.OPTIONS.get(ctx.info_name or "", {})
-        for argument in args:
-            option = argument.partition("=")[0]
-            if option in renamed:
-                ctx.fail(f"{option} is now {renamed[option]}.")
-        return super().parse_args(ctx, args)
-
-
 class Commands(TyperGroup):
     """All commands, in the order of the table.
 
@@ -99,7 +85,7 @@ class Commands(TyperGroup):
         if not function:  # inside another group, a group of one command stays a group
             parent.add_typer(loaded.commands, name=cmd_name)
             return typer.main.get_group(parent).commands[cmd_name]
-        parent.command(cmd_name, cls=RenamingCommand)(getattr(loaded, function))
+        parent.command(cmd_name)(getattr(loaded, function))
         return typer.main.get_command(parent)
 
     def list_commands(self, ctx: Context) -> list[str]:
@@ -111,8 +97,6 @@ class Commands(TyperGroup):
     ) -> tuple[str | None, Command | None, list[str]]:
         """Return the called command, or raise an error that suggests one."""
         name = args[0]
-        if name in renames.COMMANDS:
-            ctx.fail(f"worldpose {name} is now worldpose {renames.COMMANDS[name]}.")
         if name not in COMMANDS and not name.startswith("-"):
             near = get_close_matches(name, COMMANDS)
             meant = f" Did you mean {' or '.join(near)}?" if near else ""

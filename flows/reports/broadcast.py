@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
-from flows.renames import rename_settings
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
@@ -277,7 +276,7 @@ def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[Cap
     boxes = None
     for unit in seen_in_broadcast(match, clip):
         boxes = run[unit]["boxes"].sel(frame=[number]).values.astype(np.float64)
-    own = rename_settings(run.record.settings).get("broadcast_calibration", {})
+    own = run.record.settings.get("broadcast_calibration", {})
     settings = BroadcastCalibrationSettings.model_validate(own)
     greys = [np.asarray(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), np.uint8) for still in stills]
     (followed,) = follow(greys, boxes, settings.flow_points)

@@ -98,7 +98,7 @@ def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
             fallback = number
             break
         fallback = fallback or number
-    return open_run(store.url, match_id, fallback or run_id, complete=True)
+    return open_run(store.url, match_id, fallback or run_id)
 
 
 def describe_later_run(store: Store, record: RunRecord) -> str:

@@ -285,7 +285,7 @@ def release(
 
     store = Store.open(project)
     opened = open_match(store, match_id)
-    run = open_run(project, opened.match_id, complete=True)
+    run = open_run(project, opened.match_id)
     if run.record.state != "complete":
         raise WorldposeError(
             f"run {run.record.run_id} of {match_id}: expected a complete one, found "

@@ -126,7 +126,6 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
     """
     async with get_client() as client:
         await _refuse_other_project(client, plan)
-        await _remove_former(client, plan)
         matches, arrivals = pools(plan)
         await _pool(client, matches, plan.max_concurrent, "Matches, urgent ones first")
         await _pool(client, arrivals, 1, "What arrives, while matches run")
@@ -246,18 +245,6 @@ async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
         )
 
 
-async def _remove_former(client: PrefectClient, plan: ServePlan) -> None:
-    """Remove this project's deployments of earlier versions, which all had the service's name."""
-    for deployed in DEPLOYED:
-        try:
-            there = await client.read_deployment_by_name(f"{deployed.flow}/{plan.name}")
-        except ObjectNotFound:
-            continue
-        given = there.parameters
-        if plan.project in (given.get("project"), (given.get("plan") or {}).get("project")):
-            await client.delete_deployment(there.id)
-
-
 async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> None:
     try:
         await client.read_work_pool(name)
@@ -272,7 +259,7 @@ async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> Non
             )
         )
     else:
-        # Reset values that were changed there, or set by an earlier version.
+        # Reset values that were changed there.
         again = WorkPoolUpdate(concurrency_limit=limit, base_job_template=JOB_TEMPLATE)
         await client.update_work_pool(name, again)
 

@@ -59,7 +59,7 @@ class ProjectMetrics(Collector):
             matches = self._overview.look()
             ended = self._overview.poses()
             size = self._store_size()
-        yield _counts("worldpose_matches", "Matches by state", "state", STATES, matches)
+        yield _match_counts(matches)
         yield from _unit_metrics(matches)
         yield from _quality(matches)
         total = sum(count for _, count in ended)
@@ -160,12 +160,10 @@ class _MetricsServer(ThreadingHTTPServer):
         self.connections.sweep()
 
 
-def _counts(
-    name: str, about: str, label: str, states: tuple[str, ...], matches: list[MatchStatus]
-) -> GaugeMetricFamily:
+def _match_counts(matches: list[MatchStatus]) -> GaugeMetricFamily:
     found = Counter(match.state for match in matches)
-    family = GaugeMetricFamily(name, about, labels=[label])
-    for state in states:
+    family = GaugeMetricFamily("worldpose_matches", "Matches by state", labels=["state"])
+    for state in STATES:
         family.add_metric([state], found[state])
     return family
 

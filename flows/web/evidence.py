@@ -106,7 +106,7 @@ def routes(context: PageContext) -> APIRouter:
         file = Path(videos.name) / f"{name}.mp4"
         with filming:
             if not file.is_file():
-                run = open_run(context.store.url, match_id, asked.run_id, complete=True)
+                run = open_run(context.store.url, match_id, asked.run_id)
                 (unit,) = asked.keys
                 draft = file.with_suffix(".draft.mp4")
                 write_clip_video(context.store, run, match, unit.partition("/")[2], draft)
@@ -122,7 +122,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
     """Draw the evidence for a review request, from the run that created it."""
-    run = open_run(store.url, match.match_id, request.run_id, complete=True)
+    run = open_run(store.url, match.match_id, request.run_id)
     (unit,) = request.keys
     return _DRAWN.get(request.gate, _no_evidence)(store, run, match, unit.partition("/")[2])
 

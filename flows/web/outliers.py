@@ -35,7 +35,7 @@ def routes(context: PageContext) -> APIRouter:
         asked = requests_by_id(match.journal.questions).get(request)
         if asked is None:
             raise HTTPException(404, "no such review")
-        run = open_run(context.store.url, match_id, asked.run_id, complete=True)
+        run = open_run(context.store.url, match_id, asked.run_id)
         if ADJUSTED not in asked.keys or ADJUSTED not in run:
             return []
         return [

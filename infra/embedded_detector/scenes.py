@@ -81,10 +81,6 @@ SHIFTED = SceneKind(
     40_000, ("chequers", "sash"), (1.60, 2.02), person_height=(34.0, 48.0), hazy=1.0, fog=0.02
 )
 """A change of domain: other kits, fog, lower zoom."""
-DUSK = replace(
-    SHIFTED, first_seed=45_000, hazy=0.0, exposure=(-1.5, -1.1), blur=(1.0, 1.8), noise=(5.0, 10.0)
-)
-"""Another, for tuning the settings of fine-tuning: dark, soft and noisy."""
 
 
 def render_set(

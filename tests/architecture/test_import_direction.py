@@ -5,6 +5,7 @@ import functools
 import re
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -174,12 +175,55 @@ def test_processes_that_a_run_starts_import_no_command():
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-def test_no_file_is_a_drawer_for_odds_and_ends():
-    drawers = {"utils.py", "helpers.py", "common.py", "misc.py"}
-    found = [
-        path
-        for package in FORBIDDEN
-        for path in (ROOT / package).rglob("*.py")
-        if path.name in drawers
-    ]
-    assert found == []
+def module_imports(root, packages):
+    """Return the modules that each module imports, with names that a package passes on resolved."""
+    files = {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for package in packages
+        for path in (root / package).rglob("*.py")
+    }
+    taken = {
+        name: [
+            (node.module, alias.name) if isinstance(node, ast.ImportFrom) else (alias.name, "")
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for alias in node.names
+        ]
+        for name, path in files.items()
+    }
+
+    def definer(module, name, importer):
+        if f"{module}.{name}" in files:
+            return f"{module}.{name}"
+        if files[module].name == "__init__.py" and importer != module:
+            for source, passed in taken[module]:
+                if passed == name and source in files:
+                    return definer(source, name, module)
+        return module
+
+    return {
+        name: {definer(*each, name) for each in imported if each[0] in files} - {name}
+        for name, imported in taken.items()
+    }
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    TopologicalSorter(module_imports(ROOT, FORBIDDEN)).prepare()
+
+
+def test_a_circle_through_a_package_and_a_late_import_is_found(tmp_path):
+    sources = {
+        "__init__": "from one.c import value",
+        "a": "from one import value",
+        "b": "def late():\n    from one import a",
+        "c": "import one.b\nvalue = 1",
+    }
+    (tmp_path / "one").mkdir()
+    for name, source in sources.items():
+        (tmp_path / "one" / f"{name}.py").write_text(source)
+    imports = module_imports(tmp_path, ["one"])
+    assert imports["one.a"] == {"one.c"}
+    with pytest.raises(CycleError):
+        TopologicalSorter(imports).prepare()
+    del imports["one.b"]
+    TopologicalSorter(imports).prepare()

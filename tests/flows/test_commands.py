@@ -1,7 +1,6 @@
 """The table of commands: every entry loads, and listing them imports none."""
 
 import os
-import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -10,11 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from flows import renames
 from flows.cli.app import COMMANDS, app, summary
-from flows.method import METHOD
-from flows.settings import parse_overrides
-from worldpose.errors import UsageError
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -96,77 +91,3 @@ def test_a_group_lists_its_commands():
     answer = CliRunner().invoke(app, ["body", "--help"])
     assert answer.exit_code == 0
     assert "install" in answer.output.partition("Commands:")[2]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "present"),
-    [
-        (["times", "m"], "worldpose times is now worldpose timings"),
-        (["serve", "--quiet=3"], "--quiet is now --settle-time"),
-        (["serve", "--at-once", "2"], "--at-once is now --max-concurrent"),
-    ],
-)
-def test_a_former_name_is_refused_with_the_present_one(arguments, present):
-    answer = CliRunner().invoke(app, arguments)
-    assert answer.exit_code == 2
-    assert present in answer.output
-
-
-def test_a_former_setting_is_refused_with_the_present_one():
-    for stage, names in renames.SETTINGS.items():
-        for former, present in names.items():
-            with pytest.raises(UsageError, match=re.escape(f"of the setting, {present}, found")):
-                parse_overrides([f"{stage}.{former}=1"])
-
-
-def test_a_former_name_in_a_group_of_settings_is_refused_with_the_present_one():
-    with pytest.raises(UsageError, match=re.escape('.given={"rotation_rad": VALUE}')):
-        parse_overrides(['bundle_adjustment.given={"rotation": 0.001}'])
-
-
-def is_setting(settings, name):
-    """Return whether settings have a field of this name; a dot leads into a group."""
-    field, dot, rest = name.partition(".")
-    found = settings.model_fields.get(field)
-    return found is not None and (not dot or is_setting(found.annotation, rest))
-
-
-def test_every_present_name_exists():
-    for stage in METHOD:
-        for former, present in renames.SETTINGS.get(stage.name, {}).items():
-            assert is_setting(stage.settings, present), (stage.name, present)
-            assert not is_setting(stage.settings, former), (stage.name, former)
-    assert set(renames.COMMANDS.values()) <= set(COMMANDS)
-    assert not set(renames.COMMANDS) & set(COMMANDS)
-    for command, options in renames.OPTIONS.items():
-        known = CliRunner().invoke(app, [command, "--help"]).output
-        for former, present in options.items():
-            assert present in known
-            assert former not in known
-
-
-def test_settings_in_the_record_of_an_earlier_version_get_their_present_names():
-    former, present = next(iter(renames.SETTINGS["triangulation"].items()))
-    recorded = {"triangulation": {former: False, "min_views": 3}, "ingest": {}}
-    renamed = {"triangulation": {present: False, "min_views": 3}, "ingest": {}}
-    assert renames.rename_settings(recorded) == renamed
-
-
-def test_a_removed_setting_is_refused_with_what_replaces_it_and_not_read_from_records():
-    for stage, names in renames.REMOVED.items():
-        for removed, replacement in names.items():
-            by_name = {stage.name: stage.settings for stage in METHOD}
-            other, _, field = replacement.partition(".")
-            assert is_setting(by_name[other], field) and not is_setting(by_name[stage], removed)
-            with pytest.raises(UsageError, match=re.escape(f"Write --set {replacement}=VALUE")):
-                parse_overrides([f"{stage}.{removed}=1"])
-            recorded = {stage: {removed: 1, "min_views": 4}}
-            assert renames.rename_settings(recorded) == {stage: {"min_views": 4}}
-
-
-def test_settings_of_a_group_get_their_present_names():
-    recorded = {"bundle_adjustment": {"frames": 9, "solver": {"iterations": 5, "damping": 0.1}}}
-    renamed = {
-        "bundle_adjustment": {"max_frames": 9, "solver": {"max_iterations": 5, "damping": 0.1}}
-    }
-    assert renames.rename_settings(recorded) == renamed

@@ -72,7 +72,7 @@ def parts(ada):
 
 def test_the_page_gets_the_bodies_of_the_store(ada, project_copy):
     scene, ranges = parts(ada)
-    model, poses, persons = fitted_bodies(open_run(str(project_copy), TINY, complete=True), "clip")
+    model, poses, persons = fitted_bodies(open_run(str(project_copy), TINY), "clip")
     header, _ = decode_part(scene)
     assert [person["id"] for person in header["people"]] == persons.tolist()
     assert {person["kind"] for person in header["people"]} == {"triangulated"}
@@ -92,7 +92,7 @@ def test_the_page_gets_the_bodies_of_the_store(ada, project_copy):
 
 def test_the_page_gets_how_well_joints_are_known(ada, project_copy):
     _, (frames, *_) = parts(ada)
-    fits = open_run(str(project_copy), TINY, complete=True).bodies("clip")
+    fits = open_run(str(project_copy), TINY).bodies("clip")
     variance = np.trace(fits["covariance"].values, axis1=-2, axis2=-1) / 3.0
     _, arrays = decode_part(frames)
     known = np.isfinite(variance)

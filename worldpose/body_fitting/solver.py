@@ -58,8 +58,6 @@ accelerates as one: the search may count them all, the covariance of its poses m
 DAMPING: Final = 0.01
 """Information of every unknown [1/m^2, 1/rad^2]: 10 m and 10 rad. Only a lone joint leaves a
 direction that uncertain."""
-UNRELATED_ACCELERATION: Final = 1e9
-"""Acceleration of a body whose frames say nothing of each other [m/s^2]."""
 
 
 @dataclass(frozen=True, eq=False)

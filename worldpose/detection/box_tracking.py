@@ -87,12 +87,9 @@ class BoxTracker:
 
     def _predict(self) -> None:
         self._mean = self._mean @ _STEP.T
-        noise = self._noise(PLACE_NOISE, SPEED_NOISE)
+        scale = np.repeat([PLACE_NOISE, SPEED_NOISE], 4) * np.maximum(self._mean[:, 3:4], 1.0)
+        noise = np.asarray(np.eye(8) * (scale**2)[:, None, :])
         self._covariance = _STEP @ self._covariance @ _STEP.T + noise
-
-    def _noise(self, place: float, speed: float) -> Floats:
-        scale = np.repeat([place, speed], 4) * np.maximum(self._mean[:, 3:4], 1.0)
-        return np.asarray(np.eye(8) * (scale**2)[:, None, :])
 
     def _update(self, rows: Integers, boxes: Floats) -> None:
         mean, covariance = self._mean[rows], self._covariance[rows]

@@ -153,7 +153,7 @@ def plot_before_after(
         for line in markings(pitch) if pitch is not None else ():
             axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
         for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
-            draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+            draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
         axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
     return png(figure)
 

@@ -145,7 +145,7 @@ def plot_camera_view(
     for line in markings(pitch) if pitch is not None else ():
         axes.plot(*camera.project(line).T, color=line_color, linewidth=1.3, zorder=1)
     for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
-        draw_skeleton(axes, camera.project(joints), person_color(int(person_id)), 1.6, zorder=3)
+        draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
     return png(figure)
 
 
@@ -305,14 +305,14 @@ def plot_detections(
     for number in np.flatnonzero(there):
         color = USED if number in detections.used else LEFT_OUT
         _box(before, boxes[number], color, dashed=False)
-        draw_skeleton(before, detections.keypoints[number], color, 1.6, zorder=3)
+        draw_skeleton(before, detections.keypoints[number], color)
     line_color = LINE if still is None else TEMPLATE
     for line in markings(pitch) if pitch is not None else ():
         after.plot(*camera.project(line).T, color=line_color, linewidth=1.2, zorder=1)
     for person in np.flatnonzero(found):
         color = person_color(int(people.person_ids[person]))
         pixels = camera.project(joints[person])
-        draw_skeleton(after, pixels, color, 1.6, zorder=3)
+        draw_skeleton(after, pixels, color)
         pixels = pixels[np.isfinite(pixels).all(-1)]
         if not len(pixels):
             continue

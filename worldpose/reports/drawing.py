@@ -181,14 +181,12 @@ def _box_px(axes: Any, extent: tuple[float, float, float, float]) -> tuple[int, 
     return x0, y0, x1 - x0, y1 - y0
 
 
-def draw_skeleton(
-    axes: Axes, keypoints: NDArray[np.floating], color: str, width: float, zorder: int
-) -> None:
+def draw_skeleton(axes: Axes, keypoints: NDArray[np.floating], color: str) -> None:
     """Draw bones and joints of one person (17, 2) [px], without NaN joints."""
     gap = np.full((len(COCO17_BONES), 1, 2), np.nan)
     bones = np.concatenate([keypoints[np.array(COCO17_BONES)], gap], axis=1).reshape(-1, 2)
-    axes.plot(*bones.T, color=color, linewidth=width, solid_capstyle="round", zorder=zorder)
-    axes.plot(*keypoints.T, ".", color=color, markersize=2.2 * width, zorder=zorder)
+    axes.plot(*bones.T, color=color, linewidth=1.6, solid_capstyle="round", zorder=3)
+    axes.plot(*keypoints.T, ".", color=color, markersize=3.52, zorder=3)
 
 
 def draw_label(

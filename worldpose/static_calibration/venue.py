@@ -137,14 +137,11 @@ class Venue:
         cameras: batch (cameras,).
         covariance: (cameras, 12, 12) covariance of a step of each; NaN for a given camera.
         surface: surface of the pitch; None if no camera was refined on lines.
-        disagreement: root mean square distance of the cameras' own surfaces from it [standard
-            deviations], about 1 for agreeing cameras; NaN with fewer than two.
     """
 
     cameras: Camera
     covariance: Floats
     surface: Surface | None
-    disagreement: float
 
 
 def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
@@ -159,7 +156,7 @@ def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
     evidence = [VenueEvidence.from_arrays(each) for each in calibrations]
     told = [each for each in evidence if each is not None]
     if not told:
-        return Venue(Camera.stack(cameras), covariance, None, np.nan)
+        return Venue(Camera.stack(cameras), covariance, None)
     numbers = np.unique(np.concatenate([each.number for each in told]))
     count = len(numbers)
     prior, times = np.zeros((count, count)), np.zeros((count, count))
@@ -177,21 +174,15 @@ def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
     prior /= np.maximum(times, 1.0)
     total = information + prior
     pooled, spread = _solve(total, right + prior @ mean), _invert(total)
-    own = []
     for index, one in enumerate(evidence):
         if one is None:
             continue
         at = np.searchsorted(numbers, one.number)
-        alone = one.covariance
         cameras[index] = step_camera(cameras[index], one.response @ (pooled[at] - one.mean))
-        change = spread[np.ix_(at, at)] - alone
+        change = spread[np.ix_(at, at)] - one.covariance
         covariance[index] += one.response @ change @ one.response.T
-        own.append((one.mean[_surface(one.number)], alone[_block(one.number)]))
     shape, certain = pooled[_surface(numbers)], spread[_block(numbers)]
-    off = [(s - shape) @ np.linalg.solve(c, s - shape) for s, c in own]
-    freedom = 2.0 * (len(own) - 1)
-    disagreement = float(np.sqrt(sum(off) / freedom)) if freedom else np.nan
-    return Venue(Camera.stack(cameras), covariance, Surface(shape, certain), disagreement)
+    return Venue(Camera.stack(cameras), covariance, Surface(shape, certain))
 
 
 def _surface(numbers: Integers) -> Integers:

@@ -21,8 +21,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of verified bytes, and the total."""
 
 SealedEntry = tuple[JournalEntry, str]
-"""A journal entry, and the checksum in its document. A version of worldpose that had fewer fields
-sealed other bytes than those of the record as it is now."""
+"""A journal entry, and the checksum in its document."""
 
 
 @dataclass(frozen=True)

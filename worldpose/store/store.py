@@ -27,7 +27,6 @@ from worldpose.errors import (
     InputError,
     NondeterminismError,
     StoreError,
-    UsageError,
 )
 from worldpose.store.blobs import Blobs, LocalBlobs, pass_commit_point, verify_published
 from worldpose.store.documents import seal, unseal, unseal_repairable
@@ -341,11 +340,10 @@ class Run(Mapping[str, "xr.Dataset"]):
     `time` is the time of each frame in seconds.
     """
 
-    def __init__(self, store: Store, record: RunRecord, *, complete: bool = False) -> None:
+    def __init__(self, store: Store, record: RunRecord) -> None:
         self.record = record
         """Record of the run: results, settings, metrics, versions, times."""
         self._store = store
-        self._complete = complete
         self._opened: dict[str, xr.Dataset] = {}
 
     def __getitem__(self, name: str) -> xr.Dataset:
@@ -363,8 +361,6 @@ class Run(Mapping[str, "xr.Dataset"]):
             result = self._store.open_result(
                 self.record.match_id, stage, unit, self.record.results[name]
             )
-            if self._complete:
-                self._require_all_arrays(name, stage, result)
             self._opened[name] = self._label(result)
         return self._opened[name]
 
@@ -438,23 +434,6 @@ class Run(Mapping[str, "xr.Dataset"]):
     def __contains__(self, name: object) -> bool:
         return name in self.record.results
 
-    def _require_all_arrays(self, name: str, stage: str, result: xr.Dataset) -> None:
-        from data_contracts.schemas import LAYOUTS  # imported here: it imports every record class
-
-        (layout,) = (each for each in LAYOUTS if each.stage == stage)
-        written = {*(array.name for array in layout.arrays), *layout.attributes}
-        absent = sorted(written - set(layout.optional) - {*result.variables, *result.attrs})
-        if absent:
-            raise UsageError(
-                f"run {self.record.run_id} of match {self.record.match_id}: {name}",
-                expected="a result of this version of worldpose",
-                found=f"a result of an earlier version, without {', '.join(absent)}",
-                todo=(
-                    f"Compute a new run: worldpose run {self.record.match_id}. The version that "
-                    "wrote this one exports it."
-                ),
-            )
-
     def __repr__(self) -> str:
         record = self.record
         title = f"Run {record.run_id} of match {record.match_id}: {record.state}"
@@ -467,21 +446,17 @@ class Run(Mapping[str, "xr.Dataset"]):
         )
 
 
-def open_run(
-    project: str | os.PathLike[str], match: str, run: str = LATEST, *, complete: bool = False
-) -> Run:
+def open_run(project: str | os.PathLike[str], match: str, run: str = LATEST) -> Run:
     """Open a match run's results as labelled arrays (xarray), metres and pixels, world frame.
 
     Args:
         project: the project's folder or `s3://bucket/prefix`.
         match: the match's id.
         run: the run's number, such as `0003`, or `latest`.
-        complete: refuse, on opening, a result that an earlier version of worldpose computed without
-            some array of this version.
 
     Raises:
         InputError: there is no such project, match or run.
         CorruptionError: stored bytes differ from the published ones.
     """
     store = Store.open(project)
-    return Run(store, store.run(match, run), complete=complete)
+    return Run(store, store.run(match, run))

@@ -150,7 +150,4 @@ def stored_files(
 
 def content_digest(files: tuple[StoredFile, ...]) -> str:
     """Return a digest that is equal for all valid computations of one key."""
-    # Without defaults: files of earlier versions have no parts.
-    return digest(
-        canonical_json([file.model_dump(mode="json", exclude_defaults=True) for file in files])
-    )
+    return digest(canonical_json([file.model_dump(mode="json") for file in files]))

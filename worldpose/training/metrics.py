@@ -33,7 +33,6 @@ class KeypointMetrics:
     Attributes:
         people: number of people.
         pck: share of visible keypoints within a fifth of the torso [1].
-        hidden_pck: the same share of occluded keypoints within the image [1]; NaN without any.
         median_error: median error of visible keypoints, as a share of the longer side of the box
             [1].
         calibration: mean gap between confidence and share of correct keypoints [1].
@@ -41,7 +40,6 @@ class KeypointMetrics:
 
     people: int
     pck: float
-    hidden_pck: float
     median_error: float
     calibration: float
 
@@ -110,7 +108,7 @@ def score_keypoints(
         visible.append(picture.visible[asked])
         confidence.append(said.confidence)
     if not correct:
-        return KeypointMetrics(0, *(np.nan,) * 4)
+        return KeypointMetrics(0, *(np.nan,) * 3)
     good, seen = np.concatenate(correct), np.concatenate(visible)
     sure, fine = np.concatenate(confidence), np.concatenate(right)
     counted = np.isfinite(good) & np.isfinite(sure)
@@ -121,7 +119,6 @@ def score_keypoints(
     return KeypointMetrics(
         people=len(good),
         pck=share(seen == 2),
-        hidden_pck=share(seen == 1),
         median_error=float(np.nanmedian(np.concatenate(error)[seen == 2])),
         calibration=calibration_error(sure[counted], fine[counted]),
     )

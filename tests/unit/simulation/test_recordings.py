@@ -2,12 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigid_bones import RIGID_BONES
 
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
 from worldpose.simulation import SCENARIOS, MatchOptions, read_trajectories, simulate_match
-from worldpose.simulation.crowd import gather
 from worldpose.simulation.gait import walk
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
 from worldpose.simulation.recordings import NAMES, clip_path, read_bvh, read_clip
@@ -131,36 +128,6 @@ def test_units_are_told_by_the_length_of_legs(scale, file, tmp_path):
     )
 
 
-def test_other_people_keep_their_bones_and_the_clips_directions(file):
-    body = draw_body((1.7, 1.7), np.random.default_rng(3))
-    clip = read_clip(file)
-    path = clip_path(clip, stood(heading=1.2, x=7.0, y=-3.0), body)
-    times = np.arange(0.0, 3.5, 0.01)
-    joints = walk(body, path, times, lambda x, y: 0.0 * x + 0.2, np.random.default_rng(0))
-    for a, b in RIGID_BONES:
-        assert np.ptp(np.linalg.norm(joints[:, a] - joints[:, b], axis=-1)) < 1e-12
-    middle = joints[:, 11:13].mean(axis=1)
-    np.testing.assert_allclose(middle[0, :2], [7.0, -3.0], atol=1e-9)
-    ahead = middle[100, :2] - middle[0, :2]
-    # 1.2 m in a second with the clip's legs of 0.81 m; he turns a little on the way.
-    assert ahead @ [np.cos(1.2), np.sin(1.2)] == pytest.approx(1.2 * body.leg / 0.81, rel=0.01)
-    shin = joints[30, 15] - joints[30, 13]
-    clip_shin = path.clip.points[18, 10] - path.clip.points[18, 8]
-    np.testing.assert_allclose(
-        shin / np.linalg.norm(shin), clip_shin / np.linalg.norm(clip_shin), atol=1e-9
-    )
-
-
-def test_after_the_clip_the_person_stands_without_a_jump(file):
-    body = draw_body((1.8, 1.8), np.random.default_rng(1))
-    path = clip_path(read_clip(file), stood(), body)
-    times = np.arange(0.0, 4.0, 0.01)
-    joints = walk(body, path, times, lambda x, y: 0.0 * x, np.random.default_rng(0))
-    assert np.ptp(joints[250:, 5:], axis=0).max() < 1e-9
-    # From the clip's last pose to standing within half a second: a metre at most.
-    assert np.abs(np.diff(joints, axis=0)).max() < 0.05
-
-
 def test_joints_in_an_npz_are_played_too(file, tmp_path):
     capture = read_bvh(file)
     np.savez(
@@ -180,24 +147,6 @@ def test_a_joint_that_is_missing_is_named(tmp_path):
     (tmp_path / "clip.bvh").write_text(text().replace("lForeArm", "elbow"))
     with pytest.raises(InputError, match="left elbow"):
         read_clip(tmp_path / "clip.bvh")
-
-
-def test_one_person_of_a_crowd_plays_the_clip(file):
-    scenario = SCENARIOS["tiny"].model_copy(update={"duration": 1.0})
-    pitch = PitchTemplate.from_spec(scenario.pitch)
-    crowds = [
-        gather(scenario, pitch, np.random.SeedSequence(1), clip=clip)
-        for clip in (None, read_clip(file))
-    ]
-    assert [path.clip is not None for path in crowds[1].paths] == [False, False, True, False, False]
-    for person in (0, 1, 3, 4):
-        np.testing.assert_array_equal(
-            crowds[0].paths[person].position, crowds[1].paths[person].position
-        )
-    actors = [crowd.paths[2] for crowd in crowds]
-    begin = [[np.interp(0.0, path.time, axis) for axis in path.position.T] for path in actors]
-    # The path of a clip is smoothed over 0.05 s, in which 2 cm are gone.
-    np.testing.assert_allclose(begin[0], begin[1], atol=0.05)
 
 
 TIME = np.arange(0.0, 6.0, 0.1)
@@ -230,37 +179,6 @@ def test_paths_follow_the_data(tmp_path):
     assert keeper.speed.max() < 1e-9
 
 
-def test_people_come_to_a_stop_before_and_after_the_data(tmp_path):
-    (runner, _), _ = read_trajectories(tracked(tmp_path / "t.npz"), 60.0)
-    assert runner.speed[0] < 0.6
-    assert runner.speed[-1] < 0.6
-    assert np.abs(np.diff(runner.speed)).max() / 0.01 < 8.0  # [m/s^2]
-
-
-def test_the_clip_is_no_longer_than_asked_and_people_no_more(tmp_path):
-    paths, length = read_trajectories(tracked(tmp_path / "t.npz"), 2.0, max_people=1)
-    assert length == pytest.approx(2.0, abs=1e-6)
-    assert len(paths) == 1
-
-
-def test_fps_stands_for_time(tmp_path):
-    paths, length = read_trajectories(
-        tracked(tmp_path / "t.npz", time=None, fps=np.array(10.0)), 60.0
-    )
-    assert (len(paths), round(length, 6)) == (2, 5.9)
-
-
-def test_the_longest_stretch_is_used_and_who_is_in_all_of_it(tmp_path):
-    xy = np.load(tracked(tmp_path / "t.npz"))["xy"]
-    xy[40, 1] = np.nan
-    segment = np.where(TIME < 1.95, 1, 2)
-    paths, length = read_trajectories(tracked(tmp_path / "gap.npz", xy=xy, segment=segment), 60.0)
-    assert len(paths) == 1
-    assert length == pytest.approx(3.9, abs=1e-6)
-    start = np.interp(0.0, paths[0].time, paths[0].position[:, 0])
-    assert start == pytest.approx(-2.0, abs=0.3)  # where the runner is after 2 s
-
-
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
@@ -276,13 +194,6 @@ def test_the_longest_stretch_is_used_and_who_is_in_all_of_it(tmp_path):
 def test_unusable_files_are_refused(tmp_path, changes, found):
     with pytest.raises(InputError, match=found):
         read_trajectories(tracked(tmp_path / "t.npz", **changes), 60.0)
-
-
-def test_no_file_and_no_npz_are_refused(tmp_path):
-    (tmp_path / "t.npz").write_text("hello")
-    for name in ("t.npz", "absent.npz"):
-        with pytest.raises(InputError):
-            read_trajectories(tmp_path / name, 60.0)
 
 
 def test_a_match_is_driven_by_them_and_its_id_names_the_file(tmp_path):

@@ -45,7 +45,6 @@ def test_cameras_show_a_surface_that_the_file_does_not_have():
     std = np.sqrt(np.diag(venue.surface.covariance))
     assert (np.abs(off) < 3.0 * std).all()
     assert (std < [0.03, 0.05]).all()
-    assert venue.disagreement < 3.0
     for each in found:
         own = each.report.lines.venue.covariance[-2:, -2:]
         assert (np.diag(own) >= std**2 * (1.0 - 1e-9)).all()
@@ -75,5 +74,4 @@ def test_a_camera_alone_stays_as_it_is_and_a_given_one_tells_nothing():
     assert venue.cameras[0].center == pytest.approx(found[0].estimate.camera.center, abs=1e-6)
     assert venue.covariance[0] == pytest.approx(found[0].estimate.covariance, rel=1e-6, abs=1e-12)
     assert np.isnan(venue.covariance[1]).all()
-    assert np.isnan(venue.disagreement)
     assert join_cameras([given]).surface is None

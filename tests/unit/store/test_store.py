@@ -35,7 +35,6 @@ from worldpose.errors import (
     InternalError,
     NondeterminismError,
     StoreError,
-    UsageError,
 )
 from worldpose.store import ResultId, Store, verify
 from worldpose.store.documents import canonical_json, digest
@@ -510,16 +509,6 @@ def test_older_run_stays_open_to_readers(folder_store: Store) -> None:
     run_once(folder_store, sample_recipe("one"))
     run_once(folder_store, sample_recipe("two"))
     assert list(worldpose.open_run(folder_store.url, "final", "0001")) == ["tracking/one"]
-
-
-def test_result_of_an_earlier_version_is_refused_where_all_of_it_is_needed(
-    folder_store: Store,
-) -> None:
-    run_once(folder_store)
-    assert "joints" in worldpose.open_run(folder_store.url, "final")["tracking/clip"]
-    run = worldpose.open_run(folder_store.url, "final", complete=True)
-    with pytest.raises(UsageError, match=r"earlier version, without joins, .*worldpose run final"):
-        run["tracking/clip"]
 
 
 def test_absent_unit_says_what_there_is(folder_store: Store) -> None:
