@@ -36,7 +36,12 @@ class StubRun(Mapping):
     def __init__(self, **results):
         self.results = {name.replace("__", "/"): data for name, data in results.items()}
         self.record = SimpleNamespace(
-            run_id="0001", match_id="m", results=self.results, left_out={}
+            run_id="0001",
+            match_id="m",
+            state="complete",
+            results=self.results,
+            left_out={},
+            body_folder=None,
         )
 
     def __getitem__(self, name):
@@ -308,7 +313,7 @@ def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
     match_folder, tmp_path, monkeypatch
 ):
     other = dataclasses.replace(load_open_body(), name="smpl-neutral")
-    monkeypatch.setattr(best_results, "find_body", lambda name: other)
+    monkeypatch.setattr(best_results, "find_body", lambda name, folder: other)
     run = origin(match_folder, **tracked())
     (path,) = EXPORTS["gltf"](run, tmp_path / "joints")
     assert b'"skins"' not in path.read_bytes() and b"person_003_left_hip" in path.read_bytes()
