@@ -20,16 +20,22 @@ from scipy.stats import chi2
 from static_accuracy import SHARES, ground_errors
 
 from data_contracts.arrays import Floats
-from worldpose.bundle_adjustment import Clicks, Clip, adjust_cameras
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, Scenario, Scene, simulate_scene
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import StaticCalibration, calibrate_camera, project_with_jacobian
-from worldpose.static_calibration.report import calibration_arrays
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.settings import Scenario
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.static_calibration.report import StaticCalibration, calibration_arrays
 from worldpose.static_calibration.venue import Venue, join_cameras
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 MOMENTS = 6
 """Number of frames of a clip whose players count."""

@@ -28,30 +28,30 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body import BodyParameters, load_open_body
-from worldpose.body_fitting import (
-    BodyFit,
-    BodyFittingSettings,
-    ClipEvidence,
-    MonocularPoses,
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.monocular import MonocularPoses, parse_monocular, place_monocular_poses
+from worldpose.body_fitting.ray_constraints import (
     RayConstraints,
     constrain_to_rays,
     find_ray_constraints,
-    fit_bodies,
     identify_people,
-    place_monocular_poses,
 )
-from worldpose.body_fitting.monocular import parse_monocular
-from worldpose.evaluation import evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
-from worldpose.simulation.foreign import FOREIGN_SCENARIOS
-from worldpose.simulation.foreign.matches import simulate_foreign_scene
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints, undo_swaps
+from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.settings import TriangulationSettings
 
 BODY = load_open_body()
 SETTINGS, TRIANGULATION = BodyFittingSettings(), TriangulationSettings()

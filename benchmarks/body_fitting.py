@@ -28,12 +28,14 @@ import torch
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel, BodyParameters, fold_keypoints, load_open_body
+from worldpose.body.body_file import load_open_body
 from worldpose.body.differentiable import DifferentiableBody
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
-from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
+from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT, fold_keypoints
+from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior, start_poses
+from worldpose.body_fitting.settings import BodyFittingSettings
 
 NOISE = 0.02
 WEIGHT = 1e-4

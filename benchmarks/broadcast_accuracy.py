@@ -25,22 +25,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from data_contracts.arrays import Floats
-from worldpose.broadcast_calibration import (
-    BroadcastCalibrationSettings,
-    BroadcastClip,
-    MovingCamera,
-    People,
-    calibrate_broadcast,
-)
-from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE
+from worldpose.broadcast_calibration.calibration import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.priors import second_differences
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.formats import read_camera, read_joints
-from worldpose.geometry import Rigid
-from worldpose.ingest import MatchFolder, read_match, read_unit
-from worldpose.pitch import PitchTemplate
-from worldpose.video import VideoReader
+from worldpose.formats.challenge import read_camera
+from worldpose.formats.joints_file import read_joints
+from worldpose.geometry.rigid import Rigid
+from worldpose.ingest.footage import read_unit
+from worldpose.ingest.match_folder import MatchFolder, read_match
+from worldpose.pitch.template import PitchTemplate
+from worldpose.video.files import VideoReader
 
 LASTING, ANEW = 0.01, 0.02
 SHARES = (0.5, 0.8, 0.95, 0.99)

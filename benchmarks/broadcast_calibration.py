@@ -31,7 +31,7 @@ from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE,
 from worldpose.broadcast_calibration.priors import build_prior, second_differences
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, descend, equations_at, solve
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import move_broadcast_camera
 from worldpose.simulation.settings import BroadcastSettings
 

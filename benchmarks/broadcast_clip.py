@@ -39,17 +39,17 @@ from common import distances_to_polyline
 
 from data_contracts.arrays import Floats
 from data_contracts.broadcast_calibration import KeyFrames
-from worldpose.broadcast_calibration import (
+from worldpose.broadcast_calibration.calibration import (
     BroadcastCalibration,
-    BroadcastCalibrationSettings,
     BroadcastClip,
     calibrate_broadcast,
-    propose_key_frames,
 )
+from worldpose.broadcast_calibration.key_frames import propose_key_frames
 from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.ingest.validation import validate_record
-from worldpose.pitch import PitchTemplate
-from worldpose.video import open_video
+from worldpose.pitch.template import PitchTemplate
+from worldpose.video.folder import open_video
 
 REPOSITORY = "https://github.com/DonsetPG/narya"
 COMMIT = "a26438e9dae091e016813f675d2f37dbcbe6c84d"

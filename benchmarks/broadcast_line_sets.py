@@ -16,10 +16,10 @@ import pitch_lines
 from soccernet import soccernet_markings
 
 from data_contracts.broadcast_calibration import KeyFrame
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import WorldposeError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 _, SIZE = pitch_lines.SETS["wc14"]
 

@@ -16,7 +16,6 @@ import numpy as np
 from broadcast_accuracy import ANEW, LASTING, SHARES, distances, errors
 
 from data_contracts.arrays import Floats
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings, MovingCamera, People
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
@@ -24,15 +23,17 @@ from worldpose.broadcast_calibration.evidence import (
     PointEvidence,
     join_evidence,
 )
-from worldpose.broadcast_calibration.players import match, player_evidence
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.players import People, match, player_evidence
 from worldpose.broadcast_calibration.priors import (
     build_prior,
     correlation_time,
     estimate_smoothness,
 )
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.broadcast_calibration.uncertainty import compute_uncertainty
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.line_samples import (

@@ -21,7 +21,6 @@ from broadcast_accuracy import feet_in_picture, people_of, true_camera
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.calibration import BroadcastClip, refine, track
 from worldpose.broadcast_calibration.evidence import join_evidence
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
@@ -29,12 +28,14 @@ from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.players import match as match_players
 from worldpose.broadcast_calibration.players import player_evidence
 from worldpose.broadcast_calibration.report import median_residuals
-from worldpose.formats import JointTracks, read_joints
-from worldpose.ingest import read_match
-from worldpose.pitch import PitchTemplate
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.formats.joints_file import JointTracks, read_joints
+from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.reports.broadcast import largest_pose_changes, plot_before_after
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.video import VideoReader
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.video.files import VideoReader
 
 STILL = {"smooth": False, "flow_weight": 0.0}
 TERMS: dict[str, dict[str, float]] = {

@@ -30,10 +30,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
-from worldpose.bundle_adjustment import Problem, SolverSettings, solve
-from worldpose.geometry import Camera, Rigid
+from worldpose.bundle_adjustment.settings import SolverSettings
+from worldpose.bundle_adjustment.solver import Problem, solve
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import PARAMETERS, step_camera
+from worldpose.static_calibration.parameters import PARAMETERS, step_camera
 
 Solution = tuple[Camera, np.ndarray]
 Run = Callable[[], Solution]

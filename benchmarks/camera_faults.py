@@ -23,8 +23,10 @@ import numpy as np
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency import ConsistencySettings, check_consistency
-from worldpose.geometry import Camera, Rigid
+from worldpose.camera_consistency.consistency import check_consistency
+from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 KINDS = ("flipped", "mirrored", "focal", "lens", "clock", "frame_rate", "swapped", "duplicate")
 """COCO-17 with left and right swapped."""

@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from common import best_seconds
 
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 CAMERA = Camera(
     focal=np.array([3200.0, 3200.0]),

@@ -16,8 +16,9 @@ from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from worldpose.geometry import Camera, Rigid
-from worldpose.store import Store
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.store.store import Store
 
 
 def stadium_rig(count: int, rng: np.random.Generator, *, varied_lenses: bool) -> Camera:

@@ -22,10 +22,12 @@ FPS = 50.0
 
 def write(folder: Path, clips: int, frames: int, people: int) -> None:
     """Write clips of people who run in circles at 2.4 m/s before a panning, zooming camera."""
-    from worldpose.body import OPEN_BODY, BodyParameters, find_body
+    from worldpose.body.body_file import OPEN_BODY, find_body
+    from worldpose.body.model import BodyParameters
     from worldpose.formats.challenge import write_moving_camera
     from worldpose.formats.joints_file import write_poses
-    from worldpose.geometry import Camera, Rigid
+    from worldpose.geometry.cameras import Camera
+    from worldpose.geometry.rigid import Rigid
 
     model = find_body(OPEN_BODY)
     height = 0.95  # of a standing body's pelvis [m]

@@ -33,27 +33,28 @@ import torch
 
 from data_contracts.arrays import Image
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import (
-    DetectionSettings,
-    People,
-    PeopleFinder,
-    Place,
-    PoseEstimator,
+from worldpose.detection.enlargement import SeesParts, expect_parts
+from worldpose.detection.interfaces import People, PoseEstimator
+from worldpose.detection.models import (
+    BUNDLED_WEIGHTS,
+    load_bundled_detector,
+    load_bundled_pose,
     load_detectors,
     load_pose,
     load_score_map,
 )
-from worldpose.detection.enlargement import SeesParts, expect_parts
-from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.detection.pipeline import PeopleFinder, Place
+from worldpose.detection.settings import DetectionSettings
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import gather
 from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import RenderingSettings, RigSettings
-from worldpose.video import open_video, write_video
+from worldpose.video.files import write_video
+from worldpose.video.folder import open_video
 
 Result = TypeVar("Result")
 

@@ -18,11 +18,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from worldpose.body import SKELETONS, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyParameters
 from worldpose.evaluation.marker_reference import read_markers
-from worldpose.formats import JointTracks
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
+from worldpose.formats.joints_file import JointTracks
 
 PEOPLE, FRAMES, FPS = 22, 1500, 50.0
 CHECKED = (0, 333, 700, FRAMES - 1)

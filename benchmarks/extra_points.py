@@ -21,15 +21,20 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import FEET
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.keypoints import LANDMARKS
-from worldpose.body_fitting import BodyFit, BodyFittingSettings, ClipEvidence, fit_bodies
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import LANDMARKS, fold_keypoints
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import POINT_DIFFICULTY, Scene, detect_points, simulate_scene
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import Triangulation, TriangulationSettings, reconstruct_joints
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.passes import Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
 
 NEAR_M = 0.5
 """Largest distance of a person from the true one [m]."""

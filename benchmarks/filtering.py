@@ -14,29 +14,29 @@ import argparse
 
 import numpy as np
 
-from worldpose.body import find_body
-from worldpose.body_fitting import (
-    BodyFittingSettings,
-    ClipEvidence,
-    find_ray_constraints,
-    fit_bodies,
-    perceived_joints,
-)
-from worldpose.filtering import (
-    FilteringSettings,
+from worldpose.body.body_file import find_body
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.objective import perceived_joints
+from worldpose.body_fitting.ray_constraints import find_ray_constraints
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.filtering.judging import (
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
     perceived_covariance,
     view_bodies,
 )
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.filtering.settings import FilteringSettings
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints, undo_swaps
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.settings import TriangulationSettings
 
 PLANTED = 0.06
 """Share of joints with planted gross errors."""

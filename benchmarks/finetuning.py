@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from worldpose.detection.models import load_bundled_detector, load_bundled_pose
-from worldpose.training import FineTuningSettings, read_labels, write_labels
 from worldpose.training.fine_tuning import split
-from worldpose.training.labels import PictureCache
+from worldpose.training.labels import PictureCache, read_labels, write_labels
 from worldpose.training.metrics import detect_labelled, score_people
+from worldpose.training.settings import FineTuningSettings
 
 WORLDPOSE = Path(sys.executable).with_name("worldpose")
 RECIPE = Path(__file__).parents[1] / "infra" / "embedded_detector"

@@ -22,12 +22,14 @@ from scipy.stats import chi2
 
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
-from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_scene
-from worldpose.static_calibration import calibrate_camera
-from worldpose.tracking import locate_feet, track_on_plane
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.tracking.feet import locate_feet
+from worldpose.tracking.ground_tracks import track_on_plane
 
 MATCHES = ["match:5501", "hard:5503", "foreign-match:5503", "foreign-many:5502"]
 GATE_M = 1.0

@@ -18,11 +18,11 @@ import numpy as np
 from data_contracts.arrays import Floats
 from flows.results.best_results import bodies_unit, fitted_bodies
 from worldpose import open_run
-from worldpose.body import find_body
+from worldpose.body.body_file import find_body
 from worldpose.evaluation.matching import match_people
 from worldpose.formats.joints_file import read_joints, read_poses
 from worldpose.formats.motion_capture import OPENSIM_COORDINATES, opensim_coordinates
-from worldpose.ingest import read_match
+from worldpose.ingest.match_folder import read_match
 
 ANGLES = np.array([not name.startswith("pelvis_t") for name in OPENSIM_COORDINATES])
 ANGLES[OPENSIM_COORDINATES.index("pelvis_tilt")] = True

@@ -8,9 +8,14 @@ from scipy.special import chdtri
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
-from worldpose.evaluation import EvaluationSettings
-from worldpose.evaluation.matching import joint_distances, match_people, select_frames, take_matched
-from worldpose.formats import JointTracks
+from worldpose.evaluation.matching import (
+    EvaluationSettings,
+    joint_distances,
+    match_people,
+    select_frames,
+    take_matched,
+)
+from worldpose.formats.joints_file import JointTracks
 
 SEGMENTS = {
     "shoulders": ((5, 6),),

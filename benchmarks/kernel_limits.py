@@ -32,12 +32,13 @@ from triangulation import workload as joints_workload
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import fold_keypoints, load_open_body
+from worldpose.body.body_file import load_open_body
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body_fitting import BodyFittingSettings
+from worldpose.body.keypoints import fold_keypoints
 from worldpose.body_fitting.objective import Evidence, Pose, Track
 from worldpose.body_fitting.point_equations import VECTOR
 from worldpose.body_fitting.pose_space import load_pose_prior, start_poses
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
 from worldpose.bundle_adjustment.solver import _System

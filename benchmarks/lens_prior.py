@@ -27,7 +27,7 @@ from clicking_people import (
     wide_camera,
 )
 
-from worldpose.static_calibration import calibrate_camera
+from worldpose.static_calibration.calibration import calibrate_camera
 
 
 def main() -> None:

@@ -31,9 +31,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera, Rigid
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 PUBLISHED = {3: 9.9, 2: 18.3}
 """mv3dreg's mean error by views [cm]."""

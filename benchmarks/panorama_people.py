@@ -21,10 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from worldpose.detection import DetectionSettings, People
+from worldpose.detection.interfaces import People
 from worldpose.detection.models import load_detectors
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import fuse
-from worldpose.training import LabelledPicture, read_picture, read_yolo_labels
+from worldpose.training.labels import LabelledPicture, read_picture, read_yolo_labels
 from worldpose.training.metrics import average_precision
 
 PARTS = {"train": "_1st_", "test": "_2nd_", "all": ""}

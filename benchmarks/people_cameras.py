@@ -20,7 +20,8 @@ import numpy as np
 import worldpose
 from worldpose.bundle_adjustment.adjustment import camera_motion
 from worldpose.bundle_adjustment.uncertainty import Similarity
-from worldpose.geometry import Camera, align
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import align
 
 
 def main() -> None:

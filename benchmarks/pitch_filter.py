@@ -21,15 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
-from worldpose.detection import DetectionSettings, PeopleFinder, Place
 from worldpose.detection.models import load_bundled_detector, load_bundled_pose
-from worldpose.geometry import Camera
+from worldpose.detection.pipeline import PeopleFinder, Place
+from worldpose.detection.settings import DetectionSettings
 from worldpose.geometry.boxes import box_iou
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.cast import assign_roles, dress_people, place_bystanders
 from worldpose.simulation.image_formation import RenderedFrame
 from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.simulation.settings import Scenario
 

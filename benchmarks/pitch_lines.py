@@ -27,14 +27,11 @@ from soccernet import soccernet_markings
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import (
-    CameraPrior,
-    StaticCalibration,
-    StaticCalibrationSettings,
-    calibrate_camera,
-)
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
 Lines = dict[str, list[list[float]]]
 """Drawn points of one image by marking, as shares of its width and height."""

@@ -37,32 +37,26 @@ from scipy.special import chdtri
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyParameters, load_open_body
-from worldpose.body_fitting import (
-    BodyFittingSettings,
-    ClipEvidence,
-    PlaneBodies,
-    PlaneEvidence,
-    fit_bodies,
-    fit_bodies_on_plane,
-)
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
 from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
 from worldpose.body_fitting.objective import ankle_height
-from worldpose.geometry import Camera, Rigid, align
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.body_fitting.plane_bodies import PlaneBodies, PlaneEvidence, fit_bodies_on_plane
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid, align
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
-from worldpose.simulation.foreign import FOREIGN_SCENARIOS
-from worldpose.simulation.foreign.matches import simulate_foreign_scene
+from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.tracking import (
-    GroundPositions,
-    TrackingSettings,
-    locate_feet,
-    track_on_plane,
-    track_people,
-)
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints
+from worldpose.tracking.feet import GroundPositions, locate_feet
+from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 BODY: Final = load_open_body()
 LEAN: Final = np.radians(8.0)

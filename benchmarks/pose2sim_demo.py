@@ -32,11 +32,11 @@ from numpy.typing import NDArray
 import worldpose
 from data_contracts.conventions import COCO17
 from flows.results.best_results import static_cameras
-from worldpose.formats import read_joints
 from worldpose.formats.detection_files import read_openpose_folder
+from worldpose.formats.joints_file import read_joints
 from worldpose.formats.keypoint_files import on_frames
-from worldpose.geometry import Camera
-from worldpose.ingest import read_match
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.match_folder import read_match
 
 LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
 """Upper arms, forearms, thighs and shanks in COCO-17."""

@@ -56,26 +56,24 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.formats import read_camera
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import surface_shape
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.formats.challenge import read_camera
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate, surface_shape
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import (
-    Proposal,
-    SeenPeople,
-    StaticCalibration,
-    calibrate_camera,
-    calibrate_without_clicks,
-    decide_sides,
-    propose_camera,
-)
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.paint_segments import Ridges, guess_lens, straighten_paint
 from worldpose.static_calibration.parameters import by_step
-from worldpose.static_calibration.proposal import propose_from_paint
-from worldpose.static_calibration.sides import turn_camera
-from worldpose.tracking import locate_feet
+from worldpose.static_calibration.proposal import (
+    Proposal,
+    calibrate_without_clicks,
+    propose_camera,
+    propose_from_paint,
+)
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.sides import SeenPeople, decide_sides, turn_camera
+from worldpose.tracking.feet import locate_feet
 
 SIZE = (1280, 720)
 """Width, height of the images of drawn lines [px]."""

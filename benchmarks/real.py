@@ -56,22 +56,25 @@ from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.broadcast_calibration import BroadcastClip, calibrate_broadcast
-from worldpose.detection import DetectionSettings
+from worldpose.broadcast_calibration.calibration import BroadcastClip, calibrate_broadcast
 from worldpose.detection.models import load_pose
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import read_json
 from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.validation import validate_record
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import StaticCalibration, calibrate_camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.line_refinement import LineRefinement
+from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store import Store
-from worldpose.tracking import TrackingSettings, locate_feet, track_on_plane
+from worldpose.store.store import Store
+from worldpose.tracking.feet import locate_feet
+from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.settings import TrackingSettings
 from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import score_keypoints
-from worldpose.video import index_video, open_video
+from worldpose.video.folder import index_video, open_video
 
 Metrics = dict[str, Any]
 PAIR_M = 2.0

@@ -27,19 +27,18 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose import read_cameras
-from worldpose.body import fold_keypoints, load_open_body
-from worldpose.body_fitting import (
-    BodyFit,
-    BodyFittingSettings,
-    ClipEvidence,
-    fit_bodies,
-    perceived_joints,
-    perceived_points,
-)
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.extra_points import perceived_points
+from worldpose.body_fitting.objective import perceived_joints
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.formats.detection_files import read_openpose_folder
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.importing import import_pose2sim
-from worldpose.triangulation import Triangulation, TriangulationSettings, reconstruct_joints
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.passes import Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
 
 GROUPS = {
     "knees": (13, 14),

@@ -29,19 +29,20 @@ import numpy as np
 from data_contracts.arrays import AnyFloats, Floats, Image
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body import fold_keypoints, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
 from worldpose.body.model import BODY_POSE, BodyParameters
-from worldpose.detection import DetectionSettings, load_landmarks
 from worldpose.detection.bundled_nets import load_weights
 from worldpose.detection.interfaces import People
 from worldpose.detection.landmark_net import POINTS, LandmarkEstimator, LandmarkNet, Landmarks
-from worldpose.detection.models import load_bundled_detector, load_bundled_pose
+from worldpose.detection.models import load_bundled_detector, load_bundled_pose, load_landmarks
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import TORSO_SHARE, torso_sizes
-from worldpose.video import open_video
+from worldpose.video.folder import open_video
 
 MODEL = load_open_body()
 NEAREST = 12

@@ -27,8 +27,8 @@ from pathlib import Path
 
 from common import WORLDPOSE
 
-from worldpose.ingest import read_match
-from worldpose.store import Store
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Store
 
 INTERVAL_S = 0.25
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")

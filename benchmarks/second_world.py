@@ -49,13 +49,14 @@ from flows.run_plan import PlannedUnit
 from flows.run_record import RunLog
 from flows.settings import selected_stages
 from flows.stage import Stage
-from worldpose.evaluation import evaluate_joints
 from worldpose.evaluation.matching import joint_distances, match_people
-from worldpose.formats import JointTracks, read_joints
-from worldpose.ingest import read_match
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
-from worldpose.store import Run, Store, open_run
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks, read_joints
+from worldpose.ingest.match_folder import read_match
+from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.store.store import Run, Store, open_run
 
 MIX = (
     *("foreign-match", "foreign-lab", "foreign-mixed", "foreign-two", "foreign-match"),

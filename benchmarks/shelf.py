@@ -37,9 +37,9 @@ from scipy.special import chdtri
 from data_contracts.arrays import Floats
 from flows.results.best_results import JointDefinition, joint_tracks
 from worldpose.body_fitting.objective import body_axes
-from worldpose.formats import read_joints
-from worldpose.ingest import import_match
-from worldpose.store import Store
+from worldpose.formats.joints_file import read_joints
+from worldpose.ingest.importing import import_match
+from worldpose.store.store import Store
 
 FPS = 25.0
 WINDOWS = (range(300, 421), range(421, 511))

@@ -22,10 +22,13 @@ from shelf import FPS, write_case
 
 from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.ingest import read_match, read_unit
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.footage import read_unit
+from worldpose.ingest.match_folder import read_match
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 FRAMES = range(300, 421)
 FOUND_M = 0.5

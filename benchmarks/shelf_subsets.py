@@ -25,9 +25,9 @@ import numpy as np
 from common import run_in_process
 from shelf import load_scorer, read_settings, write_case
 
-from worldpose.body_fitting import perceived_joints
+from worldpose.body_fitting.objective import perceived_joints
 from worldpose.errors import WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 POINTS, MILLIMETERS = 0.3, 1.0
 """Loss through a stage that counts as worse."""

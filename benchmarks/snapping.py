@@ -26,12 +26,14 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import calibrate_camera, calibrate_without_clicks
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.paint_segments import find_paint
-from worldpose.video import median_picture, open_video
+from worldpose.static_calibration.proposal import calibrate_without_clicks
+from worldpose.video.folder import median_picture, open_video
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "real"))
 import static_pair

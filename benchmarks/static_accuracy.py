@@ -24,11 +24,14 @@ from data_contracts.arrays import Floats, Image
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.evaluation.cameras import surface_points
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import CameraEstimate, StaticCalibration, calibrate_camera
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.parameters import CameraEstimate
+from worldpose.static_calibration.report import StaticCalibration
 
 SHARES = (0.5, 0.8, 0.95, 0.99)
 BORDER = 4.0

@@ -36,9 +36,9 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Image
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_without_clicks
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.proposal import calibrate_without_clicks
 from worldpose.static_calibration.sides import turn_camera
 
 LABELS = Path(__file__).parents[1] / "tests" / "real" / "stills" / "markings.json"

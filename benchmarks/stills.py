@@ -29,8 +29,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats
-from worldpose.detection import DetectionSettings, People
+from worldpose.detection.interfaces import People
 from worldpose.detection.models import load_detectors, load_pose, load_score_map
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import fuse
 from worldpose.detection.views import TiledDetector
 from worldpose.training.labels import LabelledPicture, PictureCache, read_labels

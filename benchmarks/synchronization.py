@@ -25,13 +25,14 @@ import worldpose
 from data_contracts.keypoints import KeypointDetections
 from flows.cli.synchronize import load_clip
 from flows.registering import open_match
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
-from worldpose.store import Store
-from worldpose.tracking import track_people
-from worldpose.triangulation import shift_in_time
+from worldpose.store.store import Store
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.clocks import shift_in_time
 from worldpose.triangulation.synchronization import Synchronization, shift_frames, synchronize
 
 SHIFTS = np.array([-12.0, -3.5, 0.0, 2.25, 20.0])

@@ -30,10 +30,12 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import PlannedUnit, plan_run
 from flows.stages import refitting
-from worldpose.formats import read_joints, write_archive
-from worldpose.simulation import SCENARIOS
+from worldpose.formats.archives import write_archive
+from worldpose.formats.joints_file import read_joints
 from worldpose.simulation.matches import MatchOptions, simulate_match
-from worldpose.store import Store, recipe_key
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 SCENARIO, PEOPLE = SCENARIOS["tiny-broadcast"], 12
 LENGTH = (0.6, 1.2)

@@ -21,10 +21,11 @@ from common import best_seconds, stadium_rig
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.tracking import TrackingSettings, track_people
+from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, match_optimally, ray_affinity
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 SETTINGS = TrackingSettings()
 CAMERAS, FPS, GATE = 16, 50.0, SETTINGS.gate_m

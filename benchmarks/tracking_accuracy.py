@@ -16,11 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from worldpose.evaluation import evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.simulation import SCENARIOS, Scenario, Scene, read_trajectories, simulate_scene
-from worldpose.tracking import TrackingSettings, track_people
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.simulation.recordings import read_trajectories
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.settings import Scenario
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 CLIPS = ["match:501:60", "corner-kick:501", "corner-kick:502", "crossing:501", "crossing:502"]
 LONGEST, MOST = 12.0, 25

@@ -21,8 +21,9 @@ import numpy as np
 from common import stadium_rig
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 CAMERAS, PEOPLE, JOINTS = 16, 22, 17
 PART = 17 * 60

@@ -15,13 +15,17 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.evaluation import evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.simulation import SCENARIOS, CalibrationErrors, Scene, simulate_scene
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.simulation.annotations import add_calibration_errors
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.settings import CalibrationErrors
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 SMALL = CalibrationErrors(rotation_rad=3e-4, center_m=0.1, focal=1e-3)
 WAYS = ("none", "midhip", "body")

@@ -31,7 +31,8 @@ import data_contracts.arrays
 from data_contracts.schemas import LAYOUTS
 from data_contracts.work import Work
 from tasks.unit import keep_freed_memory
-from worldpose.store import ResultId, Store
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
 
 PAGE = 256
 """Frames per read, as in `tasks.clip_inputs`."""

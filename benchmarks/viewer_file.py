@@ -23,9 +23,10 @@ from exchange_formats import FPS, FRAMES, PEOPLE, random_motion
 from scipy.spatial.transform import Rotation
 
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
 from worldpose.formats.viewer_file import ViewerClip, ViewerPerson, write_viewer
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import markings, person_color
 
 CHECKED = (0, 333, 700, FRAMES - 1)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-import worldpose
 from data_contracts.records import field_docstrings
 from flows.cli.app import COMMANDS, app
 from flows.method import METHOD
@@ -20,25 +17,13 @@ from flows.stage import Stage
 if TYPE_CHECKING:
     from typer._click.core import Command
 
-INTERNAL = {"worldpose.simulation"}
-"""Packages that a user of the library does not import."""
-
 
 def write_reference(folder: Path) -> None:
-    """Write `settings.md`, `command_line.md`, `api.md` and a page for each package.
-
-    Pages of packages that no longer exist are removed: Sphinx warns of them.
-    """
+    """Write `settings.md`, `command_line.md` and `api.md`."""
     folder.mkdir(parents=True, exist_ok=True)
     write(folder / "settings.md", settings_page())
     write(folder / "command_line.md", command_page())
-    packages = ["worldpose", *sorted(public_packages())]
-    for page in folder.glob("worldpose*.md"):
-        if page.stem not in packages:
-            page.unlink()
-    for name in packages:
-        write(folder / f"{name}.md", package_page(name))
-    write(folder / "api.md", api_page(packages))
+    write(folder / "api.md", api_page())
 
 
 def write(path: Path, lines: Iterator[str]) -> None:
@@ -108,42 +93,12 @@ def one_command(path: str, command: Command) -> Iterator[str]:
         yield f"| {names} | {default} | {meaning} |"
 
 
-def public_packages() -> Iterator[str]:
-    """Yield the packages of the library that list what they offer."""
-    for found in pkgutil.iter_modules(worldpose.__path__, "worldpose."):
-        offers_names = getattr(importlib.import_module(found.name), "__all__", ())
-        if found.ispkg and found.name not in INTERNAL and offers_names:
-            yield found.name
-
-
-def api_page(packages: list[str]) -> Iterator[str]:
-    """Yield the lines of the index of the API."""
+def api_page() -> Iterator[str]:
+    """Yield the lines of the page of the library: its docstring and all names that it offers."""
     yield "# API"
     yield ""
-    yield "```{toctree}"
-    yield ":maxdepth: 1"
-    yield ""
-    yield from packages
-    yield "```"
-
-
-def package_page(name: str) -> Iterator[str]:
-    """Yield the lines of the page of one package: its docstring and all names it offers."""
-    yield f"# {name}"
-    yield ""
     yield "```{eval-rst}"
-    yield f".. automodule:: {name}"
-    if name != "worldpose":  # its functions stand on the pages of their packages
-        yield "   :members:"
-        yield "   :imported-members:"
+    yield ".. automodule:: worldpose"
+    yield "   :members:"
+    yield "   :imported-members:"
     yield "```"
-    if name == "worldpose":
-        yield ""
-        yield "| name | package |"
-        yield "| --- | --- |"
-        for member in worldpose.__all__:
-            where = getattr(getattr(worldpose, member), "__module__", name)
-            packages = [each for each in public_packages() if where.startswith(each)]
-            package = max(packages, key=len, default=name)
-            link = f"[{package}]({package}.md)" if packages else f"`{where}`"
-            yield f"| `{member}` | {link} |"

@@ -17,7 +17,8 @@ from data_contracts.arrays import ArrayLayout, Floats, GroupLayout
 from data_contracts.keypoints import FRAME
 from data_contracts.tracking import PERSON
 from data_contracts.work import Recipe, Work
-from worldpose.store import Store, libraries, recipe_key
+from worldpose.store.recipes import libraries, recipe_key
+from worldpose.store.store import Store
 
 WINDOW_S = 0.4
 SPEEDS = GroupLayout(

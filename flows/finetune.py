@@ -14,7 +14,7 @@ from prefect import flow
 
 from data_contracts.finetune import NetKind, NetVersion
 from tasks.finetune import finetune
-from worldpose.training import FineTuningSettings
+from worldpose.training.settings import FineTuningSettings
 
 FOLDER = "detectors"
 """Project folder with versions of nets, `<net>-<fingerprint>.safetensors`, and their records."""

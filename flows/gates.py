@@ -17,8 +17,8 @@ from data_contracts.records import Record
 from data_contracts.review import ReviewDecision, ReviewRequest
 from data_contracts.run import GatePolicy, ResultManifest, WaitingUnit
 from flows.stage import Match
-from worldpose.review import Journal, last_decision, requests_by_id, say
-from worldpose.store import Store
+from worldpose.review.journal import Journal, last_decision, requests_by_id, say
+from worldpose.store.store import Store
 
 Figures = Mapping[str, float]
 

@@ -22,7 +22,7 @@ from flows.run_record import latest_run
 from flows.running import RunRequest, keep_settings, run_match, shared_machines
 from flows.stage import Match
 from worldpose.errors import UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 GAIN: Final = 0.01
 """Minimum relative decrease of the held-out error for a better iteration: rejecting the tails of

@@ -31,7 +31,7 @@ from functools import partial
 
 from flows.stage import Match, Stage
 from worldpose.errors import StoreError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def left_out_cameras(

@@ -12,7 +12,8 @@ from flows.run_record import latest_run, resolve_settings
 from flows.run_status import recorded_differences, recorded_recipe, unit_status
 from flows.settings import Overrides
 from worldpose.errors import InputError
-from worldpose.store import Store, list_pins
+from worldpose.store.runs import list_pins
+from worldpose.store.store import Store
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from flows.run_record import RunLog, describe_end
 from flows.settings import selected_stages
 from flows.stage import Stage
 from worldpose.errors import WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 WITHOUT_CAMERAS: Final = ("ingest", "detection")
 """Last stages of runs that need no calibrated camera."""

@@ -20,7 +20,7 @@ from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from data_contracts.run import RunRecord
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LOG: Final = logging.getLogger("worldpose.run")
 URL: Final = "OPENLINEAGE_URL"

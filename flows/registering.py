@@ -11,16 +11,10 @@ from flows.review.corrections import corrected_match
 from flows.stage import Match
 from worldpose.errors import CorruptionError, InputError
 from worldpose.formats.detection_files import read_boxes
-from worldpose.ingest import (
-    MatchFolder,
-    read_match,
-    read_unit,
-    register_match,
-    require_calibrated,
-)
-from worldpose.ingest.footage import read_still, require_footage
-from worldpose.ingest.registration import READERS
-from worldpose.store import Store
+from worldpose.ingest.footage import read_still, read_unit, require_footage
+from worldpose.ingest.match_folder import MatchFolder, read_match, require_calibrated
+from worldpose.ingest.registration import READERS, register_match
+from worldpose.store.store import Store
 
 
 def register(store: Store, folder: Path, *, unfinished: bool = False) -> tuple[Match, bool]:
@@ -171,12 +165,14 @@ def _read_new_files(
             require_footage(match.spec, unit, path)
     for unit, path in match.boxes.items():
         if is_new(path):
-            from worldpose.video import index_video  # late: few matches have such files
+            from worldpose.video.folder import index_video  # late: few matches have such files
 
             index = index_video(match.videos[unit])
             read_boxes(path, index.size, len(index))
     for path in filter(is_new, match.estimates.values()):
-        from worldpose.body_fitting import read_monocular  # late: few matches have such files
+        from worldpose.body_fitting.monocular import (
+            read_monocular,  # late: few matches have such files
+        )
 
         read_monocular(path)
     for name, path in match.stills.items():

@@ -13,7 +13,7 @@ from flows.run_plan import PlannedUnit
 from flows.run_status import RunStatus, run_status
 from flows.running import RunRequest, run_match, shared_machines
 from worldpose.errors import InternalError, WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 State = Literal["never run", "current", "stale", "complete", "waiting", "partial", "failed"]
 

@@ -30,9 +30,10 @@ from flows.stages import body_fitting, broadcast_tracking, tracking, triangulati
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
-from worldpose.ingest import MatchFolder
-from worldpose.store import Store, libraries
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.store.recipes import libraries
 from worldpose.store.runs import run_order
+from worldpose.store.store import Store
 
 ComputeUnits = Callable[
     [Stage, list[PlannedUnit]], Iterable[tuple[PlannedUnit, BaseException | None]]

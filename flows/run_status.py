@@ -23,7 +23,8 @@ from flows.run_record import latest_run, resolve_settings
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
 from worldpose.errors import StoreError
-from worldpose.store import RecipeDifference, Store, recipe_differences
+from worldpose.store.recipes import RecipeDifference, recipe_differences
+from worldpose.store.store import Store
 
 TEMPORARY_ERRORS: Final = frozenset(
     name

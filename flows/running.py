@@ -31,7 +31,7 @@ from flows.settings import Overrides, selected_stages
 from flows.stage import Match
 from tasks.tracing import flush_spans, start_tracing
 from worldpose.errors import InputError, WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 if TYPE_CHECKING:
     from distributed import Security

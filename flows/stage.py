@@ -12,8 +12,8 @@ from pydantic import JsonValue
 from data_contracts.match import Registration
 from data_contracts.records import Record
 from data_contracts.review import Correction
-from worldpose.ingest import MatchFolder
-from worldpose.review import Journal
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.review.journal import Journal
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from data_contracts.work import Work
 from tasks.unit import RETRIES, RETRY_SECONDS, may_pass
 from tasks.watchdog import was_interrupted
 from worldpose.compiled import map_in_threads
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @task(task_run_name="{name}", persist_result=False)

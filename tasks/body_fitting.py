@@ -20,27 +20,22 @@ from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
 from tasks.spool import open_spool
 from tasks.triangulation import camera_errors, load_triangulation_settings
 from tasks.unit import figures_of, open_input, unit_task
-from worldpose.body import BodyModel, digest_of_body, find_body
-from worldpose.body_fitting import (
-    BodyFit,
-    BodyFittingSettings,
-    ClipEvidence,
-    FitMetrics,
-    Ground,
-    MonocularPoses,
-    RayConstraints,
-    SeenClip,
-    Shape,
-    compare_held_out,
-    far_offsets,
-    find_ray_constraints,
-    fit_in_windows,
-)
+from worldpose.body.body_file import digest_of_body, find_body
+from worldpose.body.model import BodyModel
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_in_windows
+from worldpose.body_fitting.bones import Shape
+from worldpose.body_fitting.fit_quality import FitMetrics, SeenClip, compare_held_out, far_offsets
+from worldpose.body_fitting.monocular import MonocularPoses
+from worldpose.body_fitting.objective import Ground
+from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_constraints
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
-from worldpose.store import ResultWriter, Store
-from worldpose.triangulation import ExtraJoints, undo_swaps
+from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
+from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.passes import ExtraJoints
 
 MEASURED_FRAMES: Final = 1000
 """Frames of a clip from which medians of metrics are computed."""

@@ -16,21 +16,20 @@ from data_contracts.work import Work
 from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.broadcast_calibration import (
-    BroadcastCalibrationSettings,
+from worldpose.broadcast_calibration.calibration import (
     BroadcastClip,
-    BroadcastReport,
-    KnownPeople,
-    People,
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
-    propose_key_frames,
 )
+from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.broadcast_calibration.pitch_errors import SIZES
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Store
-from worldpose.video import open_video
+from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.report import BroadcastReport
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.pitch.template import PitchTemplate
+from worldpose.store.store import Store
+from worldpose.video.folder import open_video
 
 PROPOSED_FRAMES: Final = 8
 """Frames of a clip without clicks to propose key frames in, evenly spaced [1]."""

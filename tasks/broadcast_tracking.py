@@ -19,12 +19,15 @@ from data_contracts.tracking import Track
 from data_contracts.work import Work
 from tasks.clip_inputs import select_frames
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
+from worldpose.broadcast_calibration.calibration import moving_from_arrays
 from worldpose.broadcast_calibration.pitch_errors import SIZES
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Store
-from worldpose.tracking import GroundPositions, locate_feet, measure_shirts, track_on_plane
-from worldpose.video import open_video
+from worldpose.broadcast_calibration.uncertainty import static_covariance
+from worldpose.pitch.template import PitchTemplate
+from worldpose.store.store import Store
+from worldpose.tracking.feet import GroundPositions, locate_feet
+from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.shirts import measure_shirts
+from worldpose.video.folder import open_video
 
 
 @unit_task

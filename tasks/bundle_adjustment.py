@@ -15,18 +15,14 @@ from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_frames, open_venue, select_frames
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
-from worldpose.bundle_adjustment import (
-    BundleAdjustment,
-    BundleAdjustmentSettings,
-    Clicks,
-    Clip,
-    adjust_cameras,
-    adjustment_arrays,
-)
+from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.report import adjustment_arrays
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import UsageError
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @unit_task

@@ -10,13 +10,13 @@ from data_contracts.camera_consistency import CAMERA_CONSISTENCY
 from data_contracts.work import Work
 from tasks.clip_inputs import open_clip, open_venue
 from tasks.unit import unit_task
-from worldpose.camera_consistency import (
-    ConsistencySettings,
+from worldpose.camera_consistency.consistency import (
     check_consistency,
     describe_faults,
     faulty_cameras,
 )
-from worldpose.store import Store
+from worldpose.camera_consistency.settings import ConsistencySettings
+from worldpose.store.store import Store
 
 
 @unit_task

@@ -18,11 +18,10 @@ from data_contracts.keypoints import EXTRA_ARRAYS, KeypointDetections
 from data_contracts.redetection import redetection_name
 from data_contracts.work import Work
 from tasks.unit import open_input
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.venue import Venue, join_cameras
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 PAGE = 256
 """Frames per read."""

@@ -19,25 +19,25 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.work import Work
 from tasks.spool import Spool, open_spool
 from tasks.unit import open_input, open_uncorrected, require_registered, unit_task
-from worldpose.detection import (
-    DetectionSettings,
-    People,
-    PeopleFinder,
-    Place,
+from worldpose.detection.interfaces import People
+from worldpose.detection.models import (
     load_detectors,
     load_landmarks,
     load_pose,
     load_score_map,
     weights_of,
 )
+from worldpose.detection.pipeline import PeopleFinder, Place
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import stretches
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store import Store
-from worldpose.video import FrameIndex, open_video
+from worldpose.store.store import Store
+from worldpose.video.files import FrameIndex
+from worldpose.video.folder import open_video
 
 
 @unit_task

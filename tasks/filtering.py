@@ -17,25 +17,23 @@ from tasks.clip_inputs import ChunkedRows, ClipInputs, load_dropped_boxes, open_
 from tasks.spool import open_spool
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, unit_task
-from worldpose.body_fitting import perceived_joints
+from worldpose.body_fitting.objective import perceived_joints
 from worldpose.compiled import map_in_threads
-from worldpose.filtering import (
-    BodyMotion,
+from worldpose.filtering.judging import (
     BodyViews,
-    FilteringSettings,
     Judgement,
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
-    learn_systematic_errors,
     measure_held_out,
     perceived_covariance,
     view_bodies,
-    watch_motion,
 )
+from worldpose.filtering.settings import FilteringSettings
+from worldpose.filtering.systematic_errors import BodyMotion, learn_systematic_errors, watch_motion
 from worldpose.review.identities import select_triangulated
-from worldpose.store import Store
-from worldpose.triangulation import TriangulationSettings
+from worldpose.store.store import Store
+from worldpose.triangulation.settings import TriangulationSettings
 
 PART = 64
 """Frames per part: 100 MB with 25 people and 16 cameras, for each of up to five at a time."""

@@ -11,7 +11,8 @@ from prefect import task
 
 from data_contracts.finetune import NetKind, NetVersion
 from worldpose.detection.models import BUNDLED_WEIGHTS
-from worldpose.training import FineTuningSettings, read_labels
+from worldpose.training.labels import read_labels
+from worldpose.training.settings import FineTuningSettings
 
 LOG = logging.getLogger("worldpose.finetune")
 

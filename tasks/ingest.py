@@ -13,10 +13,10 @@ from data_contracts.ingest import INGEST
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.work import Work
 from tasks.unit import require_registered, unit_task
-from worldpose.ingest import UnitFrames, read_observations
-from worldpose.ingest.footage import Footage, read_footage
+from worldpose.formats.keypoint_files import read_observations
+from worldpose.ingest.footage import Footage, UnitFrames, read_footage
 from worldpose.review.detections import DetectionEdit, replay_detections
-from worldpose.store import Store
+from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
 
 

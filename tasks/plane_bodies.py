@@ -15,18 +15,17 @@ from data_contracts.work import Work
 from tasks.body_fitting import find_same_body
 from tasks.broadcast_tracking import BroadcastInputs, open_broadcast
 from tasks.unit import figures_of, open_input, require_registered
-from worldpose.body_fitting import (
-    BodyFit,
-    PlaneEvidence,
-    fit_bodies_on_plane,
-    read_monocular,
-    report_fit,
-)
-from worldpose.broadcast_calibration import moving_from_arrays, static_covariance
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.body_fitting.body_fit import BodyFit
+from worldpose.body_fitting.fit_quality import report_fit
+from worldpose.body_fitting.monocular import read_monocular
+from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
+from worldpose.broadcast_calibration.calibration import moving_from_arrays
+from worldpose.broadcast_calibration.uncertainty import static_covariance
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
-from worldpose.store import ResultWriter, Store
+from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 
 
 def publish_plane_bodies(store: Store, work: Work, result: ResultWriter) -> None:

@@ -17,20 +17,17 @@ from data_contracts.work import Work
 from tasks.detection import footage_index, require_weights
 from tasks.static_calibration import clicked_markings, given_lens, open_still, require_picture
 from tasks.unit import open_input, unit_task
-from worldpose.detection import DetectionSettings, load_detectors
+from worldpose.detection.models import load_detectors
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_arrays
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import (
-    ProposalSettings,
-    StaticCalibrationSettings,
-    calibrate_camera,
-    propose_camera,
-)
-from worldpose.store import Store
-from worldpose.tracking import locate_feet
-from worldpose.video import open_video
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.proposal import propose_camera
+from worldpose.static_calibration.settings import ProposalSettings, StaticCalibrationSettings
+from worldpose.store.store import Store
+from worldpose.tracking.feet import locate_feet
+from worldpose.video.folder import open_video
 
 _NOT_PROPOSED: Mapping[str, Any] = {
     "drawn": {},

@@ -20,23 +20,21 @@ from tasks.clip_inputs import ADJUSTED
 from tasks.detection import footage_index, require_weights
 from tasks.triangulation import load_triangulation_settings
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.body_fitting import perceived_joints
-from worldpose.detection import DetectionSettings, Place, load_pose, load_score_map
-from worldpose.detection.settings import RedetectionSettings
-from worldpose.filtering import (
+from worldpose.body_fitting.objective import perceived_joints
+from worldpose.detection.models import load_pose, load_score_map
+from worldpose.detection.pipeline import Place
+from worldpose.detection.settings import DetectionSettings, RedetectionSettings
+from worldpose.filtering.judging import (
     BodyViews,
     Spread,
-    SystematicErrors,
     TriangulatedDetections,
-    ViewBias,
     learn_keypoint_spread,
     perceived_covariance,
     view_bodies,
-    watch_motion,
 )
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.pitch import PitchTemplate
+from worldpose.filtering.systematic_errors import SystematicErrors, ViewBias, watch_motion
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.pitch.template import PitchTemplate
 from worldpose.redetection import (
     Expected,
     MissingPeople,
@@ -47,9 +45,8 @@ from worldpose.redetection import (
     select_missing_people,
 )
 from worldpose.review.identities import select_triangulated
-from worldpose.store import Store
-from worldpose.video import open_video
-from worldpose.video.folder import some_pictures
+from worldpose.store.store import Store
+from worldpose.video.folder import open_video, some_pictures
 
 FEW: Final = 500
 """Minimum number of keypoints to estimate a camera's spread; below it the stated one is used

@@ -20,24 +20,23 @@ from tasks.body_fitting import FurtherArrays, open_people, publish_fit
 from tasks.clip_inputs import select_frames
 from tasks.plane_bodies import publish_plane_bodies
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.body_fitting import (
-    BodyFit,
-    BodyFittingSettings,
-    ClipEvidence,
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence
+from worldpose.body_fitting.bones import Shape, pool_shapes
+from worldpose.body_fitting.monocular import (
     MonocularEstimates,
     MonocularPoses,
+    place_monocular_poses,
+    read_monocular,
+)
+from worldpose.body_fitting.ray_constraints import (
     RayConstraints,
-    Shape,
     constrain_to_rays,
     identify_people,
-    place_monocular_poses,
-    pool_shapes,
-    read_monocular,
     shift_frames,
 )
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.store import Store
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.store.store import Store
 
 KNOWN: Final = 2.0
 """Frames with a larger expected reprojection error of players are left out [px]. Keypoint errors

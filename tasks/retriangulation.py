@@ -6,7 +6,7 @@ from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.work import Work
 from tasks.triangulation import load_triangulation_settings, write_joints
 from tasks.unit import unit_task
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @unit_task

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 class Spool:

@@ -21,27 +21,23 @@ from data_contracts.static_calibration import (
 from data_contracts.work import Work
 from tasks.unit import open_input, require_registered, unit_task
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
+from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.ingest.footage import read_still
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import (
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.proposal import Proposal, calibrate_proposal
+from worldpose.static_calibration.report import (
     CalibrationReport,
-    Proposal,
-    SeenPeople,
-    StaticCalibrationSettings,
-    calibrate_camera,
-    calibrate_proposal,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
-    decide_sides,
     given_attributes,
     left_out_attributes,
 )
-from worldpose.store import Store
-from worldpose.video import index_video, median_picture, open_video
-from worldpose.video.folder import some_pictures
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.static_calibration.sides import SeenPeople, decide_sides
+from worldpose.store.store import Store
+from worldpose.video.folder import index_video, median_picture, open_video, some_pictures
 
 STILL_FRAMES: Final = 25
 """Number of video frames for a median still."""

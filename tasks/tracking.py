@@ -16,7 +16,7 @@ from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.unit import figures_of, open_uncorrected, unit_task
 from worldpose.compiled import map_in_threads
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import (
     Identities,
     IdentityEdit,
@@ -24,23 +24,24 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.store import Store
-from worldpose.tracking import (
+from worldpose.store.store import Store
+from worldpose.tracking.diagnosis import diagnose_no_people
+from worldpose.tracking.feet import (
     FrameBlocks,
     GroundPositions,
-    PlaneClocks,
-    TrackingSettings,
-    TriangulatedPeople,
     count_covering_cameras,
-    describe_doubts,
-    diagnose_no_people,
-    estimate_plane_clocks,
     locate_feet,
+)
+from worldpose.tracking.ground_tracks import (
+    TriangulatedPeople,
     locate_tracks,
     track_on_plane,
-    track_people,
     triangulated_places,
 )
+from worldpose.tracking.joins import describe_doubts
+from worldpose.tracking.plane_clocks import PlaneClocks, estimate_plane_clocks
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""

@@ -16,16 +16,13 @@ from tasks.clip_inputs import ClipInputs, open_clip
 from tasks.spool import open_spool
 from tasks.unit import figures_of, open_input, unit_task
 from worldpose.review.identities import select_triangulated
-from worldpose.store import ResultWriter, Store
-from worldpose.triangulation import (
-    CameraClocks,
-    DetectorModel,
-    Smoothing,
-    Triangulation,
-    TriangulationSettings,
-    learn_clip,
-    reconstruct_chunks,
-)
+from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
+from worldpose.triangulation.chunking import learn_clip, reconstruct_chunks
+from worldpose.triangulation.clocks import CameraClocks
+from worldpose.triangulation.passes import DetectorModel, Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.smoothing import Smoothing
 
 
 @unit_task

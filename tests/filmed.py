@@ -4,8 +4,8 @@ import numpy as np
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.match import MatchSpec
-from worldpose.ingest import write_match
-from worldpose.video import write_video
+from worldpose.ingest.writing import write_match
+from worldpose.video.files import write_video
 
 SIZE = (64, 48)
 

@@ -6,9 +6,11 @@ import shutil
 from pathlib import Path
 
 from data_contracts.run import ResultManifest, RunRecord
-from worldpose.ingest import read_match, register_match
-from worldpose.store import Store, recipe_key
+from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.registration import register_match
 from worldpose.store.documents import seal
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 
 def copy_match(project, match_id, count):

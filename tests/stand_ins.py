@@ -4,9 +4,8 @@ from datetime import UTC, datetime
 
 from data_contracts.records import CONTRACT_VERSION
 from data_contracts.run import ResultManifest
-from worldpose.store import ResultId
 from worldpose.store.documents import digest, record_checksum, seal
-from worldpose.store.paths import MANIFEST
+from worldpose.store.paths import MANIFEST, ResultId
 from worldpose.store.writer import content_digest, stored_files
 
 

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from data_contracts.records import Record
-from worldpose.store import ResultId, Store
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
 
 _TRANSIENT_FIELDS = {
     "manifest": {"created_at", "seconds", "run_id", "checksum"},

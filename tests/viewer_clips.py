@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldpose.body import BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
 from worldpose.formats.viewer_file import ViewerClip, ViewerPerson
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 LOOKS_ALONG_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 INTRINSICS = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])

@@ -24,143 +24,104 @@ if TYPE_CHECKING:
     from data_contracts.keypoints import KeypointDetections as KeypointDetections
     from data_contracts.pitch import PitchSpec as PitchSpec
     from data_contracts.static_calibration import ClickedMarkings as ClickedMarkings
-    from worldpose.body import find_body as find_body
-    from worldpose.body_fitting import BodyFittingSettings as BodyFittingSettings
-    from worldpose.body_fitting import ClipEvidence as ClipEvidence
-    from worldpose.body_fitting import find_ray_constraints as find_ray_constraints
-    from worldpose.body_fitting import fit_bodies as fit_bodies
-    from worldpose.broadcast_calibration import (
+    from worldpose.body.body_file import find_body as find_body
+    from worldpose.body_fitting.body_fit import ClipEvidence as ClipEvidence
+    from worldpose.body_fitting.body_fit import fit_bodies as fit_bodies
+    from worldpose.body_fitting.ray_constraints import find_ray_constraints as find_ray_constraints
+    from worldpose.body_fitting.settings import BodyFittingSettings as BodyFittingSettings
+    from worldpose.broadcast_calibration.calibration import BroadcastClip as BroadcastClip
+    from worldpose.broadcast_calibration.calibration import (
+        calibrate_broadcast as calibrate_broadcast,
+    )
+    from worldpose.broadcast_calibration.settings import (
         BroadcastCalibrationSettings as BroadcastCalibrationSettings,
     )
-    from worldpose.broadcast_calibration import BroadcastClip as BroadcastClip
-    from worldpose.broadcast_calibration import calibrate_broadcast as calibrate_broadcast
-    from worldpose.bundle_adjustment import BundleAdjustmentSettings as BundleAdjustmentSettings
-    from worldpose.bundle_adjustment import Clicks as Clicks
-    from worldpose.bundle_adjustment import Clip as Clip
-    from worldpose.bundle_adjustment import adjust_cameras as adjust_cameras
-    from worldpose.detection import DetectionSettings as DetectionSettings
-    from worldpose.detection import detect_people as detect_people
+    from worldpose.bundle_adjustment.adjustment import adjust_cameras as adjust_cameras
+    from worldpose.bundle_adjustment.clip import Clicks as Clicks
+    from worldpose.bundle_adjustment.clip import Clip as Clip
+    from worldpose.bundle_adjustment.settings import (
+        BundleAdjustmentSettings as BundleAdjustmentSettings,
+    )
+    from worldpose.detection.pipeline import detect_people as detect_people
+    from worldpose.detection.settings import DetectionSettings as DetectionSettings
     from worldpose.errors import InputError as InputError
-    from worldpose.evaluation import EvaluationSettings as EvaluationSettings
-    from worldpose.evaluation import evaluate_joints as evaluate_joints
-    from worldpose.formats import JointTracks as JointTracks
-    from worldpose.formats import read_joints as read_joints
-    from worldpose.formats import write_joints as write_joints
+    from worldpose.evaluation.matching import EvaluationSettings as EvaluationSettings
+    from worldpose.evaluation.metrics import evaluate_joints as evaluate_joints
     from worldpose.formats.calibration_forms import read_cameras as read_cameras
-    from worldpose.geometry import Camera as Camera
-    from worldpose.geometry import Rigid as Rigid
-    from worldpose.ingest import MatchFolder as MatchFolder
-    from worldpose.ingest import read_match as read_match
-    from worldpose.ingest import read_observations as read_observations
-    from worldpose.ingest import read_unit as read_unit
+    from worldpose.formats.joints_file import JointTracks as JointTracks
+    from worldpose.formats.joints_file import read_joints as read_joints
+    from worldpose.formats.joints_file import write_joints as write_joints
+    from worldpose.formats.keypoint_files import read_observations as read_observations
+    from worldpose.geometry.cameras import Camera as Camera
+    from worldpose.geometry.rigid import Rigid as Rigid
     from worldpose.ingest.footage import read_still as read_still
-    from worldpose.pitch import PitchTemplate as PitchTemplate
-    from worldpose.static_calibration import StaticCalibrationSettings as StaticCalibrationSettings
-    from worldpose.static_calibration import calibrate_camera as calibrate_camera
+    from worldpose.ingest.footage import read_unit as read_unit
+    from worldpose.ingest.match_folder import MatchFolder as MatchFolder
+    from worldpose.ingest.match_folder import read_match as read_match
+    from worldpose.pitch.template import PitchTemplate as PitchTemplate
+    from worldpose.static_calibration.calibration import calibrate_camera as calibrate_camera
+    from worldpose.static_calibration.settings import (
+        StaticCalibrationSettings as StaticCalibrationSettings,
+    )
     from worldpose.store.store import open_run as open_run
-    from worldpose.tracking import TrackingSettings as TrackingSettings
-    from worldpose.tracking import track_people as track_people
-    from worldpose.triangulation import TriangulationSettings as TriangulationSettings
-    from worldpose.triangulation import reconstruct_joints as reconstruct_joints
-    from worldpose.triangulation import triangulate_joints as triangulate_joints
-    from worldpose.triangulation import undo_swaps as undo_swaps
-    from worldpose.video import open_video as open_video
+    from worldpose.tracking.settings import TrackingSettings as TrackingSettings
+    from worldpose.tracking.tracker import track_people as track_people
+    from worldpose.triangulation.chunking import reconstruct_joints as reconstruct_joints
+    from worldpose.triangulation.limb_lengths import undo_swaps as undo_swaps
+    from worldpose.triangulation.passes import triangulate_joints as triangulate_joints
+    from worldpose.triangulation.settings import TriangulationSettings as TriangulationSettings
+    from worldpose.video.folder import open_video as open_video
 
     __version__: str
 
 _MODULES: Final = {
-    "BodyFittingSettings": "worldpose.body_fitting",
-    "BroadcastCalibrationSettings": "worldpose.broadcast_calibration",
-    "BroadcastClip": "worldpose.broadcast_calibration",
-    "BundleAdjustmentSettings": "worldpose.bundle_adjustment",
-    "Camera": "worldpose.geometry",
+    "BodyFittingSettings": "worldpose.body_fitting.settings",
+    "BroadcastCalibrationSettings": "worldpose.broadcast_calibration.settings",
+    "BroadcastClip": "worldpose.broadcast_calibration.calibration",
+    "BundleAdjustmentSettings": "worldpose.bundle_adjustment.settings",
+    "Camera": "worldpose.geometry.cameras",
     "ClickedMarkings": "data_contracts.static_calibration",
-    "Clicks": "worldpose.bundle_adjustment",
-    "Clip": "worldpose.bundle_adjustment",
-    "ClipEvidence": "worldpose.body_fitting",
-    "DetectionSettings": "worldpose.detection",
-    "EvaluationSettings": "worldpose.evaluation",
+    "Clicks": "worldpose.bundle_adjustment.clip",
+    "Clip": "worldpose.bundle_adjustment.clip",
+    "ClipEvidence": "worldpose.body_fitting.body_fit",
+    "DetectionSettings": "worldpose.detection.settings",
+    "EvaluationSettings": "worldpose.evaluation.matching",
     "InputError": "worldpose.errors",
-    "JointTracks": "worldpose.formats",
+    "JointTracks": "worldpose.formats.joints_file",
     "KeyFrame": "data_contracts.broadcast_calibration",
     "KeypointDetections": "data_contracts.keypoints",
-    "MatchFolder": "worldpose.ingest",
+    "MatchFolder": "worldpose.ingest.match_folder",
     "PitchSpec": "data_contracts.pitch",
-    "PitchTemplate": "worldpose.pitch",
-    "Rigid": "worldpose.geometry",
-    "StaticCalibrationSettings": "worldpose.static_calibration",
-    "TrackingSettings": "worldpose.tracking",
-    "TriangulationSettings": "worldpose.triangulation",
-    "adjust_cameras": "worldpose.bundle_adjustment",
-    "calibrate_broadcast": "worldpose.broadcast_calibration",
-    "calibrate_camera": "worldpose.static_calibration",
-    "detect_people": "worldpose.detection",
-    "evaluate_joints": "worldpose.evaluation",
-    "find_body": "worldpose.body",
-    "find_ray_constraints": "worldpose.body_fitting",
-    "fit_bodies": "worldpose.body_fitting",
+    "PitchTemplate": "worldpose.pitch.template",
+    "Rigid": "worldpose.geometry.rigid",
+    "StaticCalibrationSettings": "worldpose.static_calibration.settings",
+    "TrackingSettings": "worldpose.tracking.settings",
+    "TriangulationSettings": "worldpose.triangulation.settings",
+    "adjust_cameras": "worldpose.bundle_adjustment.adjustment",
+    "calibrate_broadcast": "worldpose.broadcast_calibration.calibration",
+    "calibrate_camera": "worldpose.static_calibration.calibration",
+    "detect_people": "worldpose.detection.pipeline",
+    "evaluate_joints": "worldpose.evaluation.metrics",
+    "find_body": "worldpose.body.body_file",
+    "find_ray_constraints": "worldpose.body_fitting.ray_constraints",
+    "fit_bodies": "worldpose.body_fitting.body_fit",
     "open_run": "worldpose.store.store",
-    "open_video": "worldpose.video",
+    "open_video": "worldpose.video.folder",
     "read_cameras": "worldpose.formats.calibration_forms",
-    "read_joints": "worldpose.formats",
-    "read_match": "worldpose.ingest",
-    "read_observations": "worldpose.ingest",
+    "read_joints": "worldpose.formats.joints_file",
+    "read_match": "worldpose.ingest.match_folder",
+    "read_observations": "worldpose.formats.keypoint_files",
     "read_still": "worldpose.ingest.footage",
-    "read_unit": "worldpose.ingest",
-    "reconstruct_joints": "worldpose.triangulation",
-    "track_people": "worldpose.tracking",
-    "triangulate_joints": "worldpose.triangulation",
-    "undo_swaps": "worldpose.triangulation",
-    "write_joints": "worldpose.formats",
+    "read_unit": "worldpose.ingest.footage",
+    "reconstruct_joints": "worldpose.triangulation.chunking",
+    "track_people": "worldpose.tracking.tracker",
+    "triangulate_joints": "worldpose.triangulation.passes",
+    "undo_swaps": "worldpose.triangulation.limb_lengths",
+    "write_joints": "worldpose.formats.joints_file",
 }
 """Module of each name, imported on first use: `import worldpose` alone takes a few milliseconds."""
 
-__all__ = [
-    "BodyFittingSettings",
-    "BroadcastCalibrationSettings",
-    "BroadcastClip",
-    "BundleAdjustmentSettings",
-    "Camera",
-    "ClickedMarkings",
-    "Clicks",
-    "Clip",
-    "ClipEvidence",
-    "DetectionSettings",
-    "EvaluationSettings",
-    "InputError",
-    "JointTracks",
-    "KeyFrame",
-    "KeypointDetections",
-    "MatchFolder",
-    "PitchSpec",
-    "PitchTemplate",
-    "Rigid",
-    "StaticCalibrationSettings",
-    "TrackingSettings",
-    "TriangulationSettings",
-    "__version__",
-    "adjust_cameras",
-    "calibrate_broadcast",
-    "calibrate_camera",
-    "detect_people",
-    "evaluate_joints",
-    "find_body",
-    "find_ray_constraints",
-    "fit_bodies",
-    "open_run",
-    "open_video",
-    "read_cameras",
-    "read_joints",
-    "read_match",
-    "read_observations",
-    "read_still",
-    "read_unit",
-    "reconstruct_joints",
-    "track_people",
-    "triangulate_joints",
-    "undo_swaps",
-    "write_joints",
-]
+__all__ = ["__version__", *_MODULES]
 
 
 def __getattr__(name: str) -> object:

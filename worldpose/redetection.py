@@ -16,21 +16,16 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, Flags, Floats, Image
 from data_contracts.conventions import COCO17_BONES, COCO17_TORSO
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import People, Place, PoseEstimator
-from worldpose.detection.pipeline import on_pitch
+from worldpose.detection.interfaces import People, PoseEstimator
+from worldpose.detection.pipeline import Place, on_pitch
 from worldpose.detection.settings import RedetectionSettings
 from worldpose.detection.suppression import (
     combine_boxes,
     object_keypoint_similarity,
     surest_confidence,
 )
-from worldpose.filtering import (
-    BodyViews,
-    FilteringSettings,
-    Spread,
-    TriangulatedDetections,
-    judge_detections,
-)
+from worldpose.filtering.judging import BodyViews, Spread, TriangulatedDetections, judge_detections
+from worldpose.filtering.settings import FilteringSettings
 from worldpose.geometry.boxes import box_areas, box_iou
 
 BOX_MARGINS: Final = (0.12, 0.20, 0.12, 0.10)

@@ -9,7 +9,7 @@ import typer
 
 from flows.cli.console import JsonOption, line, print_json
 from flows.cli.options import BodyFolderOption
-from worldpose.body import body_path, install_body
+from worldpose.body.body_file import body_path, install_body
 
 commands = typer.Typer(name="body", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 

@@ -10,7 +10,7 @@ import typer
 from data_contracts.arrays import Image
 from flows.cli.console import JsonOption, line, print_json, print_table
 from worldpose.errors import InputError, UsageError
-from worldpose.video import is_video
+from worldpose.video.names import is_video
 
 if TYPE_CHECKING:
     from worldpose.static_calibration.boards import Board, BoardView, LensFit
@@ -148,7 +148,7 @@ def _read_views(
         InputError: an image is unreadable, or images have several sizes.
     """
     from worldpose.static_calibration.boards import choose_views
-    from worldpose.video import VideoReader, index_frames
+    from worldpose.video.files import VideoReader, index_frames
 
     if place.is_file():
         index = index_frames(place)

@@ -23,7 +23,7 @@ from flows.cli.console import (
 from worldpose.errors import UsageError
 
 if TYPE_CHECKING:
-    from worldpose.training import FineTuningSettings
+    from worldpose.training.settings import FineTuningSettings
 
 SETTING = {"people": "detection.detector", "keypoints": "detection.pose"}
 """Setting that selects each net in a run."""
@@ -51,7 +51,7 @@ def label(
 
     Example: worldpose label cam00.mp4 cam01.mp4 --out labels
     """
-    from worldpose.detection import DetectionSettings
+    from worldpose.detection.settings import DetectionSettings
     from worldpose.training.labels import propose_labels
 
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
@@ -173,7 +173,7 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
     Raises:
         UsageError: an unknown setting, or an invalid value.
     """
-    from worldpose.training import FineTuningSettings
+    from worldpose.training.settings import FineTuningSettings
 
     groups: dict[str, dict[str, JsonValue]] = {"": {}, "training": {}}
     for assignment in assignments:

@@ -24,7 +24,7 @@ from flows.results.comparison import (
     largest_pose_changes,
 )
 from flows.settings import parse_overrides
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def diff(

@@ -28,7 +28,7 @@ from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.stage import Match
 from worldpose.errors import InputError, UsageError
-from worldpose.store import Run, Store
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from worldpose.bundle_adjustment.people_cameras import CamerasFromPeople, KnownLength

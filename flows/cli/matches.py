@@ -26,16 +26,11 @@ from flows.cli.console import (
 from flows.registering import register
 from flows.stage import Match
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.ingest import (
-    import_boxes,
-    import_clicks,
-    import_lenses,
-    import_match,
-    import_pose2sim,
-    import_videos,
-    unclicked_clips,
-)
-from worldpose.store import Store
+from worldpose.ingest.clicks import import_clicks
+from worldpose.ingest.importing import import_lenses, import_match, import_pose2sim, import_videos
+from worldpose.ingest.match_folder import unclicked_clips
+from worldpose.ingest.writing import import_boxes
+from worldpose.store.store import Store
 
 
 def simulate(
@@ -84,8 +79,9 @@ def simulate(
 
     Example: worldpose simulate --scenario tiny --seed 1 --out matches/tiny
     """
-    from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-    from worldpose.simulation.foreign import FOREIGN_SCENARIOS, simulate_foreign_match
+    from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_match
+    from worldpose.simulation.matches import MatchOptions, simulate_match
+    from worldpose.simulation.scenarios import SCENARIOS
 
     about = {name: each.about for name, each in (SCENARIOS | FOREIGN_SCENARIOS).items()}
     if scenario == "list":
@@ -411,7 +407,7 @@ def _import_clicks(file: Path, out: Path, camera: str | None, *, as_json: bool) 
 
 def import_pitch(survey: Path, out: Path, *, left_handed: bool, as_json: bool) -> None:
     """Align a survey with the world frame, write pitch.json and print the residuals."""
-    from worldpose.formats import whole_file
+    from worldpose.formats.files import whole_file
     from worldpose.ingest.pitch_file import refuse_unread_pitch
     from worldpose.pitch.survey import SurveySettings, fit_survey, read_survey
 

@@ -11,8 +11,9 @@ from data_contracts.pin import Pin
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, line, print_json
 from flows.lineage import find_run
 from worldpose.errors import UsageError
-from worldpose.store import Store, pin_run, unpin_run
 from worldpose.store.paths import checked_name
+from worldpose.store.runs import pin_run, unpin_run
+from worldpose.store.store import Store
 
 
 def pin(

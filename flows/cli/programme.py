@@ -50,7 +50,7 @@ def clips(
         return
     from flows.results.outputs import claim_file
     from worldpose.broadcast_calibration.shots import find_shots
-    from worldpose.video import index_frames
+    from worldpose.video.files import index_frames
 
     claim_file(sheet, str(programme.resolve()))
 
@@ -72,7 +72,7 @@ def clips(
         )
     proposed = [shot for shot in shots if not shot.unfit]
     if sheet is not None:
-        from worldpose.formats import whole_file
+        from worldpose.formats.files import whole_file
         from worldpose.reports.broadcast import programme_sheet
 
         with whole_file(sheet) as draft:
@@ -115,7 +115,7 @@ def clips(
 
 def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Yield all images, downscaled, with progress on a terminal; add undecodable ones to `lost`."""
-    from worldpose.video import VideoReader
+    from worldpose.video.files import VideoReader
 
     with (
         VideoReader(programme) as video,
@@ -131,7 +131,7 @@ def _pictures(programme: Path, lost: list[int]) -> Iterator[tuple[int, NDArray[n
 
 def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
     """Cut a range of images out, and print the entry for match.yaml."""
-    from worldpose.formats import whole_file
+    from worldpose.formats.files import whole_file
     from worldpose.video.files import cut_video
 
     first, _, stop = take.partition(":")

@@ -23,9 +23,12 @@ from flows.review.verdicts import still_waiting
 from flows.run_record import latest_run, resolve_settings
 from flows.run_status import UnitState, list_unit_states
 from worldpose.errors import WorldposeError
-from worldpose.store import Store, collect, list_pins, plan_gc, repair
-from worldpose.store import verify as verify_store
+from worldpose.store.garbage import collect, plan_gc
+from worldpose.store.integrity import repair
+from worldpose.store.integrity import verify as verify_store
 from worldpose.store.paths import damaged_path
+from worldpose.store.runs import list_pins
+from worldpose.store.store import Store
 
 
 def init(

@@ -26,7 +26,7 @@ from flows.reprocess import Reprocessed, reprocess_matches
 from flows.run_status import RunStatus
 from flows.running import RunRequest
 from flows.settings import parse_overrides
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 MAX_REASONS: Final = 3
 """Printed reasons per unit; --json has them all."""

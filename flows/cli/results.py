@@ -22,8 +22,8 @@ from flows.cli.console import (
     print_json,
 )
 from worldpose.errors import InputError, UsageError
-from worldpose.store import Store
 from worldpose.store.runs import LATEST
+from worldpose.store.store import Store
 
 OverwriteOption = Annotated[
     bool,

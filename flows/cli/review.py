@@ -40,7 +40,7 @@ from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 commands = typer.Typer(
     name="review",

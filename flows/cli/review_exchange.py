@@ -13,7 +13,7 @@ from flows.review.descriptions import correction_json, in_words
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, Format
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 MatchId = Annotated[str, typer.Argument(metavar="MATCH", help="Id of a registered match.")]
 FormatOption = Annotated[str, typer.Option("--format", help=f"{', '.join(FORMATS)}.")]

@@ -44,7 +44,7 @@ from flows.run_record import latest_run, require_no_other_run
 from flows.running import RunRequest, kept_iterations, run_match
 from flows.settings import parse_overrides, selected_stages
 from worldpose.errors import UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 if TYPE_CHECKING:
     from flows.results.comparison import Mark

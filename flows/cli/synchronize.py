@@ -29,9 +29,9 @@ from flows.running import RunRequest, run_match
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
 from worldpose.errors import InputError, UsageError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Run, Store
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.store.store import Run, Store
 
 MIN_OFFSET_FRAMES = 0.1
 """Remaining offset that is worth a correction [frame]."""

@@ -16,7 +16,7 @@ from flows.cli.console import (
 )
 from flows.registering import find_registration
 from flows.results.timings import run_time
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def timings(

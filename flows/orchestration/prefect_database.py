@@ -30,7 +30,7 @@ def begin_database(home: Path) -> bool:
         StoreError: `home` is not writable.
     """
     # Imported here and below: with them, the server's process would import numba and scipy.
-    from worldpose.formats import whole_file
+    from worldpose.formats.files import whole_file
     from worldpose.store.blobs import storage_errors
 
     kept = kept_database()
@@ -48,7 +48,7 @@ def begin_database(home: Path) -> bool:
 
 def keep_database(home: Path) -> None:
     """Keep a copy of the unused database that a server has created in `home`."""
-    from worldpose.formats import whole_file
+    from worldpose.formats.files import whole_file
 
     kept = kept_database()
     if kept is None or not (home / DATABASE).exists():

@@ -27,10 +27,9 @@ from data_contracts.run import WaitingUnit
 from flows.orchestration.result_pages import PAGE, page_offsets
 from flows.review.metric_words import all_reasons
 from worldpose.errors import WorldposeError
-from worldpose.review import Journal, say
-from worldpose.store import Store
+from worldpose.review.journal import Journal, say
 from worldpose.store.documents import canonical_json, digest
-from worldpose.store.store import open_blobs
+from worldpose.store.store import Store, open_blobs
 
 PATIENCE: Final = timedelta(days=90)
 """Prefect cannot resume a run after a longer suspension; a new run continues equally well."""

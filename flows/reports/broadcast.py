@@ -21,13 +21,13 @@ from flows.results.best_results import (
 )
 from flows.stage import Match
 from flows.stages.detection import seen_in_broadcast
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings, camera_before
+from worldpose.broadcast_calibration.calibration import camera_before
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.tracking import follow, modified_z_scores
-from worldpose.formats import JointTracks, whole_file
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.ingest import unit_frames
-from worldpose.reports import CaptionedImage
+from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.ingest.footage import unit_frames
 from worldpose.reports.broadcast import (
     camera_angles,
     largest_pose_changes,
@@ -36,10 +36,11 @@ from worldpose.reports.broadcast import (
     plot_flow,
 )
 from worldpose.reports.clips import plot_camera_view
-from worldpose.reports.html_page import Table
+from worldpose.reports.html_page import CaptionedImage, Table
 from worldpose.reports.videos import overlay_frames
-from worldpose.store import Run
-from worldpose.video import open_video, write_video
+from worldpose.store.store import Run
+from worldpose.video.files import write_video
+from worldpose.video.folder import open_video
 
 WORST_FRAMES: Final = 2
 """Number of frames shown with the largest camera uncertainty [1]."""

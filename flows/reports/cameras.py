@@ -12,10 +12,9 @@ from data_contracts.match import MatchSpec
 from flows.reports.match_pictures import background_image
 from flows.results.best_results import estimated_pitch
 from flows.stage import Match
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.reports import CameraSummary, CaptionedImage
-from worldpose.reports.html_page import Table
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.reports.html_page import CaptionedImage, Table
+from worldpose.reports.run_report import CameraSummary
 from worldpose.reports.static_cameras import (
     NEAR_PAINT_PX,
     Click,
@@ -24,7 +23,7 @@ from worldpose.reports.static_cameras import (
     plot_paint,
 )
 from worldpose.static_calibration.proposal import PROPOSED
-from worldpose.store import Run, Store
+from worldpose.store.store import Run, Store
 
 MAX_CAMERAS = 2
 """Number of cameras shown with their clicks, weakest first."""

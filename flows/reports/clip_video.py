@@ -20,10 +20,10 @@ from flows.results.best_results import (
     static_cameras,
 )
 from flows.stage import Match
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames
-from worldpose.store import Run, Store
-from worldpose.video import write_video
+from worldpose.store.store import Run, Store
+from worldpose.video.files import write_video
 
 MAX_VIDEO_S: Final = 30.0
 """Maximum duration [s]; a longer clip is cut to the middle part."""

@@ -17,9 +17,8 @@ from flows.results.best_results import (
 )
 from flows.stage import Match
 from flows.stages.redetection import seen_in
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.reports import CaptionedImage
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, plot_bodies
 from worldpose.reports.clips import (
     ImageDetections,
@@ -29,7 +28,8 @@ from worldpose.reports.clips import (
     plot_paths,
     plot_stadium,
 )
-from worldpose.store import Run, Store
+from worldpose.reports.html_page import CaptionedImage
+from worldpose.store.store import Run, Store
 
 
 def clip_pictures(

@@ -10,10 +10,10 @@ from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import clip_title, estimated_pitch, joint_tracks, static_cameras
 from flows.stage import Match
 from flows.stages.redetection import seen_in
-from worldpose.formats import JointTracks
-from worldpose.reports import CaptionedImage
+from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import ImageDetections, ReconstructedPeople, plot_detections
-from worldpose.store import Run, Store
+from worldpose.reports.html_page import CaptionedImage
+from worldpose.store.store import Run, Store
 
 MAX_VIEWS: Final = 2
 """Number of views shown: the worst, each of another person."""

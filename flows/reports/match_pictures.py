@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.stage import Match
-from worldpose.ingest import unit_frames
-from worldpose.ingest.footage import read_still
-from worldpose.store import Store
-from worldpose.video import open_video
+from worldpose.ingest.footage import read_still, unit_frames
+from worldpose.store.store import Store
+from worldpose.video.folder import open_video
 
 
 def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.uint8] | None:

@@ -18,7 +18,7 @@ from flows.results.best_results import (
 from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
 from worldpose.reports.run_report import format_number
-from worldpose.store import Run
+from worldpose.store.store import Run
 
 MAX_ROWS = 20
 """Maximum number of rows of the outlier lists, worst first."""

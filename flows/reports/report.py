@@ -42,12 +42,12 @@ from flows.review.descriptions import in_words, is_first_click, when
 from flows.stage import Match
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics, kind_of
 from worldpose.errors import UsageError
-from worldpose.formats import whole_file
-from worldpose.reports import CaptionedImage, LinkedFile, Section, Table, report_page
+from worldpose.formats.files import whole_file
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.drawing import keep_figures, write_figure
-from worldpose.reports.run_report import camera_table
-from worldpose.store import Run, Store
+from worldpose.reports.html_page import CaptionedImage, LinkedFile, Section, Table
+from worldpose.reports.run_report import camera_table, report_page
+from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,9 +26,9 @@ from flows.results.best_results import (
 )
 from flows.results.tool_exports import describe_clip
 from flows.stage import Match
-from worldpose.body import BodyModel, BodyParameters
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import UsageError
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
 from worldpose.formats.viewer_file import (
     ViewerClip,
@@ -36,9 +36,9 @@ from worldpose.formats.viewer_file import (
     viewer_pieces,
     write_viewer,
 )
-from worldpose.ingest import read_match
-from worldpose.reports import EmbeddedPage
-from worldpose.store import Run
+from worldpose.ingest.match_folder import read_match
+from worldpose.reports.html_page import EmbeddedPage
+from worldpose.store.store import Run
 
 REPORT_POSES: Final = 100_000
 """Maximum people times frames in a report's 3D view: about 30 MB of text."""

@@ -8,30 +8,29 @@ from typing import Final
 
 import numpy as np
 
-from worldpose.body import find_body
-from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
-from worldpose.bundle_adjustment import (
-    BundleAdjustmentSettings,
-    Clicks,
-    Clip,
-    adjust_cameras,
-    marking_errors,
-)
+from worldpose.body.body_file import find_body
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.report import marking_errors
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import InputError
-from worldpose.evaluation import evaluate_cameras, evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.evaluation.cameras import evaluate_cameras
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration import (
-    StaticCalibration,
-    StaticCalibrationSettings,
-    calibrate_camera,
-)
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 SCENARIO: Final = "penalty-box"
 CLICKS: Final = {

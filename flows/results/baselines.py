@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from data_contracts.evaluation import Evaluation, MethodScore
 from flows.results.evaluation import cameras_of, reference_side
-from worldpose.body import OPEN_BODY, find_body
+from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.errors import UsageError
-from worldpose.evaluation import EvaluationSettings, evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.formats.baselines import Method, MethodResult, find_method, resample_result
+from worldpose.evaluation.matching import EvaluationSettings
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.baselines import Method, find_method
+from worldpose.formats.baselines.result import MethodResult, resample_result
 from worldpose.formats.challenge import RELEASE_SIZE
-from worldpose.geometry import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 
 
 def score_methods(

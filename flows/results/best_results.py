@@ -16,17 +16,18 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.run import BODY_STAGES, JOINT_STAGES, RunRecord, RunState
 from data_contracts.tracking import Track
 from flows.stage import Match
-from worldpose.body import BodyModel, BodyParameters, find_body
-from worldpose.body_fitting import perceived_joints, perceived_points, random_covariance
+from worldpose.body.body_file import find_body
+from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.body_fitting.body_fit import random_covariance
+from worldpose.body_fitting.extra_points import perceived_points
+from worldpose.body_fitting.objective import perceived_joints
 from worldpose.errors import InputError, UsageError
-from worldpose.formats import JointTracks
-from worldpose.formats.joints_file import ExtraTracks, fill_gaps
+from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store import Run, Store, open_run
 from worldpose.store.runs import LATEST
+from worldpose.store.store import Run, Store, open_run
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -21,8 +21,8 @@ from data_contracts.arrays import Floats
 from data_contracts.run import BODY_STAGES, RunRecord
 from flows.registering import find_registration
 from flows.results.best_results import bodies_unit, static_cameras
-from worldpose.geometry import Camera
-from worldpose.store import Run, Store
+from worldpose.geometry.cameras import Camera
+from worldpose.store.store import Run, Store
 
 Kind = Literal["match", "clip", "camera", "player"]
 Mark = Literal["better", "worse", "mixed", "unchanged", "only in A", "only in B"]

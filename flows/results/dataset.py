@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_contracts.release import CheckReport, DataSetStatistics, Finding
-from worldpose.body import OPEN_BODY, find_body
+from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.dataset.check import check_clip
 from worldpose.dataset.contents import list_clips, read_clip
 from worldpose.dataset.faults import CheckSettings

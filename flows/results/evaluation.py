@@ -19,7 +19,7 @@ from flows.results.best_results import (
     static_cameras,
 )
 from worldpose.errors import InputError, UsageError
-from worldpose.evaluation import CameraScore, PersonScore, evaluate_cameras, evaluate_joints
+from worldpose.evaluation.cameras import CameraScore, evaluate_cameras
 from worldpose.evaluation.marker_reference import (
     SUFFIXES,
     ReferenceAlignment,
@@ -29,12 +29,14 @@ from worldpose.evaluation.marker_reference import (
     read_marker_map,
     read_markers,
 )
-from worldpose.formats import JointTracks, read_camera, read_joints
-from worldpose.geometry import Camera
-from worldpose.ingest import MatchFolder, read_match
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Store
+from worldpose.evaluation.metrics import PersonScore, evaluate_joints
+from worldpose.formats.challenge import read_camera
+from worldpose.formats.joints_file import JointTracks, read_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.match_folder import MatchFolder, read_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import LATEST
+from worldpose.store.store import Store
 
 
 @dataclass(frozen=True, eq=False)

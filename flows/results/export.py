@@ -44,7 +44,6 @@ from worldpose.dataset.manifest import (
     write_origins,
 )
 from worldpose.errors import InputError, UsageError
-from worldpose.formats import coco_dataset, write_coco, write_joints
 from worldpose.formats.baselines.result import (
     write_baseline_settings,
     write_slahmr_cameras,
@@ -62,13 +61,15 @@ from worldpose.formats.challenge import (
     write_submission,
 )
 from worldpose.formats.files import FULL
-from worldpose.formats.joints_file import write_poses
+from worldpose.formats.joints_file import write_joints, write_poses
+from worldpose.formats.motion_capture import coco_dataset, write_coco
 from worldpose.formats.tables import write_positions
-from worldpose.ingest import read_match
+from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Store, pin_run
-from worldpose.video import write_video
+from worldpose.pitch.template import PitchTemplate
+from worldpose.store.runs import pin_run
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
 
 PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""

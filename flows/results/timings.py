@@ -8,7 +8,7 @@ from typing import Self
 
 from data_contracts.run import ResultManifest
 from flows.method import METHOD
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @dataclass(frozen=True)

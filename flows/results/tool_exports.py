@@ -23,7 +23,7 @@ from flows.results.best_results import (
     person_kinds,
     static_cameras,
 )
-from worldpose.body import BodyModel
+from worldpose.body.model import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
@@ -43,9 +43,9 @@ from worldpose.formats.tables import (
     write_parquet,
 )
 from worldpose.formats.usd_file import write_usd
-from worldpose.geometry import Camera
-from worldpose.ingest import read_match
-from worldpose.store import Run
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Run
 
 if TYPE_CHECKING:
     import pandas as pd

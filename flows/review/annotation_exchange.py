@@ -17,17 +17,10 @@ from flows.review.corrections import keep_edits
 from flows.review.detections import detections_now
 from flows.stage import Match
 from worldpose.errors import UsageError
-from worldpose.formats.annotations import (
-    AnnotatedImage,
-    AnnotatedPerson,
-    Format,
-    format_suffix,
-    read_annotations,
-    write_annotations,
-)
-from worldpose.formats.annotations.annotated_images import SEEN
+from worldpose.formats.annotations import Format, format_suffix, read_annotations, write_annotations
+from worldpose.formats.annotations.annotated_images import SEEN, AnnotatedImage, AnnotatedPerson
 from worldpose.review.detections import DETECTION_EDITS, Changes, find_changes, image_name
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 EXPORTED: Final = "exported.json"
 """Record of the export, next to the annotation file; the import compares against it."""

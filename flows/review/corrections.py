@@ -14,19 +14,12 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import require_fitting
 from flows.stage import Match
 from worldpose.errors import InputError
-from worldpose.ingest import MatchFolder
-from worldpose.review import (
-    Journal,
-    Replay,
-    add_previous_value,
-    append,
-    current_value,
-    read_journal,
-    replay_corrections,
-)
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.review.clicks import Replay, add_previous_value, current_value, replay_corrections
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.store import Store
+from worldpose.review.journal import Journal, append, read_journal
+from worldpose.store.store import Store
 
 
 def corrected_match(store: Store, folder: MatchFolder, registration: Registration) -> Match:

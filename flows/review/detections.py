@@ -17,14 +17,15 @@ from flows.stage import Match
 from flows.stages.detection import seen_by, seen_in_broadcast
 from flows.stages.ingest import edits_by_camera
 from worldpose.errors import InputError
-from worldpose.review import say
 from worldpose.review.detections import (
     DETECTION_EDITS,
     DetectionEdit,
     find_objection,
     replay_detections,
 )
-from worldpose.store import Store, recipe_key
+from worldpose.review.journal import say
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 if TYPE_CHECKING:
     import xarray as xr

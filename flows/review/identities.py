@@ -18,7 +18,8 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.store import Store, recipe_key
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 
 def identities_now(store: Store, match: Match, clip: str) -> IdentityReplay:

@@ -9,13 +9,13 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.annotations import clicked_file, read_clicked_markings
 from worldpose.ingest.clicks import RepeatedClick
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
 
 NAMED_WITHIN_M: Final = 1.0
 """Maximum distance to a point of the pitch at which a place has the point's name [m]."""

@@ -27,10 +27,11 @@ from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
 from worldpose.errors import InputError, StoreError
-from worldpose.review import Journal, last_decision, requests_by_id, say
 from worldpose.review.detections import DETECTION_EDITS
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.store import Store, recipe_key
+from worldpose.review.journal import Journal, last_decision, requests_by_id, say
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 State = Literal["waits", "corrected", "approve", "reject", "superseded"]
 

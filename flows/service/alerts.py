@@ -17,7 +17,7 @@ from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
 from flows.service.plan import ServePlan
 from flows.service.senders import Sender
-from worldpose.formats import whole_file
+from worldpose.formats.files import whole_file
 
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
 

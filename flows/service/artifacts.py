@@ -18,7 +18,7 @@ from flows.progress import Reporter, format_duration, reporting_to
 from flows.review.metric_words import in_short
 from flows.service.match_runs import artifact_key
 from flows.service.overview import Overview
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LOG = logging.getLogger("worldpose.operations")
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from flows.service.layout import PRIORITIES, StateFolder
 from worldpose.errors import InputError, UsageError
-from worldpose.formats import whole_file
+from worldpose.formats.files import whole_file
 from worldpose.store.blobs import Entry
 from worldpose.store.objects import ObjectBlobs
 from worldpose.store.paths import checked_path

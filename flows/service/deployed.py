@@ -40,7 +40,7 @@ from flows.settings import selected_stages
 from flows.stage import Match
 from tasks.tracing import start_tracing
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.store import Store, open_run
+from worldpose.store.store import Store, open_run
 
 NAME: Final = TypeAdapter(Name)
 LOG = logging.getLogger("worldpose.operations")
@@ -351,7 +351,7 @@ def finetune(
         starts: net to its initial weights, if not the shipped ones.
     """
     from flows.finetune import FOLDER, fine_tune_nets  # torch takes seconds to import
-    from worldpose.training import FineTuningSettings
+    from worldpose.training.settings import FineTuningSettings
 
     versions = fine_tune_nets.fn(  # in this flow, not as a subflow
         Path(annotations),

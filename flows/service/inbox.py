@@ -21,9 +21,9 @@ from flows.registering import register
 from flows.service.layout import PRIORITIES, StateFolder
 from flows.stage import Match
 from worldpose.errors import InputError, InternalError, StoreError, WorldposeError
-from worldpose.ingest import unclicked_clips
+from worldpose.ingest.match_folder import unclicked_clips
 from worldpose.ingest.validation import require_local
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 SUMS: Final = "SHA256SUMS"
 """An optional checksum list in the format of `sha256sum`, of all files to expect."""

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from data_contracts.operations import Arrival, Priority, Serving
 from worldpose.errors import UsageError
-from worldpose.formats import whole_file
+from worldpose.formats.files import whole_file
 from worldpose.store.blobs import storage_errors
 
 PRIORITIES: Final[tuple[Priority, ...]] = ("urgent", "normal", "background")

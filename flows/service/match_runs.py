@@ -31,7 +31,7 @@ from flows.run_record import runs_at_work
 from flows.service.layout import StateFolder, is_alive, served_state
 from flows.service.plan import deployment_name, deployment_names
 from worldpose.errors import WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LOG: Final = logging.getLogger("worldpose.operations")
 ANSWER_SECONDS: Final = 20.0

@@ -24,7 +24,7 @@ from flows.service.overview import MatchStatus, Overview, UnitSummary, age
 from flows.service.plan import ServePlan
 from flows.web.host_guard import LOOPBACK, host_name
 from flows.web.http_server import Connections
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 MAX_SCRAPES: Final = 50
 """Open connections of scrapers."""

@@ -17,8 +17,8 @@ from flows.results.timings import Cost
 from flows.review.metric_words import all_reasons
 from flows.run_record import latest_run
 from worldpose.errors import WorldposeError
-from worldpose.review import last_decision, read_journal, requests_by_id
-from worldpose.store import Store
+from worldpose.review.journal import last_decision, read_journal, requests_by_id
+from worldpose.store.store import Store
 
 UnitState = Literal["done", "waiting", "failed", "blocked"]
 

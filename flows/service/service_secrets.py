@@ -20,7 +20,7 @@ from flows.orchestration.prefect_environment import (
 from flows.service.plan import ServePlan
 from flows.web.proxy import TOKEN_LENGTH
 from worldpose.errors import UsageError
-from worldpose.formats import whole_file
+from worldpose.formats.files import whole_file
 
 ALERTS: Final = ("WORLDPOSE_ALERT_URL", "WORLDPOSE_ALERT_MAIL")
 LINEAGE: Final = "OPENLINEAGE_API_KEY"

@@ -28,7 +28,7 @@ from flows.service.plan import ServePlan
 from flows.service.service_secrets import Secrets
 from flows.web.http_server import require_free_ports
 from worldpose.errors import UsageError, WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LONGEST_PAUSE: Final = 60.0
 """Between two starts of a process that keeps ending [s]."""

@@ -34,7 +34,7 @@ from flows.service.recovery import (
 )
 from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 INBOX_SECONDS: Final = 2.0
 """Between two scans of the inbox; longer if a scan takes long."""

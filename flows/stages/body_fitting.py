@@ -6,8 +6,8 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import detection, tracking
-from worldpose.body import digest_of_body, is_open_body
-from worldpose.body_fitting import BodyFittingSettings
+from worldpose.body.body_file import digest_of_body, is_open_body
+from worldpose.body_fitting.settings import BodyFittingSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:

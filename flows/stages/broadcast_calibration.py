@@ -6,9 +6,9 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings
-from worldpose.ingest import unit_frames
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.ingest.annotations import key_frames_file
+from worldpose.ingest.footage import unit_frames
 
 
 @once_a_match

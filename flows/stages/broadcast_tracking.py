@@ -7,7 +7,7 @@ from pydantic import JsonValue
 from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import broadcast_calibration, broadcast_pooling, detection
-from worldpose.ingest import unit_frames
+from worldpose.ingest.footage import unit_frames
 
 
 class BroadcastTrackingSettings(Record):

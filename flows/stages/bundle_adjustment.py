@@ -6,7 +6,7 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import detection, tracking
-from worldpose.bundle_adjustment import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 
 
 def units(match: Match) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import tracking
-from worldpose.camera_consistency import ConsistencySettings
+from worldpose.camera_consistency.settings import ConsistencySettings
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:

@@ -8,7 +8,8 @@ from data_contracts.detection import detection_unit
 from data_contracts.redetection import redetection_name
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import ingest
-from worldpose.detection import DetectionSettings, weights_of
+from worldpose.detection.models import weights_of
+from worldpose.detection.settings import DetectionSettings
 
 
 def seen_by(match: Match, camera_id: str, clip_id: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flows.stage import Match, Stage
 from flows.stages import detection, refitting, tracking
-from worldpose.filtering import FilteringSettings
+from worldpose.filtering.settings import FilteringSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:

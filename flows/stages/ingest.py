@@ -9,8 +9,7 @@ from pydantic import JsonValue, TypeAdapter
 
 from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
-from worldpose.ingest import unit_frames
-from worldpose.ingest.footage import footage_clips, footage_size
+from worldpose.ingest.footage import footage_clips, footage_size, unit_frames
 from worldpose.review.detections import DETECTION_EDITS, DetectionEdit
 
 _EDITS = TypeAdapter(list[DetectionEdit])

@@ -8,10 +8,10 @@ from data_contracts.static_calibration import ClickedMarkings
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
 from flows.stages.ingest import video_sources
-from worldpose.detection import DetectionSettings
-from worldpose.ingest import unit_frames
+from worldpose.detection.settings import DetectionSettings
 from worldpose.ingest.annotations import clicked_file
-from worldpose.static_calibration import ProposalSettings
+from worldpose.ingest.footage import unit_frames
+from worldpose.static_calibration.settings import ProposalSettings
 
 
 @once_a_match

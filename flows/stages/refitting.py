@@ -17,8 +17,8 @@ from flows.stages import (
     detection,
     tracking,
 )
-from worldpose.body import OPEN_BODY
-from worldpose.ingest import unit_frames
+from worldpose.body.body_file import OPEN_BODY
+from worldpose.ingest.footage import unit_frames
 
 
 class RefittingSettings(Record):

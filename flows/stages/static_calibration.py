@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flows.stage import Match, Stage
 from flows.stages.proposal import camera_sources, needed_proposals
-from worldpose.static_calibration import StaticCalibrationSettings
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
 def units(match: Match) -> tuple[str, ...]:

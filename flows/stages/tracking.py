@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from flows.stage import Match, Stage
 from flows.stages import detection
 from worldpose.review.identities import IDENTITY_EDITS
-from worldpose.tracking import TrackingSettings
+from worldpose.tracking.settings import TrackingSettings
 
 MIN_CAMERAS: Final = 2
 """Minimum number of static cameras for triangulation [1]."""

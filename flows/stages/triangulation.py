@@ -6,7 +6,7 @@ from pydantic import JsonValue
 
 from flows.stage import Match, Stage
 from flows.stages import tracking
-from worldpose.triangulation import TriangulationSettings
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:

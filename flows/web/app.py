@@ -42,7 +42,7 @@ from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
 from flows.web.intake import routes as routes_of_intake
 from flows.web.proxy import NAME_LENGTH, Role
 from worldpose.errors import InputError, InternalError, WorldposeError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LOG: Final = logging.getLogger("worldpose.pages")
 TYPES: Final = {

@@ -30,7 +30,7 @@ from flows.service.match_runs import (
 )
 from flows.stage import Match
 from flows.web.access import Access
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,11 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
-from worldpose.static_calibration import StaticCalibrationSettings, propose_camera
-from worldpose.video import open_video
+from worldpose.static_calibration.proposal import propose_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.video.folder import open_video
 
 CACHED_IMAGES: Final = 2
 """Images that are kept decoded; a 4K one takes 25 MB."""

@@ -18,7 +18,7 @@ from flows.review.detections import accept, detections_now, left_to_look_at
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
 from worldpose.errors import InputError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 MAX_LISTED: Final = 60
 """Maximum number of listed detections to review."""

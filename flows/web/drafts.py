@@ -32,14 +32,15 @@ from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
 from flows.web.browser_words import in_browser
 from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
-from worldpose.formats import whole_file
-from worldpose.ingest import MatchFolder, read_match
+from worldpose.formats.files import whole_file
 from worldpose.ingest.footage import read_still, require_footage
+from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.ingest.validation import list_problems, validate_record
-from worldpose.store import Store
-from worldpose.video import VIDEO_SUFFIXES, FrameIndex, VideoReader, index_frames, is_video
+from worldpose.store.store import Store
+from worldpose.video.files import FrameIndex, VideoReader, index_frames
 from worldpose.video.folder import HEADER_BYTES, declared_size
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
+from worldpose.video.names import VIDEO_SUFFIXES, is_video
 
 DRAFTS: Final = ".drafts"
 """Folder of all drafts in the inbox."""

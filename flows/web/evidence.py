@@ -24,13 +24,12 @@ from flows.reports.people import adjustment_tables, body_tables
 from flows.results.best_results import placed_joints, static_cameras
 from flows.stage import Match
 from flows.web.app_context import PageContext
-from worldpose.formats import JointTracks
-from worldpose.reports import CaptionedImage
+from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import plot_paths
-from worldpose.reports.html_page import Table
-from worldpose.review import requests_by_id
+from worldpose.reports.html_page import CaptionedImage, Table
 from worldpose.review.evidence import Curve, clip_curves
-from worldpose.store import Run, Store, open_run
+from worldpose.review.journal import requests_by_id
+from worldpose.store.store import Run, Store, open_run
 
 CACHED_REVIEWS: Final = 16
 """Review requests whose images are kept in memory; drawing takes one or two seconds each."""

@@ -15,7 +15,7 @@ from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from worldpose.review.identities import Identities, find_sighting
-from worldpose.store import Store, open_run
+from worldpose.store.store import Store, open_run
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,8 +15,9 @@ from flows.results.best_results import ADJUSTED
 from flows.stage import Match
 from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext
-from worldpose.review import current_value, requests_by_id
-from worldpose.store import Run, open_run
+from worldpose.review.clicks import current_value
+from worldpose.review.journal import requests_by_id
+from worldpose.store.store import Run, open_run
 
 MAX_LISTED: Final = 60
 """Maximum number of listed keypoints, by largest Mahalanobis distance."""

@@ -25,8 +25,8 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from flows.web.corrections import count_corrections, describe_groups
 from worldpose.errors import WorldposeError
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 BUDGET_SECONDS: Final = 0.25
 """Time that one request spends on changed matches; the page asks again for the others."""

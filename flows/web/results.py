@@ -36,7 +36,7 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.store import Run
+from worldpose.store.store import Run
 
 BINARY: Final = "application/octet-stream"
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from worldpose.errors import InputError
-from worldpose.video import is_video
+from worldpose.video.names import is_video
 
 MAX_ENTRIES: Final = 2000
 """Folders and videos of one folder that a page lists."""

@@ -17,9 +17,9 @@ from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.review.evidence import check_views, epipolar_curves
-from worldpose.store import open_run
+from worldpose.store.store import open_run
 
 CACHED_PEOPLE: Final = 8
 """People whose views are kept in memory while a keypoint is dragged."""

@@ -19,11 +19,10 @@ from scenes import SIZE, SceneKind, Shot, find_visible, label, render_scene, sav
 from scipy.spatial import cKDTree
 
 from data_contracts.arrays import Floats
-from worldpose.body import fold_keypoints
-from worldpose.body.keypoints import VERTEX_OF_POINT
+from worldpose.body.keypoints import VERTEX_OF_POINT, fold_keypoints
 from worldpose.detection.landmark_net import POINTS
 from worldpose.simulation.mannequins import Mannequin, open_mannequin
-from worldpose.training import LabelledPicture, read_labels, write_labels
+from worldpose.training.labels import LabelledPicture, read_labels, write_labels
 
 CLEAR_M: Final = 0.02
 """A part of the body covers a landmark if it is nearer to the camera by more than this [m]."""

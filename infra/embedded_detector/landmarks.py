@@ -33,7 +33,6 @@ from worldpose.detection.bundled_nets import (
 )
 from worldpose.detection.landmark_net import POINTS, LandmarkNet, SeenLandmarks, locate
 from worldpose.detection.models import BUNDLED_WEIGHTS
-from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.augmentation import REAL_LOOKS, AugmentationSettings
 from worldpose.training.fine_tuning import MIN_HEIGHT, Training, train
 from worldpose.training.keypoint_training import (
@@ -44,6 +43,8 @@ from worldpose.training.keypoint_training import (
     keypoint_batch,
     labelled_people,
 )
+from worldpose.training.labels import LabelledPicture, PictureCache
+from worldpose.training.settings import TrainingSettings
 
 SCENES: Final = {
     "training": (TRAINING, 50, 3, 4),

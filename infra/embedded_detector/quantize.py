@@ -37,7 +37,6 @@ from scenes import TRAINING, read_set, render_set
 from torch import Tensor, nn
 
 from data_contracts.arrays import Image
-from worldpose.detection import DetectionSettings
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import (
     COARSEST,
@@ -51,8 +50,9 @@ from worldpose.detection.bundled_pose import BundledPoseEstimator
 from worldpose.detection.landmark_net import LandmarkNet, SeenLandmarks
 from worldpose.detection.models import BUNDLED_WEIGHTS, LANDMARK_WEIGHTS
 from worldpose.detection.net_inference import WEIGHTS_DIGEST, place_net
+from worldpose.detection.settings import DetectionSettings
 from worldpose.ingest.registration import digest_of_files
-from worldpose.training import read_picture
+from worldpose.training.labels import read_picture
 
 SCENES: Final = 4
 """Rendered scenes, of four images each."""

@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image
 from data_contracts.conventions import COCO17_FLIP
-from worldpose.detection import People, PoseEstimator
+from worldpose.detection.interfaces import People, PoseEstimator
 from worldpose.detection.models import load_bundled_detector
 from worldpose.detection.onnx_detectors import load_onnx_detector
 from worldpose.detection.onnx_nets import load_onnx_pose
 from worldpose.detection.suppression import suppress
 from worldpose.detection.views import TiledDetector
 from worldpose.geometry.boxes import box_iou
-from worldpose.training import LabelledPicture, read_yolo_labels, write_labels
-from worldpose.training.labels import label_boxes
+from worldpose.training.labels import LabelledPicture, label_boxes, read_yolo_labels, write_labels
 
 FRAMES: Final = range(2, 100, 12)
 """Frames of each video: half a second apart, people have moved."""

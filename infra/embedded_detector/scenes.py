@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyParameters
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.body.model import BodyParameters
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.cast import assign_roles, dress_people
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.image_formation import RenderedFrame
@@ -27,7 +27,7 @@ from worldpose.simulation.settings import (
     RigSettings,
     Scenario,
 )
-from worldpose.training import LabelledPicture, read_labels, write_labels
+from worldpose.training.labels import LabelledPicture, read_labels, write_labels
 
 HIDDEN = 0.3
 """People with a smaller visible share are ignored [1]."""

@@ -23,14 +23,13 @@ from scenes import CHECKING, read_set, render_set
 from scipy.optimize import minimize
 
 from data_contracts.arrays import Flags, Floats
-from worldpose.detection import People
-from worldpose.detection.interfaces import ScoreMap
+from worldpose.detection.interfaces import People, ScoreMap
 from worldpose.detection.models import (
     SHIPPED_SCORE_MAP,
     load_bundled_detector,
     load_bundled_pose,
 )
-from worldpose.training import LabelledPicture, PictureCache, read_labels, read_yolo_labels
+from worldpose.training.labels import LabelledPicture, PictureCache, read_labels, read_yolo_labels
 from worldpose.training.metrics import (
     average_precision,
     calibration_error,

@@ -26,16 +26,15 @@ import torch
 from real_frames import label_pair, read_panorama
 from scenes import CHECKING, CROWDS, FAR, HELD_OUT, TRAINING, VARIETY, read_set, render_set
 
-from worldpose.detection import DetectionSettings
 from worldpose.detection.bundled_detector import BundledDetector
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.detection.bundled_pose import BundledPoseEstimator
+from worldpose.detection.settings import DetectionSettings
 from worldpose.geometry.boxes import box_iou
-from worldpose.training import LabelledPicture, PictureCache, TrainingSettings
 from worldpose.training.augmentation import REAL_LOOKS
 from worldpose.training.fine_tuning import MIN_HEIGHT, train_keypoint_net, train_people_net
 from worldpose.training.keypoint_training import KeypointCrops
-from worldpose.training.labels import read_labels
+from worldpose.training.labels import LabelledPicture, PictureCache, read_labels
 from worldpose.training.metrics import (
     HEIGHTS,
     detect_labelled,
@@ -43,6 +42,7 @@ from worldpose.training.metrics import (
     score_people,
 )
 from worldpose.training.people_training import PeopleWindows
+from worldpose.training.settings import TrainingSettings
 
 Net = TypeVar("Net", PeopleNet, KeypointNet)
 RealImages = Literal["frames", "stills"]

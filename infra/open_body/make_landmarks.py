@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 from scipy.spatial import cKDTree
 
-from worldpose.body import load_open_body
+from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import JOINT_NAMES
 
 SEGMENTS = {

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from worldpose.body_fitting.pose_space import COORDINATES, GATHER, SIZE
-from worldpose.formats import write_archive
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.formats.archives import write_archive
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.crowd import gather
+from worldpose.simulation.scenarios import SCENARIOS
 
 CLIPS = (
     ("match", 24.0, 9001),

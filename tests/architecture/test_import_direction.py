@@ -25,7 +25,6 @@ FORBIDDEN = {
 ORDER_IN_WORLDPOSE = (
     "errors",
     "cache_folder",
-    "lazy_names",
     "parsing",
     "compiled",
     "geometry",
@@ -144,7 +143,9 @@ def test_only_one_module_reads_npy_arrays():
     assert users == {"worldpose/parsing.py"}
 
 
-@pytest.mark.parametrize("package", ["worldpose", "worldpose.tracking", "worldpose.store"])
+@pytest.mark.parametrize(
+    "package", ["worldpose", "worldpose.tracking.tracker", "worldpose.store.store"]
+)
 def test_the_library_imports_without_orchestrators(package):
     script = (
         "import sys\n"
@@ -227,3 +228,25 @@ def test_a_circle_through_a_package_and_a_late_import_is_found(tmp_path):
         TopologicalSorter(imports).prepare()
     del imports["one.b"]
     TopologicalSorter(imports).prepare()
+
+
+HEAVY = ("numba", "scipy", "cv2", "av", "zarr", "xarray", "torch", "pandas", "matplotlib")
+
+
+@pytest.mark.parametrize("name", ["tracking", "body_fitting", "bundle_adjustment", "ingest"])
+def test_the_settings_and_readers_of_a_stage_import_no_estimator(name):
+    module = "worldpose.ingest.match_folder" if name == "ingest" else f"worldpose.{name}.settings"
+    assert heavy_imports_of(module) == []
+
+
+def test_a_run_is_planned_without_an_estimator():
+    # Prefect's server and the workers start after that.
+    assert heavy_imports_of("flows.cli.run, flows.registering, flows.running") == []
+
+
+def heavy_imports_of(modules):
+    """Heavy modules that a process has after importing these."""
+    script = f"import sys, {modules}; print(*sorted({set(HEAVY)} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()

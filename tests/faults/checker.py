@@ -5,8 +5,9 @@ from datetime import timedelta
 
 from store_comparison import compare_stores
 
-from worldpose.store import Store, verify
 from worldpose.store.garbage import collect, plan_gc
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 
 def problems_of(project, undisturbed):

@@ -12,8 +12,8 @@ from command_line import TINY
 
 from data_contracts.review import Correction
 from flows.registering import open_match
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 PATIENCE = 300.0
 """Seconds until a server that was started has to answer."""

@@ -24,7 +24,8 @@ from checker import problems_of
 from machines import Machines
 from recoveries import Fault, by_kind, reason_in, summary_of
 
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 
 WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}

@@ -11,8 +11,8 @@ import time
 
 import numpy as np
 
-from worldpose.store import Store
 from worldpose.store.blobs import LocalBlobs
+from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY, worldpose
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.usefixtures("server"), pytest.mark.faults, pytest.mark.slow]
 

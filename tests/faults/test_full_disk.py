@@ -12,7 +12,8 @@ from flows.orchestration import prefect_database
 from flows.orchestration.cluster_errors import require_room
 from flows.orchestration.prefect_database import begin_database
 from worldpose.errors import MemoryLimitError, StoreError, require_memory
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 
 
 @pytest.fixture

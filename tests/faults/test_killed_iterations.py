@@ -24,9 +24,10 @@ from flows.review.verdicts import correct
 from flows.run_record import RunLog
 from flows.running import RunRequest
 from flows.settings import selected_stages
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.store import Store
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.store.blobs import install_fault_hook
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.faults
 

@@ -19,7 +19,7 @@ from editing import Editor, account
 from page_client import MATCH, TOKEN
 
 from flows.registering import register
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.faults
 

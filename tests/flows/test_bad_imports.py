@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from flows.cli.app import app
 from worldpose.errors import InputError
-from worldpose.video import write_video
+from worldpose.video.files import write_video
 
 CALIBRATION = """
 [cam_0]

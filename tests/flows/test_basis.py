@@ -9,7 +9,7 @@ from flows.registering import register
 from flows.run_plan import RunPlan, plan_run
 from flows.run_record import RunLog, latest_run
 from flows.settings import selected_stages
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 OTHER = {"tracking": {"min_joints": 6}}
 

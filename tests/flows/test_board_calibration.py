@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from flows.cli.app import app
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.lens_files import read_lens_toml
-from worldpose.video import write_video
+from worldpose.video.files import write_video
 
 SIZE = (640, 480)
 FOCAL = 520.0

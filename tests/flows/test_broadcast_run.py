@@ -10,7 +10,7 @@ import yaml
 from command_line import succeed, worldpose
 
 import worldpose as library
-from worldpose.video import VideoReader
+from worldpose.video.files import VideoReader
 
 
 @pytest.mark.slow

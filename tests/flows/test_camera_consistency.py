@@ -7,7 +7,7 @@ import page_client
 import pytest
 from command_line import TINY, succeed, worldpose
 
-from worldpose.store import open_run
+from worldpose.store.store import open_run
 
 OTHER_END = {"left": "right", "right": "left", "near": "far", "far": "near"}
 

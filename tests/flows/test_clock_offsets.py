@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from flows.cli.app import app
 from worldpose.errors import UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture(scope="module")

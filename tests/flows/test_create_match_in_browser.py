@@ -13,9 +13,9 @@ import page_client
 import pytest
 from chromium import IN_BROWSER, drive
 
-from worldpose.ingest import read_match
-from worldpose.store import Store
-from worldpose.video import write_video
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(900)]
 SCRIPT = Path(__file__).with_name("create_match_in_browser.mjs")

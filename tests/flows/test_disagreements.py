@@ -7,8 +7,8 @@ import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from flows.reports.disagreements import worst_views
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.simulation.scene import look_at
 
 FRAMES = np.arange(20, 24)

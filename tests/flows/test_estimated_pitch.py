@@ -6,7 +6,7 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from flows.results.best_results import estimated_pitch
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 GIVEN = PitchSpec(crown=0.2)
 SPEC = SimpleNamespace(static_cameras=[])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import write_markers
 
 

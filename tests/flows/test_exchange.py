@@ -14,7 +14,7 @@ from flows.review.detections import detections_now
 from flows.review.edit_conflicts import StaleEditError
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.annotations import FORMATS, read_annotations, write_annotations
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 PLACES = [("cam00", 3), ("cam01", 4)]
 

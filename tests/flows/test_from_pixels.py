@@ -16,7 +16,7 @@ from flows.results.best_results import Origin
 from flows.results.tool_exports import describe_clip
 from worldpose import open_run, read_cameras, read_joints
 from worldpose.formats.baselines.result import write_tracks
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def green_share(image):

@@ -27,7 +27,8 @@ from flows.run_record import latest_run
 from flows.running import RunRequest, run_match
 from tasks.static_calibration import static_calibration
 from worldpose.errors import InputError
-from worldpose.store import Store, verify
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 WRONG = "static_calibration/cam03"
 """The camera of `tiny` with a click that the others contradict."""

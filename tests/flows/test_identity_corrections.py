@@ -13,7 +13,8 @@ from flows.run_plan import plan_run
 from flows.run_record import latest_run
 from tasks.tracking import tracking
 from worldpose.review.identities import find_sighting
-from worldpose.store import ResultId, Store
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from flows.review.verdicts import correct
 from flows.run_plan import plan_run, results_before
 from flows.running import RunRequest
 from worldpose.errors import UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LATER = ("tracking", "triangulation", "bundle_adjustment", "retriangulation", "body_fitting")
 """Stages that from the second iteration on look at what was filtered."""

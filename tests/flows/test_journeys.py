@@ -18,7 +18,7 @@ from command_line import succeed, worldpose
 from test_broadcast_run import remove_static_cameras
 
 import worldpose as library
-from worldpose.body import load_open_body, save_body
+from worldpose.body.body_file import load_open_body, save_body
 
 NEW_PROCESS = {"COLUMNS": "200"}
 """An environment of its own makes a command a new process."""

@@ -11,7 +11,7 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import RunPlan, plan_run
 from tasks.static_calibration import static_calibration
-from worldpose.store import Store, open_run
+from worldpose.store.store import Store, open_run
 
 STAGES = {stage.name: stage for stage in METHOD}
 

@@ -11,7 +11,8 @@ from flows.cli.app import app
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.lens_files import write_lens_toml
-from worldpose.geometry import Camera, align
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import align
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from command_line import TINY
 from long_journal import write_corrections
 from many_matches import copy_match
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(3000)]
 SCRIPT = Path(__file__).with_name("many_matches_in_browser.mjs")

@@ -16,7 +16,7 @@ from flows.cli.app import app
 from flows.registering import find_registration, open_for_review, register
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.calibration_files import write_calibration_toml
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def made(folder, match_id, pitch=None):

@@ -10,7 +10,7 @@ from chromium import IN_BROWSER, drive
 from command_line import TINY, worldpose
 from long_journal import write_corrections
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(1200)]
 SCRIPT = Path(__file__).with_name("match_page_in_browser.mjs")

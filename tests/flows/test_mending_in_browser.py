@@ -18,7 +18,7 @@ from flows.review.corrections import keep_edits
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
 from flows.running import RunRequest, run_match
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(1800)]  # the run is done three times
 SCRIPT = Path(__file__).with_name("mending_in_browser.mjs")

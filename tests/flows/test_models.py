@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from data_contracts.checkpoint import Checkpoint
 from flows.checkpoint_downloads import CATALOG, pull, resolve_address
 from flows.cli.app import app
-from worldpose.detection import DetectionSettings, weights_of
-from worldpose.detection.models import load_detectors
+from worldpose.detection.models import load_detectors, weights_of
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError, UsageError, WorldposeError
 
 REVISION = "0123456789abcdef0123456789abcdef01234567"

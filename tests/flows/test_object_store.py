@@ -6,7 +6,8 @@ from command_line import TINY, succeed
 from store_comparison import compare_stores
 
 from worldpose import open_run
-from worldpose.store import Store, verify
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 
 def test_a_match_run_on_object_storage_equals_one_on_disk(server, bucket, tiny, tiny_run):

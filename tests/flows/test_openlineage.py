@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 
 from data_contracts.run import UnitFailure
 from flows.openlineage import lineage_events, tell_lineage
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 SCHEMA = os.environ.get("WORLDPOSE_OPENLINEAGE_SCHEMA")
 

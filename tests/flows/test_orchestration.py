@@ -14,7 +14,7 @@ from command_line import TINY, succeed, worldpose
 from store_comparison import compare_stores
 
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, authorization
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 LOOPBACK_ONLY = str(Path(__file__).with_name("loopback_only"))
 

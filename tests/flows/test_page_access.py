@@ -15,8 +15,8 @@ from flows.web import app
 from flows.web.access import SESSION_SECONDS, WRONG_SECONDS, WRONG_TOKENS, access_for
 from flows.web.app import BODY_BYTES, OPEN, create_app
 from worldpose.errors import UsageError
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 
 def every_route(app):

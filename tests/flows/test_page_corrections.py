@@ -14,7 +14,7 @@ from flows.registering import open_for_review, register
 from flows.review.corrections import keep_edits
 from flows.web.browser_words import in_browser
 from flows.web.corrections import SESSION_GAP
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

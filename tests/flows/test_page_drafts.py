@@ -15,9 +15,9 @@ from flows.service.inbox import entries, fingerprint_of, missing_of
 from flows.web.access import Access, User, access_for
 from flows.web.app import create_app
 from flows.web.intake import CHUNK_BYTES, Intake
-from worldpose.ingest import read_match
-from worldpose.store import Store
-from worldpose.video import write_video
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
 
 DRAFTS = "/api/drafts"
 SIZE, FPS, FRAMES = (96, 64), 25, 12

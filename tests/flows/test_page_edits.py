@@ -10,8 +10,8 @@ from page_client import MATCH, a_click, moved
 from flows.registering import open_match, register
 from flows.review import corrections
 from worldpose.errors import StoreError
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 
 def test_a_correction_is_kept_with_who_and_shown_to_all(ada, bob, project_copy):

@@ -10,7 +10,7 @@ from flows.registering import open_match
 from flows.results.best_results import static_cameras
 from flows.run_plan import plan_run
 from tasks.ingest import ingest
-from worldpose.store import Store, open_run
+from worldpose.store.store import Store, open_run
 
 
 def test_a_keypoint_that_is_taken_out_is_gone_from_all_that_follows(ada, bob, project_copy):

@@ -12,13 +12,13 @@ from command_line import TINY, succeed, worldpose
 from page_client import MATCH
 
 from flows.registering import open_match
-from worldpose.formats import read_camera
-from worldpose.geometry import Camera
+from worldpose.formats.challenge import read_camera
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import write_still
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 SIZE = (1920, 1080)
 

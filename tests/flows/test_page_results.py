@@ -23,7 +23,7 @@ from worldpose.formats.viewer_file import (
     encode_spread,
     read_viewer,
 )
-from worldpose.store import Store, open_run
+from worldpose.store.store import Store, open_run
 
 
 def test_a_complete_run_gives_its_report_and_its_exports(ada):

@@ -16,9 +16,9 @@ from flows.reports.clip_video import clip_view
 from flows.running import RunRequest, run_match
 from flows.web import app_context
 from flows.web.app_context import Continuing, PageContext
-from worldpose.review import say
-from worldpose.store import Store, open_run
-from worldpose.video import VideoReader
+from worldpose.review.journal import say
+from worldpose.store.store import Store, open_run
+from worldpose.video.files import VideoReader
 
 
 @pytest.fixture

@@ -11,11 +11,10 @@ from command_line import succeed
 
 from data_contracts.pitch import PitchSpec
 from flows.registering import open_match
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.ingest import read_calibration
-from worldpose.pitch import PitchTemplate
-from worldpose.store import Store, open_run
+from worldpose.formats.calibration_forms import read_calibration
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.pitch.template import PitchTemplate
+from worldpose.store.store import Store, open_run
 
 pytestmark = [
     *IN_BROWSER,

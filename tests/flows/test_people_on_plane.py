@@ -11,8 +11,8 @@ import worldpose as library
 from flows.match import IncompleteRunError
 from flows.web.app_context import Continuing
 from worldpose.formats.viewer_file import decode_part, read_viewer
-from worldpose.store import Store
-from worldpose.video import write_video
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
 
 
 def check_pages(folder, match):

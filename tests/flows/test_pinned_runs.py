@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from flows.cli.app import app
 from worldpose.errors import InputError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from command_line import succeed, worldpose
 
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 NAMES = (
     *(f"corner_{side}_{end}" for side in ("left", "right") for end in ("near", "far")),

@@ -13,8 +13,8 @@ from data_contracts.static_calibration import ClickedMarkings
 from flows.method import METHOD
 from flows.run_plan import RunPlan
 from flows.stage import Match, once_a_match
-from worldpose.ingest import MatchFolder
-from worldpose.review import Journal
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.review.journal import Journal
 
 CAMERAS = 6
 

@@ -4,7 +4,7 @@ import av
 import numpy as np
 from command_line import succeed, worldpose
 
-from worldpose.video import VideoReader, write_video
+from worldpose.video.files import VideoReader, write_video
 
 FPS = 10.0
 

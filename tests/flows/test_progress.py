@@ -31,9 +31,9 @@ from flows.run_record import (
     require_no_other_run,
 )
 from flows.web.app_context import read_progress
-from worldpose.ingest import MatchFolder
-from worldpose.store import Store
+from worldpose.ingest.match_folder import MatchFolder
 from worldpose.store.documents import seal
+from worldpose.store.store import Store
 
 
 class Heard(Reporter):

@@ -24,8 +24,8 @@ from flows.web.access import access_for
 from flows.web.app import create_app
 from flows.web.proxy import Proxy
 from worldpose.errors import UsageError
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 with page_client.warnings.catch_warnings():
     page_client.warnings.simplefilter("ignore")

@@ -7,7 +7,7 @@ from test_refitting import halves
 
 from flows.registering import register
 from flows.stages.redetection import STAGE
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from command_line import succeed
 
-from worldpose.formats import read_camera
-from worldpose.store import Store, open_run
+from worldpose.formats.challenge import read_camera
+from worldpose.store.store import Store, open_run
 
 PEOPLE = 5
 CAMERAS = 4

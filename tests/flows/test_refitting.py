@@ -12,7 +12,7 @@ from flows.registering import open_match, register
 from flows.run_plan import plan_run
 from flows.stages.refitting import STAGE
 from worldpose.errors import InputError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 def halves(tiny, folder, **people):

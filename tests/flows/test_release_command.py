@@ -9,8 +9,9 @@ from command_line import TINY, succeed, worldpose
 
 from worldpose.errors import InputError
 from worldpose.simulation.recordings import read_bvh
-from worldpose.store import Store, list_pins
 from worldpose.store.garbage import plan_gc
+from worldpose.store.runs import list_pins
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")
 

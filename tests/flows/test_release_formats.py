@@ -19,12 +19,12 @@ from flows.cli.app import app
 from flows.results import best_results
 from flows.results.best_results import Origin
 from flows.results.export import CLASHING, COUNTED, EXPORTS, export
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.keypoints import CHALLENGE15
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import CHALLENGE15, fold_keypoints
+from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import ORIGINS
 from worldpose.errors import InputError, UsageError, WorldposeError
-from worldpose.formats import read_camera
-from worldpose.formats.challenge import read_challenge, read_submission
+from worldpose.formats.challenge import read_camera, read_challenge, read_submission
 from worldpose.formats.joints_file import read_poses
 
 FRAMES = np.arange(100, 104)

@@ -25,8 +25,8 @@ from flows.running import RunRequest
 from flows.service import deployed
 from flows.stages.tracking import STAGE
 from worldpose.errors import InputError, WorldposeError
-from worldpose.store import ResultId, Store
-from worldpose.store.paths import record_path
+from worldpose.store.paths import ResultId, record_path
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -18,8 +18,9 @@ from flows.run_record import latest_run, resolve_settings
 from flows.running import RunRequest, kept_iterations, run_match
 from flows.service import deployed
 from worldpose import open_run
-from worldpose.body import load_open_body, save_body
-from worldpose.store import Store, verify
+from worldpose.body.body_file import load_open_body, save_body
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")
 

@@ -17,10 +17,11 @@ from flows.registering import open_match
 from flows.reports import viewer
 from flows.reports.people import body_tables
 from worldpose import open_run
-from worldpose.body import fold_keypoints, load_open_body
-from worldpose.formats import read_camera, read_joints
-from worldpose.formats.joints_file import read_poses
-from worldpose.store import Store
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.formats.challenge import read_camera
+from worldpose.formats.joints_file import read_joints, read_poses
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("server")
 

@@ -6,7 +6,8 @@ import pytest
 from data_contracts.run import RunRecord
 from flows.results import comparison
 from flows.results.comparison import BodiesOfBoth, compare_runs, count_marks, pair_people
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 
 def record(figures):

@@ -16,7 +16,7 @@ from flows.review.verdicts import correct
 from flows.run_record import RunLog
 from flows.run_status import run_status
 from flows.running import RunRequest
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from command_line import TINY, WORLDPOSE
 
 from data_contracts.review import ReviewDecision
 from flows.registering import register
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.slow  # three servers, each started twice
 

@@ -15,8 +15,8 @@ from prefect.flow_runs import resume_flow_run
 
 from data_contracts.review import ReviewDecision
 from flows.registering import register
-from worldpose.review import read_journal
-from worldpose.store import Store
+from worldpose.review.journal import read_journal
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.slow  # five processes that import and serve, one after the other
 

@@ -9,7 +9,7 @@ import pytest
 from command_line import TINY, succeed
 
 from tasks import tracing
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from viewer_clips import mixed_clip
 
 from worldpose.formats.viewer_file import write_viewer
-from worldpose.video import write_video
+from worldpose.video.files import write_video
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(1800)]
 SCRIPT = Path(__file__).with_name("viewer_file_in_browser.mjs")

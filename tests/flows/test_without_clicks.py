@@ -5,9 +5,9 @@ import shutil
 import yaml
 from command_line import succeed
 
-from worldpose.formats import read_camera
+from worldpose.formats.challenge import read_camera
 from worldpose.ingest.footage import write_still
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 
 

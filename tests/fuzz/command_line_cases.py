@@ -98,7 +98,7 @@ def _judge(draft, work, done):
 
 
 def _score(draft, work, run_id):
-    from worldpose.store import Store
+    from worldpose.store.store import Store
 
     store = Store.open(str(work / "project"))
     (match_id,) = store.matches()

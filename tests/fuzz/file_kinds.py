@@ -512,7 +512,7 @@ kinds(
 
 def write_videos(draft, folder):
     """Small videos of a match of which nothing else is known (base `filmed`)."""
-    from worldpose.video import write_video
+    from worldpose.video.files import write_video
 
     (folder / "videos").mkdir(exist_ok=True)
     for number, each in enumerate(draft.spec["cameras"]):
@@ -550,7 +550,7 @@ def _filmed_otherwise(draft, rng, how):
     name = some(draft, rng)
 
     def strike(folder):
-        from worldpose.video import write_video
+        from worldpose.video.files import write_video
 
         file = folder / "videos" / f"{name}.mp4"
         width, height = size or (64, 48)

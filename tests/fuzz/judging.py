@@ -167,7 +167,7 @@ def run_match(folder, project, overrides=(), until=None):
     from flows.registering import register
     from flows.run_record import RunLog
     from flows.settings import parse_overrides, selected_stages
-    from worldpose.store import Store
+    from worldpose.store.store import Store
 
     _open_results_once(Store)
     stages = selected_stages(None, until)

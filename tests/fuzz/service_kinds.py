@@ -177,7 +177,9 @@ def use_store(project):
     from flows.registering import open_match
     from flows.review.verdicts import reviews_of, warnings_of
     from flows.run_record import latest_run
-    from worldpose.store import Store, open_run, plan_gc, repair, verify
+    from worldpose.store.garbage import plan_gc
+    from worldpose.store.integrity import repair, verify
+    from worldpose.store.store import Store, open_run
 
     from .judging import run_match
 

@@ -16,7 +16,8 @@ from threading import Thread
 import pytest
 from service import Served
 
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary
 
 from flows.progress import reporter
 from flows.service.artifacts import show_at_prefect
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from faults.checker import doubled
 from service import TOKEN
 
 from flows.run_record import runs_at_work
-from worldpose.store import Store, verify
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(3600)]
 SCRIPT = Path(__file__).with_name("day_in_browser.mjs")

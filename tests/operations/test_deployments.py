@@ -38,7 +38,7 @@ from flows.service.watching import failed_runs
 from flows.web import app_context
 from flows.web.app_context import Continuing
 from worldpose.errors import InputError, UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from chromium import IN_BROWSER, drive
 from command_line import succeed
 from service import TOKEN
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(3600)]
 SCRIPT = Path(__file__).with_name("first_match_in_browser.mjs")

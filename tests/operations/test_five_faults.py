@@ -26,7 +26,7 @@ from service import Browser, Served, wait_until
 from test_slow_connections import open_many, send_first, still_open
 
 from flows.registering import register
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.faults, pytest.mark.timeout(3600)]
 

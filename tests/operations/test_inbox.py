@@ -21,7 +21,7 @@ from flows.service.inbox import (
 )
 from flows.service.layout import StateFolder, state_folder
 from worldpose.errors import UsageError
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 
 class Desk:

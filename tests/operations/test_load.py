@@ -14,8 +14,9 @@ from command_line import WORLDPOSE, succeed
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.store import Store
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600), pytest.mark.usefixtures("server")]
 

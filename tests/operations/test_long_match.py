@@ -10,8 +10,9 @@ from stand_ins import publish_stand_in
 
 from flows.registering import register
 from flows.run_plan import plan_run
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.store import Store
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

@@ -18,7 +18,8 @@ from flows.orchestration.prefect_environment import (
 )
 from flows.service.plan import ServePlan
 from flows.service.serving import answers
-from worldpose.store import Store, verify
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 LOGIN = new_login()
 START_SECONDS = 300

@@ -13,8 +13,10 @@ from faults.checker import doubled
 from service import Browser, wait_until
 
 from flows.registering import register
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.store import Store, verify
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2, "stills": False, "video": False}
 LINKED_SECONDS = 1.0

@@ -10,7 +10,7 @@ import pytest
 from command_line import succeed, worldpose
 from service import TOKEN, Browser, fetch, free_ports, wait_until
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 pytestmark = pytest.mark.slow  # a Prefect server, a worker, and a match from end to end
 

@@ -18,7 +18,7 @@ from flows.service.layout import StateFolder
 from flows.service.metrics import ProjectMetrics, exposition, metrics_server
 from flows.service.overview import Overview
 from flows.service.plan import ServePlan
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 INFRA = Path(__file__).parents[2] / "infra"
 DASHBOARD = INFRA / "grafana" / "worldpose.json"

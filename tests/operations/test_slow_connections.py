@@ -15,7 +15,7 @@ from page_client import TOKEN
 from service import free_ports
 from websockets.sync.client import connect
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 HALF_HEADERS = b"GET /api/health HTTP/1.1\r\nHost: 127.0.0.1\r\n"
 HALF_BODY = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 BATCH = Path(__file__).parents[2] / "infra" / "slurm" / "dask.sbatch"
 PROGRAMS = os.environ.get("PATH", "") + ":/usr/sbin"

@@ -18,7 +18,7 @@ from flows.service.status_page import (
 )
 from flows.web.access import access_for
 from flows.web.app import create_app
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the web framework, about its own test client

@@ -14,8 +14,8 @@ from page_client import log_in, served
 from flows.registering import register
 from flows.service.overview import Overview
 from worldpose.errors import InputError
-from worldpose.ingest import read_match
-from worldpose.store import Store
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Store
 
 
 @pytest.fixture

@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 import static_pair
 
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_camera
-from worldpose.video import open_video, write_video
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.video.files import write_video
+from worldpose.video.folder import open_video
 
 SIZE = (1280, 720)
 FRAMES, FPS = 150, 25.0

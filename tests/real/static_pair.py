@@ -13,9 +13,8 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import law_points
-from worldpose.video import median_picture, open_video
+from worldpose.pitch.template import PitchTemplate, law_points
+from worldpose.video.folder import median_picture, open_video
 
 CROWN = 0.1
 """Height of the long axis above the touch lines [m]; it fits both cameras better than 0.2."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mvor import NO_BOX, NO_IDENTITY, judge_result, load_moments, measure, name_detections
 
-from worldpose.tracking import TrackingSettings
+from worldpose.tracking.settings import TrackingSettings
 
 MVOR = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "mvor"
 FILES = [MVOR / "camma_mvor_2018.json", MVOR / "openpose_kps.json"]

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import static_pair
 
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_without_clicks
-from worldpose.store import Store
-from worldpose.video import median_picture, open_video
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.proposal import calibrate_without_clicks
+from worldpose.store.store import Store
+from worldpose.video.folder import median_picture, open_video
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.detection import People
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
-from worldpose.video import write_video
+from worldpose.detection.interfaces import People
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
+from worldpose.video.files import write_video
 
 REAL = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 FOLDER = Path(__file__).parents[2] / "benchmarks"

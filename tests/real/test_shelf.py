@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import succeed
 
-from worldpose.formats import read_joints
+from worldpose.formats.joints_file import read_joints
 
 SHELF = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "shelf_dev"
 

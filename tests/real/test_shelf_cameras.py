@@ -11,7 +11,7 @@ import pytest
 from common import run_in_process
 from shelf_subsets import load_scorer, score, write_case
 
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 SHELF = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "shelf_dev"
 CAMERAS = ("cam0", "cam2", "cam3", "cam4")

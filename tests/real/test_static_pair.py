@@ -16,8 +16,8 @@ from static_pair import CROWN, read_clicks, write_static_pair
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "static_pair"
 

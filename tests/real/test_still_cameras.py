@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "still_cameras"
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "still_cameras.py"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldpose.detection import People
+from worldpose.detection.interfaces import People
 from worldpose.training.labels import read_labels
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

@@ -9,7 +9,8 @@ import pytest
 from data_contracts.work import Recipe, Work
 from tasks import batch, tracking
 from worldpose.errors import DegenerateError, StoreError
-from worldpose.store import Store, recipe_key
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 
 @pytest.fixture

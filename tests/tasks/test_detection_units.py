@@ -17,10 +17,10 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import RunPlan
 from tasks.clip_inputs import open_clip, open_frames
-from worldpose.detection import People
+from worldpose.detection.interfaces import People
 from worldpose.errors import InputError
-from worldpose.ingest import import_boxes
-from worldpose.store import Store
+from worldpose.ingest.writing import import_boxes
+from worldpose.store.store import Store
 
 OFFSETS = {"left": 0, "right": 3}
 CLIPS = [("early", 2, 12), ("late", 20, 10)]

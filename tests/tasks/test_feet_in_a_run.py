@@ -11,11 +11,13 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.results.best_results import joint_tracks
 from flows.run_plan import plan_run
-from worldpose.body import BodyParameters, find_body, fold_keypoints
-from worldpose.formats import read_camera
+from worldpose.body.body_file import find_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyParameters
+from worldpose.formats.challenge import read_camera
 from worldpose.formats.joints_file import read_poses
 from worldpose.formats.keypoint_files import read_keypoint_arrays, write_keypoint_arrays
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 STAGES = (
     *("ingest", "static_calibration", "camera_consistency", "tracking", "triangulation"),

@@ -13,8 +13,8 @@ from tasks.clip_inputs import ClipInputs
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
-from worldpose.geometry import Camera, Rigid
-from worldpose.geometry.cameras import camera_arrays
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
 
 LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]

@@ -10,7 +10,7 @@ from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 NOBODY = {"tracking": {"size_range": [3.0, 4.0]}}
 """All detected people are too small, or too tall."""

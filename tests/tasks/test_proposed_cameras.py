@@ -11,12 +11,12 @@ from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
 from worldpose.errors import InputError
-from worldpose.formats import read_camera
+from worldpose.formats.challenge import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
 from worldpose.ingest.footage import write_still
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.store import Store
+from worldpose.store.store import Store
 
 TASKS = {stage.name: task_of(stage) for stage in METHOD}
 TURNED = "cam01"

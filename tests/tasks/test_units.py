@@ -18,11 +18,13 @@ from tasks.static_calibration import static_calibration
 from tasks.triangulation import camera_errors
 from tasks.unit import unit_task
 from worldpose.errors import CorruptionError, InputError, StoreError, WorldposeError
-from worldpose.formats import read_camera
+from worldpose.formats.challenge import read_camera
 from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.ingest import import_lenses, read_match
 from worldpose.ingest.footage import write_still
-from worldpose.store import Store, recipe_differences, recipe_key
+from worldpose.ingest.importing import import_lenses
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.recipes import recipe_differences, recipe_key
+from worldpose.store.store import Store
 
 
 @pytest.fixture

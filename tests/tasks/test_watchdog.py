@@ -13,7 +13,7 @@ from tasks.watchdog import (
     kill_on_timeout,
     was_interrupted,
 )
-from worldpose.store import recipe_key
+from worldpose.store.recipes import recipe_key
 
 
 @pytest.fixture

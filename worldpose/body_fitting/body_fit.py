@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.body_fitting.bones import Shape
 from worldpose.body_fitting.extra_points import (
     ExtraFit,
@@ -47,7 +48,7 @@ from worldpose.body_fitting.solver import (
 )
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
-from worldpose.triangulation import ExtraJoints
+from worldpose.triangulation.passes import ExtraJoints
 
 KEPT_BIAS: Final = 0.01
 """Part of the joints' common bias that stays in their covariance per axis [m]; the shared offsets

@@ -16,8 +16,8 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel
 from worldpose.body.keypoints import JOINT_OF_POINT
+from worldpose.body.model import BodyModel
 
 BONES: Final = (
     *((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16), (5, 6), (11, 12)),

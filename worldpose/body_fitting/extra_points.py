@@ -16,14 +16,19 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.keypoints import JOINT_NAMES, LANDMARKS, VERTEX_OF_POINT, point_segments
-from worldpose.body.model import SMPL_VERTICES
+from worldpose.body.keypoints import (
+    JOINT_NAMES,
+    LANDMARKS,
+    VERTEX_OF_POINT,
+    fold_keypoints,
+    point_segments,
+)
+from worldpose.body.model import SMPL_VERTICES, BodyModel, BodyParameters
 from worldpose.body_fitting.objective import Evidence
 from worldpose.body_fitting.solver import Shapes, Solver
 from worldpose.compiled import map_in_threads
-from worldpose.triangulation import ExtraJoints
+from worldpose.triangulation.passes import ExtraJoints
 
 OFFSET_STD_M: Final = 0.02
 """Expected offset of a detector's point from the body's, per axis of the segment [m]: soles and toe

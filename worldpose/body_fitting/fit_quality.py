@@ -22,8 +22,9 @@ from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from data_contracts.records import Record
-from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel
 from worldpose.body_fitting.body_fit import BodyFit, random_covariance
 from worldpose.body_fitting.bones import BONES, Shape
 from worldpose.body_fitting.objective import ANKLES, Evidence, Ground, perceived_joints
@@ -32,9 +33,9 @@ from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_cons
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.body_fitting.solver import Solver
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
-from worldpose.triangulation import Triangulation, TriangulationSettings, triangulate_joints
-from worldpose.triangulation.passes import learn_detector
+from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.passes import Triangulation, learn_detector, triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""

@@ -26,7 +26,8 @@ from worldpose.body_fitting.pose_space import GATHER, SIZE, interpolate_gaps
 from worldpose.errors import InputError
 from worldpose.formats.archives import read_npz
 from worldpose.formats.files import require_file
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 ESTIMATE_BYTES: Final = 1 << 30
 """Maximum size of the arrays of one file [byte]: 1.5 million bodies as matrices."""

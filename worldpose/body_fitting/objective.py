@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, COCO17_SIGMAS, FEET
-from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints, KeypointJacobian
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.point_equations import accumulate_points, invert_symmetric
 from worldpose.body_fitting.pose_space import (

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel
 from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.bones import DEFINITION_STD_M, shorten_limbs
 from worldpose.body_fitting.monocular import (
@@ -55,7 +56,8 @@ from worldpose.body_fitting.solver import (
     spread_intervals,
 )
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.ground_tracks import CORRELATION_S as PLACE_CORRELATION_S
 
 HIPS: Final = (11, 12)

@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body import BodyModel
 from worldpose.body.keypoints import JOINT_NAMES
-from worldpose.body.model import BODY_POSE
+from worldpose.body.model import BODY_POSE, BodyModel
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import Rigid
 from worldpose.parsing import read_npz_members
 
 COORDINATES: Final = (

@@ -19,7 +19,7 @@ from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections, TrackedFrames
 from worldpose.body_fitting.pose_space import interpolate_gaps
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 BLOCK: Final = 256
 """Frames of detections in memory at a time."""

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.body import BodyModel, BodyParameters
 from worldpose.body.jacobian import ChainedKeypoints
-from worldpose.body.model import BODY_POSE
+from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
 from worldpose.body_fitting.bones import Shape, fit_shape, measure_bones, shorten_limbs
 from worldpose.body_fitting.monocular import MonocularPrior
 from worldpose.body_fitting.objective import (
@@ -47,8 +46,8 @@ from worldpose.body_fitting.pose_space import (
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.compiled import map_in_threads
 from worldpose.errors import DegenerateError
-from worldpose.geometry import Rigid
 from worldpose.geometry.optimize.banded import BandedFactor
+from worldpose.geometry.rigid import Rigid
 
 ACCELERATION_WEIGHT: Final = float((1.0 / ACCELERATION_SCALE**2).sum())
 """Number of hip accelerations that equal independent accelerations of all keypoints [1]. But a body

@@ -61,9 +61,8 @@ from worldpose.broadcast_calibration.uncertainty import (
     paint_variance,
 )
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.pitch.template import PitchTemplate
 
 Pictures = Callable[[], Iterator[Image]]
 """Starts a new pass over all frames of the clip, grey (height, width), in order."""

@@ -28,18 +28,19 @@ from worldpose.broadcast_calibration.priors import build_prior
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.solver import Problem, solve
 from worldpose.errors import DegenerateError, InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import (
-    CameraEstimate,
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.parameters import CameraEstimate, nearest_on_markings
+from worldpose.static_calibration.proposal import propose_camera
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.static_calibration.sides import (
+    INDEPENDENT_S,
+    MIN_EVIDENCE,
     SeenPeople,
-    StaticCalibration,
-    calibrate_camera,
-    propose_camera,
+    compare_sides,
 )
-from worldpose.static_calibration.parameters import nearest_on_markings
-from worldpose.static_calibration.sides import INDEPENDENT_S, MIN_EVIDENCE, compare_sides
-from worldpose.tracking import locate_feet
+from worldpose.tracking.feet import locate_feet
 
 _ITERATIONS = 3
 """Iterations that match drawn markings and painted lines again [1]."""

@@ -21,8 +21,7 @@ from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cam
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import surface_shape
+from worldpose.pitch.template import PitchTemplate, surface_shape
 from worldpose.static_calibration.line_detection import (
     CANDIDATES,
     CLEARANCE,

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats
 from worldpose.broadcast_calibration.normal_equations import Cameras, Lens
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 FRAME_SIZE = 7
 """Parameters of a frame's step: rotation [rad] in the camera's axes, log focal, k1, k2, k3."""

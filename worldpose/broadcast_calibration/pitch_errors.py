@@ -18,8 +18,7 @@ from data_contracts.arrays import Floats, Integers
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import law_points, surface_shape
+from worldpose.pitch.template import PitchTemplate, law_points, surface_shape
 
 SIZES: Final = ("length", "width", "crown", "end_fall")
 """Entries of pitch.json that a clip's fit estimates."""

@@ -13,7 +13,7 @@ from data_contracts.records import Record
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastPrior
 from worldpose.broadcast_calibration.tracking import LENS_POWERS, Chain
-from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import Rigid
 
 REFERENCE: Final = 2.19
 """Reference focal length of the prior's distortion, in image widths [1]."""

@@ -26,7 +26,7 @@ from worldpose.broadcast_calibration.priors import Weights
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.broadcast_calibration.tracking import Chain
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 _MIN_LINES: Final = 30
 """Minimum line samples that determine a frame's camera [1]."""

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from data_contracts.pitch import Coordinate
 from data_contracts.records import Positive, Record
-from worldpose.static_calibration import CameraPrior, StaticCalibrationSettings
+from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 
 _Offset = Annotated[float, Field(ge=-1, le=1)]
 """Offset in widths of the image [1]."""

@@ -20,7 +20,7 @@ from worldpose.broadcast_calibration.normal_equations import (
     flow_row,
 )
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import Rigid
 
 
 @dataclass(frozen=True, eq=False)

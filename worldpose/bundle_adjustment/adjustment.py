@@ -45,9 +45,9 @@ from worldpose.bundle_adjustment.uncertainty import (
     survey_response,
 )
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
-from worldpose.static_calibration import PARAMETERS, project_with_jacobian
-from worldpose.triangulation import triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian
+from worldpose.triangulation.passes import triangulate_joints
 
 _OTHER_PEOPLE: Final = (
     "refused: this camera shows other people than the other cameras under the same ids"

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import StaticCalibration
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,9 @@ from worldpose.bundle_adjustment.solver import Problem, Solution, solve
 from worldpose.bundle_adjustment.uncertainty import Similarity, align_points
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.static_calibration import PARAMETERS
-from worldpose.triangulation import triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
 
 _INTERVALS: Final = 4

@@ -30,8 +30,8 @@ from worldpose.bundle_adjustment.problems import KeypointNoise, estimate_noise
 from worldpose.bundle_adjustment.solver import Solution
 from worldpose.bundle_adjustment.uncertainty import Similarity, relative_covariance
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.static_calibration import project_with_jacobian
+from worldpose.geometry.cameras import Camera
+from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
 
 UNKNOWN_FOCAL: Final = 0.1

@@ -23,7 +23,8 @@ from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution, solve
 from worldpose.detection.box_tracking import BoxTracker
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.triangulation.noise_model import STATURE
 
 JOINTS: Final = np.arange(5, 17)

@@ -11,8 +11,8 @@ from data_contracts.arrays import Flags, Floats
 from worldpose.bundle_adjustment.clip import Clip, Observations
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution
-from worldpose.geometry import Camera
-from worldpose.static_calibration import PARAMETERS
+from worldpose.geometry.cameras import Camera
+from worldpose.static_calibration.parameters import PARAMETERS
 
 MEDIAN_SQUARED: Final = 2.0 * np.log(2.0)
 """Median squared length of a standard Gaussian in two dimensions [1]."""

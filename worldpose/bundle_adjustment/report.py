@@ -15,10 +15,10 @@ from worldpose.bundle_adjustment.problems import KeypointNoise
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_arrays
-from worldpose.static_calibration import image_problems, project_with_jacobian
-from worldpose.triangulation import triangulate_joints
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.static_calibration.report import image_problems
+from worldpose.triangulation.passes import triangulate_joints
 
 
 def adjustment_arrays(

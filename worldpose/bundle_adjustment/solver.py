@@ -12,7 +12,7 @@ from scipy.linalg.blas import dsyrk
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.bundle_adjustment.settings import SolverSettings
 from worldpose.errors import InputError, InternalError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
 from worldpose.geometry.optimize.schur_complement import (
     STEPS,
@@ -22,7 +22,7 @@ from worldpose.geometry.optimize.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.static_calibration import step_camera
+from worldpose.static_calibration.parameters import step_camera
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""

@@ -17,14 +17,15 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from worldpose.bundle_adjustment.clip import Clip
-from worldpose.geometry import Camera, Rigid
-from worldpose.static_calibration import PARAMETERS, project_with_jacobian
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     project_lines,
     sample_markings,
     thin_samples,
 )
+from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian
 from worldpose.static_calibration.settings import LineRefinementSettings
 
 SIMILARITY: Final = 7

@@ -14,7 +14,7 @@ from data_contracts.arrays import Floats
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.compiled import compile_kernel, map_in_threads
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
 from worldpose.tracking.settings import TrackingSettings

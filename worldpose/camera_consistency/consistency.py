@@ -16,7 +16,7 @@ from worldpose.camera_consistency.diagnosis import Consistency, Diagnosis, Fault
 from worldpose.camera_consistency.hypotheses import OFF_AXIS
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
 
 GIVEN_TILT: Final = 0.003

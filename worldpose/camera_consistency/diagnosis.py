@@ -27,7 +27,7 @@ from worldpose.camera_consistency.hypotheses import (
     scale_focal_length,
 )
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 PARTNERS: Final = 4
 """Number of partners for the closer comparison of a camera that agrees with others."""

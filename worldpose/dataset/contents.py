@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import Finding, ReleaseManifest
-from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
+from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.archives import wrong
 from worldpose.formats.challenge import (
@@ -26,7 +27,7 @@ from worldpose.formats.challenge import (
     submission_clips,
 )
 from worldpose.formats.joints_file import read_joints, read_poses
-from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import Rigid
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from data_contracts.records import Positive, Record, Share
 from data_contracts.release import Finding
 from worldpose.dataset.contents import PointSource, View
 from worldpose.formats.challenge import CameraRows
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 LATEST: Final = 3
 """Maximum frame offset that is tested [frame]."""

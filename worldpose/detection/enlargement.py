@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats, Image
 from worldpose.detection.interfaces import Detector, People
 from worldpose.detection.suppression import suppress
-from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_iou
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 
 STEPS: Final = ((36.0, 2.0), (18.0, 3.0))
 """Heights below which people are seen enlarged [px], and the enlargement [1]."""

@@ -30,9 +30,9 @@ from worldpose.detection.models import (
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse, suppress, suppress_poses
 from worldpose.detection.views import TiledDetector
-from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_areas
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 
 HEAD_HEIGHT: Final = 1.75
 """Height of the head above the ground, for a person whose feet the lower border cuts off [m]."""

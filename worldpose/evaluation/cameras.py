@@ -12,8 +12,9 @@ from pydantic import Field
 from data_contracts.evaluation import CameraErrors, CameraEvaluation
 from data_contracts.records import Record
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rays
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rays import Rays
+from worldpose.pitch.template import PitchTemplate
 
 
 class CameraErrorSettings(Record):

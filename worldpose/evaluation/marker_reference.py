@@ -21,7 +21,7 @@ from worldpose.evaluation.matching import (
     register_world,
     take_matched,
 )
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.rigid import Similarity, align
 
 METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}

@@ -12,8 +12,8 @@ from scipy.optimize import linear_sum_assignment
 
 from data_contracts.records import Record
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
 from worldpose.geometry.boxes import box_iou
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Similarity, align
 
 HOTA_LEVELS: Final = np.arange(1, 20) / 20.0

@@ -19,8 +19,8 @@ from worldpose.evaluation.matching import (
     select_frames,
     take_matched,
 )
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import align
 
 LIMBS: Final = {

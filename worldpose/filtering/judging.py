@@ -15,8 +15,9 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.compiled import map_in_threads
 from worldpose.filtering.settings import FilteringSettings
-from worldpose.geometry import Camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 Places = NDArray[np.int64]
 

@@ -34,7 +34,7 @@ from worldpose.filtering.judging import (
     learn_keypoint_spread,
 )
 from worldpose.filtering.settings import FilteringSettings
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import by_step
 
 WAVES: Final = (2, 3)

@@ -27,10 +27,10 @@ from worldpose.formats.calibration_files import (
 from worldpose.formats.calibration_systems import read_calibration_xml
 from worldpose.formats.files import SETTINGS_BYTES, require_file
 from worldpose.formats.lens_files import read_file_storage
-from worldpose.video import is_video
+from worldpose.video.names import is_video
 
 if TYPE_CHECKING:
-    from worldpose.geometry import Camera
+    from worldpose.geometry.cameras import Camera
 
 OPENCAP_NAME: Final = "cameraIntrinsicsExtrinsics"
 """Stem of OpenCap's files; the folder of each is called as the camera."""
@@ -73,7 +73,7 @@ def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     Raises:
         InputError: an unknown form, or an invalid entry, with file and key.
     """
-    from worldpose.geometry import Camera  # late: most commands only check calibrations
+    from worldpose.geometry.cameras import Camera  # late: most commands only check calibrations
 
     given = read_calibration(Path(path))
     return {name: Camera.from_calibration(calibration) for name, calibration in given.items()}

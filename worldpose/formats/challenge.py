@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.cameras import CameraCalibration
-from worldpose.body import BODY25, CHALLENGE15, BodyModel, BodyParameters, fold_keypoints
+from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 from worldpose.formats.files import whole_file
-from worldpose.geometry import Camera, Rigid
-from worldpose.geometry.rigid import nearest_rotation
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid, nearest_rotation
 from worldpose.parsing import read_npy
 
 MEMBERS: Final = {

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.body import SKELETONS, BodyModel, BodyParameters
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 _KINDS: Final = {"int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _TYPES: Final = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.archives import Member, read_archive, write_archive, wrong
 

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, COCO17_BONES
-from worldpose.body import SKELETONS, BodyModel, BodyParameters
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 PIXEL_DECIMALS: Final = 2
 """Decimals of all pixel values: a hundredth of a pixel is far below any detector's error."""

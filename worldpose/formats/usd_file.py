@@ -10,11 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Floats
-from worldpose.body import SKELETONS, BodyModel
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyModel
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.gltf_file import FACING, INFLUENCES, AnimatedBody
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 APERTURE_MM: Final = 36.0
 """Width of a camera's sensor [tenth of a unit]; only its ratio to the focal length counts."""

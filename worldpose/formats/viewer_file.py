@@ -34,11 +34,11 @@ from scipy.spatial.transform import Rotation
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17_BONES
-from worldpose.body import BodyModel, BodyParameters, is_open_body
-from worldpose.body.model import articulate
+from worldpose.body.body_file import is_open_body
+from worldpose.body.model import BodyModel, BodyParameters, articulate
 from worldpose.errors import InputError
 from worldpose.formats.files import whole_file
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 FORMAT: Final = "worldpose-viewer/1"
 RANGE_SECONDS: Final = 10.0

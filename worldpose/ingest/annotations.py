@@ -14,7 +14,7 @@ from data_contracts.static_calibration import ClickedMarkings, Pixel
 from worldpose.errors import InputError
 from worldpose.formats.files import read_json
 from worldpose.ingest.validation import existing_file, validate_record
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 CLICKED_FOLDER: Final = "annotations/static_calibration"
 """Folder of `<camera>.json`, relative to the match folder."""

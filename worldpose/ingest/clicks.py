@@ -19,13 +19,12 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.formats import whole_file
 from worldpose.formats.annotations.marked_images import MarkedImage, read_marked_images
+from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch, refuse_unread_pitch
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import law_points
+from worldpose.pitch.template import PitchTemplate, law_points
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""

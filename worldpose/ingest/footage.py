@@ -20,7 +20,7 @@ from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder
 
 if TYPE_CHECKING:
-    from worldpose.video import FrameIndex
+    from worldpose.video.files import FrameIndex
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def read_footage(
     Raises:
         InputError: no video, another size or rate, or a clip of which it has no frame.
     """
-    from worldpose.video import index_video  # late: most commands open no video
+    from worldpose.video.folder import index_video  # late: most commands open no video
 
     index = index_video(path) if index is None else index
     if index.size != image_size:

@@ -4,7 +4,3 @@ Input: a `PitchSpec` with surveyed points, or none; a surveyor's file. Output: a
 metres for calibration, drawing and filtering; a survey in the world frame
 (`worldpose.pitch.survey`).
 """
-
-from worldpose.pitch.template import MarkingSamples, PitchTemplate
-
-__all__ = ["MarkingSamples", "PitchTemplate"]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyModel, BodyParameters
-from worldpose.geometry import Camera
+from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rasters import (
     NOBODY,
     Samples,

@@ -14,7 +14,7 @@ from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.shots import Shot
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
     INK,
     PALETTE,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import crowded_part
 from worldpose.reports.drawing import (
     GRASS,

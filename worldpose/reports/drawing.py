@@ -31,7 +31,7 @@ from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 if TYPE_CHECKING:
     from worldpose.static_calibration.boards import LensFit

@@ -14,7 +14,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import markings, person_color
 
 NAME: Final = "worldpose"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Image
 from data_contracts.pitch import PitchSpec
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.drawing import (
     HALO,
     INK,

@@ -14,7 +14,7 @@ from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, paint_bodies, zoom_camera
 from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, person_color
 

@@ -16,8 +16,8 @@ from data_contracts.review import (
     RedrawnMarking,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
-from worldpose.ingest import MatchFolder
-from worldpose.pitch import PitchTemplate
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DETECTION_EDITS, DetectionEdit
 from worldpose.review.identities import IDENTITY_EDITS
 

@@ -19,14 +19,13 @@ from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
 from data_contracts.review import Acceptance
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.geometry import Camera, Rays, intersect_rays
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rays import Rays, intersect_rays
+from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DetectionEdit
-from worldpose.static_calibration import (
-    CalibrationReport,
-    StaticCalibrationSettings,
-    calibrate_camera,
-)
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import CalibrationReport
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 
 @dataclass(frozen=True, eq=False)

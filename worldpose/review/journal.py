@@ -26,9 +26,9 @@ from data_contracts.review import (
     Withdrawal,
 )
 from worldpose.errors import CorruptionError
-from worldpose.store import Store
 from worldpose.store.documents import read_checksum, record_checksum, seal, unseal
 from worldpose.store.paths import checked_name
+from worldpose.store.store import Store
 
 _ENTRY = re.compile(r"(\d{6,})\.json")
 READERS = 8

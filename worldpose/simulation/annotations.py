@@ -13,8 +13,9 @@ from data_contracts.arrays import Floats
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.settings import CalibrationErrors, ClickSettings
 
 SPACING: Final = 0.25

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 
 _SHIRT, _SHORTS, _SKIN, _SOCKS, _BOOTS, _HAIR = range(6)
 _GOAL_RADIUS = 0.06

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Singles
-from worldpose.body import BodyParameters
-from worldpose.geometry import Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.body.model import BodyParameters
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.mannequins import (
     Kit,
     Mannequin,

@@ -14,9 +14,8 @@ from typing import Final
 import numpy as np
 
 from data_contracts.arrays import Floats
-from worldpose.body import BodyParameters
-from worldpose.body.model import BODY_POSE
-from worldpose.pitch import PitchTemplate
+from worldpose.body.model import BODY_POSE, BodyParameters
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.football import play
 from worldpose.simulation.gait import tread
 from worldpose.simulation.motions import Action, jump

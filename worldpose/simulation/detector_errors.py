@@ -19,10 +19,12 @@ from data_contracts.arrays import Flags, Floats
 from data_contracts.conventions import COCO17, COCO17_SIGMAS
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
-from worldpose.body import BodyModel, BodyParameters, load_open_body
-from worldpose.formats import write_archive
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyModel, BodyParameters
+from worldpose.formats.archives import write_archive
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.gait import walk
 from worldpose.simulation.paths import bursts, drift, wander
 from worldpose.simulation.settings import CrowdSettings, ObservationNoise, Scenario

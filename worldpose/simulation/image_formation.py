@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rasters import (
     NOBODY,
     Box,

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
-from worldpose.body import BodyModel, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.compiled import compile_kernel
 from worldpose.simulation.settings import PATTERNS, Pattern
 

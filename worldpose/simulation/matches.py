@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Image, Singles
 from data_contracts.broadcast_calibration import KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from worldpose.body import OPEN_BODY
-from worldpose.formats import write_archive, write_joints, write_moving_camera, write_static_camera
-from worldpose.formats.joints_file import write_poses
-from worldpose.geometry import Camera
-from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
+from worldpose.body.body_file import OPEN_BODY
+from worldpose.formats.archives import write_archive
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.challenge import write_moving_camera, write_static_camera
+from worldpose.formats.joints_file import write_joints, write_poses
+from worldpose.geometry.cameras import Camera
 from worldpose.ingest.footage import write_still
-from worldpose.pitch import PitchTemplate
+from worldpose.ingest.writing import MatchAnnotations, write_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click_key_frames
 from worldpose.simulation.cast import (
     BALL,
@@ -54,7 +56,7 @@ from worldpose.simulation.renderer import film_broadcast, render_broadcast, rend
 from worldpose.simulation.scene import Scene, simulate_scene
 from worldpose.simulation.settings import CalibrationErrors, RenderingSettings, Scenario
 from worldpose.simulation.venues import Venue, build_venue, paint_empty
-from worldpose.video import write_video
+from worldpose.video.files import write_video
 
 
 @dataclass(frozen=True, eq=False)

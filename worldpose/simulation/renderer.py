@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Singles
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.capsules import draw_things, goal_capsules, person_capsules
 from worldpose.simulation.image_formation import Moment, RenderedFrame, expose, sensor_grain
 from worldpose.simulation.settings import RenderingSettings

@@ -13,12 +13,13 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17, FEET
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyModel, BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.keypoints import point_segments
-from worldpose.body.model import BODY_POSE
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints, point_segments
+from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import Clicks, add_calibration_errors, click, every, survey
 from worldpose.simulation.crowd import Crowd, gather
 from worldpose.simulation.detector_errors import (

@@ -15,10 +15,10 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyModel, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import VERTEX_OF_POINT
-from worldpose.body.model import BODY_POSE
-from worldpose.geometry import Rigid
+from worldpose.body.model import BODY_POSE, BodyModel, BodyParameters
+from worldpose.geometry.rigid import Rigid
 
 BUILD: Final = (-1.0, 0.5)
 """Mean and standard deviation of the second beta [1]: wide shoulders, narrow hips, little fat."""

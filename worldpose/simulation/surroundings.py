@@ -15,7 +15,7 @@ import numpy as np
 from data_contracts.arrays import Floats
 from data_contracts.pitch import ArcSpec
 from worldpose.compiled import compile_kernel
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 LINE_WIDTH: Final = 0.12
 """Width of the painted markings, centred on the template's line [m] (Law 1)."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from data_contracts.arrays import Floats, Singles
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.capsules import draw_shadows, draw_things
 from worldpose.simulation.settings import RenderingSettings
 from worldpose.simulation.surroundings import (

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import LensCalibration
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.evidence import Evidence, count_neighbors
 from worldpose.static_calibration.parameters import (
     PARAMETERS,

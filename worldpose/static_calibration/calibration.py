@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import law_points
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate, law_points
 from worldpose.static_calibration.adjustment import (
     Problem,
     adjust,

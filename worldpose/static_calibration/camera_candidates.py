@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.match import Side
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.line_samples import LineSamples
 from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
 from worldpose.static_calibration.settings import CameraPrior

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_contracts.arrays import Floats
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.camera_candidates import (
     SEGMENTS,
     TILTS,

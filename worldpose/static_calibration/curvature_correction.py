@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import (
     Problem,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import points_off_line
 
 _MAX_DRAWN: Final = 200

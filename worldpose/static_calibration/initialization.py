@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.adjustment import Problem, adjust, camera_row
 from worldpose.static_calibration.evidence import Evidence
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings

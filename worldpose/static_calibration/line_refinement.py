@@ -21,9 +21,8 @@ from scipy.special import chdtrc
 
 from data_contracts.arrays import Floats
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import Surface
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate, Surface
 from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import (
     Explanation,

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.line_detection import CANDIDATES, CLEARANCE, find_bars, fit_bars
 from worldpose.static_calibration.line_samples import (
     LineSamples,

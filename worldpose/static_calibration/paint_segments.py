@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Image, Integers
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 _WIDTHS: Final = (1280, 1920)
 """Minimum and maximum width of the image in which paint is searched [px]: far lines of a wide view

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from data_contracts.arrays import Floats, Integers
 from data_contracts.static_calibration import CAMERA_STEP
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera, Projection
+from worldpose.geometry.cameras import Camera, Projection
 from worldpose.geometry.projection import fold_squared, project_with_jacobians
 
 PARAMETERS: Final = CAMERA_STEP

@@ -22,8 +22,9 @@ from data_contracts.cameras import LensCalibration
 from data_contracts.match import Side
 from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.camera_candidates import (
     INDEPENDENT,

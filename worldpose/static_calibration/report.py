@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import LensCalibration
-from worldpose.geometry import Camera, RayStatus
-from worldpose.geometry.cameras import camera_arrays
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera, camera_arrays
+from worldpose.geometry.rays import RayStatus
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.adjustment import Problem, camera_row, compute_residuals
 from worldpose.static_calibration.click_outliers import Explanation, InlierFit
 from worldpose.static_calibration.ground_error import (

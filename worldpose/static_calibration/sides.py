@@ -15,8 +15,9 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 
 MIN_EVIDENCE: Final = 7.0
 """Minimum log probability ratio that decides a side [1]: a thousand to one."""

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.geometry import Camera
-from worldpose.geometry.cameras import camera_from_arrays
+from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import camera_row
 from worldpose.static_calibration.curvature_correction import ClicksAndBars, weight_residuals

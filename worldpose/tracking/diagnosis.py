@@ -20,7 +20,7 @@ import numpy as np
 
 from data_contracts.arrays import ClipArray, Flags, Floats
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import size_ratios
 from worldpose.tracking.pair_births import CameraGates, CameraVisibility, judge_pairs
 from worldpose.tracking.settings import TrackingSettings

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import AnyFloats, Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
 
 ANKLES: Final = (15, 16)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import associate
 from worldpose.tracking.joins import (
     Candidate,

@@ -21,7 +21,7 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.tracking.epipolar import is_person, pair_distances, size_ratios
 from worldpose.tracking.person import Sighting, separations
 from worldpose.tracking.ray_matching import intersect_people

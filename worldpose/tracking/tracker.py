@@ -17,7 +17,7 @@ from data_contracts.records import Record
 from data_contracts.tracking import Join, Track
 from worldpose.compiled import compile_kernel, map_in_threads
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
 from worldpose.tracking.feet import PIXEL_SHARE, PIXEL_STD
 from worldpose.tracking.frame_tracker import FrameTracker

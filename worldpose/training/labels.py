@@ -17,10 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from data_contracts.arrays import Flags, Floats, Image
 from data_contracts.conventions import COCO17
-from worldpose.detection import DetectionSettings, People, load_detectors, load_pose
+from worldpose.detection.interfaces import People
+from worldpose.detection.models import load_detectors, load_pose
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import combine_boxes, fuse
 from worldpose.errors import InputError, UsageError
-from worldpose.video import open_video
+from worldpose.video.folder import open_video
 
 VISIBLE_CONFIDENCE: Final = 0.5
 """Keypoints from this confidence on are proposed as visible, others as occluded [1]."""

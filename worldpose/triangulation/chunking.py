@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import ClipArray, Flags, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.batched_gauss_newton import LANES
 from worldpose.triangulation.clocks import CameraClocks, estimate_clocks, read_frames
 from worldpose.triangulation.limb_lengths import undo_swaps

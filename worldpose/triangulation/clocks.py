@@ -17,7 +17,8 @@ from data_contracts.arrays import ClipArray, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import Record
 from worldpose.compiled import map_in_threads
-from worldpose.geometry import Camera, projection
+from worldpose.geometry import projection
+from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.noise_model import NoiseModel
 from worldpose.triangulation.observations import Observations, Rig
 from worldpose.triangulation.settings import TriangulationSettings

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import AnyFloats, Floats
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera, fold_radius, projection
-from worldpose.geometry.projection import distort
+from worldpose.geometry import projection
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.projection import distort, fold_radius
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,

@@ -19,7 +19,7 @@ from data_contracts.arrays import Floats
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.limb_lengths import (
     find_swaps,
     limb_lengths,

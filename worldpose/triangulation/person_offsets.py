@@ -18,7 +18,8 @@ from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from worldpose.compiled import compile_kernel
-from worldpose.geometry import Camera, projection
+from worldpose.geometry import projection
+from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.batched_gauss_newton import (
     EXTRA,
     LANES,

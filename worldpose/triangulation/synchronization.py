@@ -15,22 +15,19 @@ import numpy as np
 
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency import ConsistencySettings
 from worldpose.camera_consistency.comparison import Comparison
 from worldpose.camera_consistency.consistency import select_busiest_frames
 from worldpose.camera_consistency.hypotheses import STATED
+from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, projection
-from worldpose.pitch import PitchTemplate
-from worldpose.tracking import (
-    GroundPositions,
-    TrackingSettings,
-    estimate_plane_clocks,
-    locate_feet,
-    track_on_plane,
-    track_people,
-)
-from worldpose.tracking.plane_clocks import MIN_RUNNERS
+from worldpose.geometry import projection
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.tracking.feet import GroundPositions, locate_feet
+from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.plane_clocks import MIN_RUNNERS, estimate_plane_clocks
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 from worldpose.triangulation.clocks import (
     ALIKE,
     GATES,

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body import BodyModel, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyModel, BodyParameters
 
 
 @pytest.fixture(scope="session")

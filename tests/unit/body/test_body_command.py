@@ -6,7 +6,7 @@ from smpl_pickles import pickled, smpl_like
 from typer.testing import CliRunner
 
 from flows.cli.app import app
-from worldpose.body import find_body
+from worldpose.body.body_file import find_body
 from worldpose.errors import InputError
 
 

@@ -4,8 +4,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from worldpose.body import OPEN_BODY, find_body, load_body, save_body
-from worldpose.body.body_file import KEYS, read_npz_arrays
+from worldpose.body.body_file import (
+    KEYS,
+    OPEN_BODY,
+    find_body,
+    load_body,
+    read_npz_arrays,
+    save_body,
+)
 from worldpose.errors import InputError, UsageError
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from smpl_pickles import pickled, smpl_like
 
-from worldpose.body import BodyParameters, find_body, install_body
-from worldpose.body.body_file import KEYS, read_npz_arrays, save_body
+from worldpose.body.body_file import KEYS, find_body, install_body, read_npz_arrays, save_body
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
 
 

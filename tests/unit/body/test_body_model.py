@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body import BodyParameters
 from worldpose.body.keypoints import JOINT_NAMES
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Rigid
 

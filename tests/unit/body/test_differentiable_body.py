@@ -3,8 +3,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from worldpose.body import SKELETONS, BodyParameters, fold_keypoints  # noqa: E402
 from worldpose.body.differentiable import DifferentiableBody  # noqa: E402
+from worldpose.body.keypoints import SKELETONS, fold_keypoints  # noqa: E402
+from worldpose.body.model import BodyParameters  # noqa: E402
 
 # Double precision at tens of metres.
 ROUNDING = 1e-10

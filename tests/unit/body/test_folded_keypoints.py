@@ -3,8 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body import SKELETONS, BodyParameters, fold_keypoints, fold_regressor
-from worldpose.body.keypoints import JOINT_OF_POINT, VERTEX_OF_POINT
+from worldpose.body.keypoints import (
+    JOINT_OF_POINT,
+    SKELETONS,
+    VERTEX_OF_POINT,
+    fold_keypoints,
+    fold_regressor,
+)
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 
 # The requirement is 0.02 mm; double precision at tens of metres gives 1e-11.

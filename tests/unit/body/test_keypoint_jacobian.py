@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body import BODY25, SKELETONS, BodyParameters, fold_keypoints
 from worldpose.body.jacobian import ChainedKeypoints
+from worldpose.body.keypoints import BODY25, SKELETONS, fold_keypoints
+from worldpose.body.model import BodyParameters
 
 NAMES = ("betas", "global_orient", "body_pose", "transl")
 STEP = 1e-6

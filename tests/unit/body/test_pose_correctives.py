@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body import BodyParameters
 from worldpose.body.keypoints import JOINT_NAMES, LANDMARKS, VERTEX_OF_POINT
+from worldpose.body.model import BodyParameters
 
 
 def bent(**turns):

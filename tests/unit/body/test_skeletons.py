@@ -1,11 +1,15 @@
 import numpy as np
 import pytest
 
-from worldpose.body import BODY25, CHALLENGE15, EVALUATED14, SKELETONS, load_open_body
+from worldpose.body.body_file import load_open_body
 from worldpose.body.keypoints import (
+    BODY25,
+    CHALLENGE15,
+    EVALUATED14,
     JOINT_NAMES,
     JOINT_OF_POINT,
     LANDMARKS,
+    SKELETONS,
     VERTEX_OF_POINT,
     point_segments,
 )

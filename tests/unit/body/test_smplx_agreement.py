@@ -10,7 +10,7 @@ smplx = pytest.importorskip("smplx")
 
 from smplx.utils import Struct  # noqa: E402
 
-from worldpose.body import BODY25, fold_keypoints  # noqa: E402
+from worldpose.body.keypoints import BODY25, fold_keypoints  # noqa: E402
 
 # Measured 2e-8 m in double precision: smplx adds 1e-8 to every angle.
 AGREEMENT = 1e-5

@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
-from worldpose.body import BodyParameters
-from worldpose.body_fitting import (
-    BodyFittingSettings,
-    ClipEvidence,
-    FitMetrics,
-    body_fit,
-    fit_bodies,
-    report_fit,
-)
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting import body_fit
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.fit_quality import FitMetrics, report_fit
 from worldpose.body_fitting.objective import MIRRORED_OFFSETS, body_axes
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
 
 SETTINGS = BodyFittingSettings()

@@ -8,12 +8,9 @@ from test_monocular import broadcast
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body_fitting import (
-    BodyFittingSettings,
-    ClipEvidence,
-    fit_bodies,
-    report_fit,
-)
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.fit_quality import report_fit
+from worldpose.body_fitting.settings import BodyFittingSettings
 
 
 def test_figures_of_every_person_are_those_of_his_joints():

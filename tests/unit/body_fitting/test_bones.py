@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from walking_bodies import KEYPOINTS, MODEL
 
-from worldpose.body import BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.bones import (
     BONES,
     BoneLengths,

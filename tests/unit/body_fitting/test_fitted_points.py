@@ -7,18 +7,13 @@ import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.conventions import FEET
-from worldpose.body import fold_keypoints
-from worldpose.body.keypoints import LANDMARKS, point_segments
-from worldpose.body_fitting import (
-    BodyFittingSettings,
-    ClipEvidence,
-    extra_points,
-    fit_bodies,
-    perceived_points,
-)
-from worldpose.body_fitting.extra_points import KEPT_BIAS_M
+from worldpose.body.keypoints import LANDMARKS, fold_keypoints, point_segments
+from worldpose.body_fitting import extra_points
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
+from worldpose.body_fitting.extra_points import KEPT_BIAS_M, perceived_points
 from worldpose.body_fitting.pose_space import SIZE, SPREADS
-from worldpose.triangulation import ExtraJoints
+from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.triangulation.passes import ExtraJoints
 
 POINTS = fold_keypoints(MODEL, FEET)
 SETTINGS = BodyFittingSettings()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
-from worldpose.body import BodyParameters
-from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
 from worldpose.body_fitting.monocular import (
     INDEPENDENT_SHARE,
     PRIOR_SPREAD,
@@ -24,8 +24,10 @@ from worldpose.body_fitting.monocular import (
     read_monocular,
 )
 from worldpose.body_fitting.pose_space import GATHER
+from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
 VECTORS = np.random.default_rng(0).normal(0.0, 0.4, (3, 24, 3))

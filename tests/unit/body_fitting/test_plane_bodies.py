@@ -9,12 +9,13 @@ import pytest
 from scipy.special import chdtri
 from walking_bodies import KEYPOINTS, MODEL, walker
 
-from worldpose.body import BodyParameters
-from worldpose.body_fitting import PlaneEvidence, fit_bodies_on_plane
+from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
 from worldpose.body_fitting.objective import ankle_height
+from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
 
 FPS, FRAMES = 25.0, 30

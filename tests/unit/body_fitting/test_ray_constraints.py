@@ -8,8 +8,8 @@ from test_monocular import broadcast, crowd
 from walking_bodies import KEYPOINTS, MODEL, seen, walker
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.body import BodyParameters
-from worldpose.body_fitting import BodyFittingSettings, ClipEvidence, fit_bodies
+from worldpose.body.model import BodyParameters
+from worldpose.body_fitting.body_fit import ClipEvidence, fit_bodies
 from worldpose.body_fitting.objective import Evidence
 from worldpose.body_fitting.ray_constraints import (
     constrain_to_rays,
@@ -17,6 +17,7 @@ from worldpose.body_fitting.ray_constraints import (
     identify_people,
     shift_frames,
 )
+from worldpose.body_fitting.settings import BodyFittingSettings
 
 CAMERA = broadcast(1)
 

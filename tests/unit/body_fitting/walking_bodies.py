@@ -3,8 +3,9 @@
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.body.model import BODY_POSE
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BODY_POSE, BodyParameters
 from worldpose.body_fitting.pose_space import SPREAD, load_pose_prior
 
 MODEL = load_open_body()

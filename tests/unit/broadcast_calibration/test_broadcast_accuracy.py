@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from worldpose.broadcast_calibration import BroadcastClip, MovingCamera, People, calibrate_broadcast
-from worldpose.pitch import PitchTemplate
+from worldpose.broadcast_calibration.calibration import BroadcastClip, calibrate_broadcast
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
+from worldpose.broadcast_calibration.players import People
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click_key_frames
 from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.scenarios import SCENARIOS

@@ -20,11 +20,11 @@ from flows.stages.broadcast_pooling import STAGE as POOLING
 from tasks.broadcast_calibration import broadcast_calibration
 from tasks.broadcast_pooling import broadcast_pooling
 from tasks.ingest import ingest
-from worldpose.geometry import Camera
-from worldpose.ingest import MatchAnnotations, write_match
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.writing import MatchAnnotations, write_match
 from worldpose.simulation.renderer import render_broadcast
-from worldpose.store import Store
-from worldpose.video import write_video
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
 
 FIRST, COUNT, OFFSET = 7, 10, 4.4
 """The clip's first match frame and length; its video's frame there. Frames 4 to 13 are the clip's,

@@ -10,17 +10,17 @@ from data_contracts.broadcast_calibration import (
     KeyFrame,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.broadcast_calibration import (
-    BroadcastCalibrationSettings,
+from worldpose.broadcast_calibration import calibration
+from worldpose.broadcast_calibration.calibration import (
     BroadcastClip,
-    People,
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
-    calibration,
     moving_from_arrays,
 )
 from worldpose.broadcast_calibration.evidence import CLICK, MARKING
+from worldpose.broadcast_calibration.players import People
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
 from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.settings import RenderingSettings

@@ -5,13 +5,13 @@ import pytest
 import turning_clip as clip
 from test_calibrating_clips import FPS, LOOK, SETTINGS, clicks, grey
 
-from worldpose.broadcast_calibration import (
+from worldpose.broadcast_calibration.calibration import (
     BroadcastClip,
-    People,
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
 )
+from worldpose.broadcast_calibration.players import People
 from worldpose.simulation.renderer import render_broadcast
 
 FRAMES = 6

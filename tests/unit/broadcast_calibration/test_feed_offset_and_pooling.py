@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 import turning_clip as clip
 
-from worldpose.broadcast_calibration import (
-    People,
+from worldpose.broadcast_calibration.normal_equations import point_row
+from worldpose.broadcast_calibration.players import People, estimate_feed_offset
+from worldpose.broadcast_calibration.uncertainty import (
+    Uncertainty,
     drawn_to,
-    estimate_feed_offset,
     pool_centers,
     static_covariance,
 )
-from worldpose.broadcast_calibration.normal_equations import point_row
-from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.static_calibration.parameters import project_with_jacobian
 
 FRAMES, FPS = 120, 50.0

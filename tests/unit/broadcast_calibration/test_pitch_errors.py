@@ -7,13 +7,13 @@ import pytest
 import turning_clip as clip
 
 from data_contracts.pitch import PitchSpec
-from worldpose.broadcast_calibration import BroadcastCalibrationSettings, BroadcastPrior
 from worldpose.broadcast_calibration.evidence import MARKING, FlowEvidence, spread_noise
 from worldpose.broadcast_calibration.pitch_errors import PitchErrors
 from worldpose.broadcast_calibration.priors import build_prior
+from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings, BroadcastPrior
 from worldpose.broadcast_calibration.solver import Problem, displace, solve
 from worldpose.broadcast_calibration.uncertainty import lasting_samples, paint_variance
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 SETTINGS = BroadcastCalibrationSettings()
 

@@ -6,12 +6,12 @@ import pytest
 
 from worldpose.broadcast_calibration.shots import find_shots, grass_and_people
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_broadcast
 from worldpose.simulation.scene import look_at
-from worldpose.video import VideoReader, index_frames, write_video
-from worldpose.video.files import cut_video
+from worldpose.video.files import VideoReader, cut_video, index_frames, write_video
 
 SIZE = np.array([320, 180])
 FPS = 10.0

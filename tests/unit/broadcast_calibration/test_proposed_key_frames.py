@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.broadcast_calibration import KnownPeople, propose_key_frames
+from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
 

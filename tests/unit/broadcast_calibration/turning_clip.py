@@ -9,7 +9,7 @@ from worldpose.broadcast_calibration.evidence import (
     PointEvidence,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import look_at
 
 PITCH = PitchTemplate.standard()

@@ -2,11 +2,14 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.bundle_adjustment import Clicks, Clip, Problem
-from worldpose.geometry import Camera, Rigid
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.bundle_adjustment.solver import Problem
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import PARAMETERS, step_camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.static_calibration.parameters import PARAMETERS, step_camera
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 def rig(count, rng):

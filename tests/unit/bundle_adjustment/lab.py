@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.bundle_adjustment import Clicks, Clip
-from worldpose.geometry import Camera, Rigid
-from worldpose.static_calibration import step_camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 FPS = 25.0
 SIZE = (1280, 960)

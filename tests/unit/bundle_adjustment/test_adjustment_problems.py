@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import BundleAdjustmentSettings, GivenCameraPrior
 from worldpose.bundle_adjustment.clip import select_observations
 from worldpose.bundle_adjustment.problems import (
     KeypointNoise,
@@ -16,8 +15,9 @@ from worldpose.bundle_adjustment.problems import (
     markings_problem,
     players_problem,
 )
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
 from worldpose.bundle_adjustment.solver import solve
-from worldpose.static_calibration import PARAMETERS
+from worldpose.static_calibration.parameters import PARAMETERS
 
 SETTINGS = BundleAdjustmentSettings()
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
-from worldpose.bundle_adjustment import (
-    BundleAdjustmentSettings,
-    Clicks,
-    adjust_cameras,
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks
+from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.report import (
     adjustment_arrays,
     keypoint_outliers,
     marking_errors,
     review_clicks,
-    weak_direction,
 )
-from worldpose.bundle_adjustment.problems import KeypointNoise
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.bundle_adjustment.uncertainty import weak_direction
 from worldpose.geometry.cameras import camera_from_arrays
-from worldpose.static_calibration import PARAMETERS
+from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.store.groups import checked_arrays, checked_attributes
 
 

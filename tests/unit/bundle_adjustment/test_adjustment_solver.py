@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import SolverSettings, solve
+from worldpose.bundle_adjustment.settings import SolverSettings
+from worldpose.bundle_adjustment.solver import solve
 from worldpose.errors import InputError, InternalError
-from worldpose.static_calibration import PARAMETERS, step_camera
+from worldpose.static_calibration.parameters import PARAMETERS, step_camera
 
 DISTURBED = np.array([2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1, 5e-3, 3.0, 3.0, 0.01, 0.005, 0.0])
 

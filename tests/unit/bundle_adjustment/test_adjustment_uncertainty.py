@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from worldpose.bundle_adjustment.uncertainty import add_shared_errors, survey_response
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import step_camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.line_samples import (
     EXACT_PAINT,
     project_lines,
@@ -15,6 +14,7 @@ from worldpose.static_calibration.line_samples import (
     thin_samples,
 )
 from worldpose.static_calibration.line_search import adjust
+from worldpose.static_calibration.parameters import step_camera
 
 SURVEY_ERROR = 0.006
 

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
-from worldpose.static_calibration import project_with_jacobian, step_camera
-from worldpose.triangulation import triangulate_joints
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
+from worldpose.triangulation.passes import triangulate_joints
 
 AMBIGUOUS = 0
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2)

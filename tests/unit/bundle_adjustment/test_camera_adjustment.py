@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import (
-    BundleAdjustmentSettings,
-    Clicks,
-    SolverSettings,
-    adjust_cameras,
-    adjustment,
-)
-from worldpose.static_calibration import step_camera
-from worldpose.triangulation import triangulate_joints
+from worldpose.bundle_adjustment import adjustment
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.passes import triangulate_joints
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
 

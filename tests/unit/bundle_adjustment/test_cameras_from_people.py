@@ -9,8 +9,9 @@ from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.people_cameras import KnownLength, locate_cameras
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, align
-from worldpose.simulation import SCENARIOS
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import align
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import look_at, simulate_scene
 
 FPS = 50.0

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldpose.bundle_adjustment import propose_frames
+from worldpose.bundle_adjustment.clip import propose_frames
 
 
 def test_frames_keep_their_distance_and_rise(clip):

@@ -10,8 +10,8 @@ from worldpose.bundle_adjustment.uncertainty import (
     relative_covariance,
     similarity_steps,
 )
-from worldpose.geometry import Rigid
-from worldpose.static_calibration import project_with_jacobian, step_camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
 
 ORIGIN = np.array([0.3, -0.2, 1.0])
 

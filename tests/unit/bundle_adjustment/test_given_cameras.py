@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from lab import joint_error, make_lab, triangulated
 
-from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
-from worldpose.static_calibration import step_camera
-from worldpose.triangulation import triangulate_joints
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.passes import triangulate_joints
 
 CASES = {
     "exact": {},

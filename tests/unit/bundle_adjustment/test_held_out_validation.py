@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.bundle_adjustment import BundleAdjustmentSettings, adjust_cameras
+from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.held_out_validation import (
     Verdict,
     compare_errors,
     held_out_errors,
     judge_cameras,
 )
-from worldpose.static_calibration import step_camera
-from worldpose.triangulation import triangulate_joints
+from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.triangulation.passes import triangulate_joints
 
 
 def test_true_cameras_are_judged_by_the_noise_alone(clip):

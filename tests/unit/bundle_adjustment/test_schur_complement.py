@@ -13,7 +13,7 @@ from worldpose.geometry.optimize.schur_complement import (
     eliminate,
     substitute,
 )
-from worldpose.static_calibration import PARAMETERS, project_with_jacobian, step_camera
+from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian, step_camera
 
 
 def evidence_of(problem):

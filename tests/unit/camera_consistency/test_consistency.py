@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.camera_consistency import ConsistencySettings, check_consistency
+from worldpose.camera_consistency.consistency import check_consistency
 from worldpose.camera_consistency.hypotheses import (
     LEFT_RIGHT,
     MAX_TANGENTIAL,
@@ -15,8 +15,10 @@ from worldpose.camera_consistency.hypotheses import (
     lens_hypotheses,
     tangential_shift,
 )
+from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 SETTINGS = ConsistencySettings(sample_frames=18)
 PITCH = (105.0, 68.0)

@@ -7,8 +7,9 @@ import pytest
 from faulty_data_sets import FPS, FRAMES, PERSONS, looking
 
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.formats import JointTracks, coco_dataset, write_coco, write_joints
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyParameters
 from worldpose.formats.challenge import (
     challenge_truth,
     write_challenge,
@@ -16,8 +17,10 @@ from worldpose.formats.challenge import (
     write_static_camera,
     write_submission,
 )
-from worldpose.formats.joints_file import write_poses
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
+from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 LENS = (0.05, 0.02, 0.004, -0.003, 0.03)
 

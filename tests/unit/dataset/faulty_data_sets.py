@@ -4,7 +4,8 @@ import numpy as np
 
 from worldpose.dataset.check import CheckSettings, check_clip
 from worldpose.dataset.contents import list_clips, read_clip
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 FRAMES, PERSONS, FPS = 40, 6, 50.0
 Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

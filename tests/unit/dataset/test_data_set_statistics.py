@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 from data_contracts.release import ClipStatistics
 from flows.cli.app import app
 from flows.results.dataset import check, count
-from worldpose.body import BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.dataset.manifest import clip_frame_rate, read_frame_rates, write_frame_rates
 from worldpose.dataset.statistics import clip_statistics, data_set_statistics
 from worldpose.errors import InputError, UsageError
-from worldpose.formats import JointTracks, write_joints, write_moving_camera
-from worldpose.formats.challenge import write_submission
-from worldpose.formats.joints_file import write_poses
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.challenge import write_moving_camera, write_submission
+from worldpose.formats.joints_file import JointTracks, write_joints, write_poses
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.data_set import bin_edges, plot_statistics
 
 

@@ -17,7 +17,7 @@ from worldpose.dataset.manifest import (
     write_origins,
 )
 from worldpose.errors import InputError
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 
 
 def manifest_of(folder, **changes):

@@ -12,8 +12,9 @@ from worldpose.detection.enlargement import (
     restore_size,
 )
 from worldpose.detection.interfaces import People
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 
 SHAPE = (1080, 1920, 3)
 

@@ -32,8 +32,9 @@ from worldpose.detection.net_inference import QuantizedNet
 from worldpose.errors import InputError
 from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.registration import digest_of_files
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.training import read_picture
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.training.labels import read_picture
 
 
 def shaken(net):

@@ -7,7 +7,6 @@ from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
 from worldpose.detection.bundled_nets import decode_candidates
 from worldpose.detection.bundled_pose import (
     CropEstimates,
@@ -15,8 +14,10 @@ from worldpose.detection.bundled_pose import (
     find_occluded_people,
     surroundings,
 )
-from worldpose.detection.interfaces import FindsOccludedPeople
+from worldpose.detection.interfaces import FindsOccludedPeople, People
 from worldpose.detection.models import load_bundled_pose
+from worldpose.detection.pipeline import PeopleFinder, Place
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
 from worldpose.geometry.boxes import box_iou
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import DetectionSettings, People, PeopleFinder, Place
-from worldpose.detection.interfaces import ScoreMap
+from worldpose.detection.interfaces import People, ScoreMap
 from worldpose.detection.models import SHIPPED_SCORE_MAP, load_score_map
-from worldpose.detection.pipeline import on_pitch
+from worldpose.detection.pipeline import PeopleFinder, Place, on_pitch
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import object_keypoint_similarity, suppress_poses
 from worldpose.formats.calibration_files import build_camera
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 
 SIZE = (1920, 1080)
 PITCH = PitchTemplate.standard()

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
 from worldpose.body.keypoints import LANDMARKS
-from worldpose.detection import DetectionSettings, People, PeopleFinder
 from worldpose.detection.bundled_nets import CELL, CROP, load_weights
+from worldpose.detection.interfaces import People
 from worldpose.detection.landmark_net import (
     POINTS,
     LandmarkEstimator,
@@ -22,6 +22,8 @@ from worldpose.detection.landmark_net import (
 )
 from worldpose.detection.models import LANDMARK_WEIGHTS, load_landmarks, weights_of
 from worldpose.detection.net_inference import QuantizedNet
+from worldpose.detection.pipeline import PeopleFinder
+from worldpose.detection.settings import DetectionSettings
 from worldpose.ingest.registration import digest_of_files
 
 RECIPE = Path(__file__).parents[3] / "infra" / "embedded_detector"

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from worldpose.detection import DetectionSettings, detect_people
 from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, decode_boxes, load_weights
 from worldpose.detection.models import BUNDLED_WEIGHTS, QUANTIZED_WEIGHTS, load_bundled_pose
 from worldpose.detection.net_inference import CROPS, FloatNet, QuantizedNet
+from worldpose.detection.pipeline import detect_people
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
-from worldpose.training import read_picture
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.training.labels import read_picture
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 

@@ -5,7 +5,7 @@ import pytest
 
 from data_contracts.conventions import COCO17_FLIP
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import DetectionSettings, load_detectors, weights_of
+from worldpose.detection.models import load_detectors, weights_of
 from worldpose.detection.onnx_nets import (
     _read_keypoints,
     cut_crops,
@@ -13,6 +13,7 @@ from worldpose.detection.onnx_nets import (
     from_heat_maps,
     points_in_frame,
 )
+from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.views import FlipTest
 from worldpose.errors import InputError
 

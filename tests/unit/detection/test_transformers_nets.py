@@ -5,7 +5,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from worldpose.detection import DetectionSettings, load_detectors, load_pose, weights_of
+from worldpose.detection.models import load_detectors, load_pose, weights_of
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (180, 240, 3), dtype=np.uint8)

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from worldpose.evaluation import EvaluationSettings, evaluate_joints
-from worldpose.formats import JointTracks
+from worldpose.evaluation.matching import EvaluationSettings
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
 
 SIDES = {1: 0.03, 3: 0.07, 5: 0.20, 7: 0.20, 9: 0.20, 11: 0.11, 13: 0.11, 15: 0.11}
 HEIGHTS = (1.70, 1.72, 1.70, 1.45, 1.15, 0.89, 0.90, 0.50, 0.10)

@@ -1,7 +1,8 @@
 import numpy as np
 
 from worldpose.evaluation.matching import box_overlaps, joint_boxes
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 DOWN_Z = Camera(
     focal=np.array([100.0, 100.0]),

@@ -9,10 +9,15 @@ from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.evaluation import CameraErrorSettings, evaluate_cameras
-from worldpose.evaluation.cameras import camera_samples, surface_points
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.evaluation.cameras import (
+    CameraErrorSettings,
+    camera_samples,
+    evaluate_cameras,
+    surface_points,
+)
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 
 FLAT = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 CROWNED = PitchTemplate.standard()

@@ -16,7 +16,7 @@ from worldpose.evaluation.marker_reference import (
     sample_joints,
 )
 from worldpose.evaluation.metrics import evaluate_joints
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import Y_UP, write_markers
 
 FPS, RATE, OFFSET = 50.0, 100.0, 0.7313

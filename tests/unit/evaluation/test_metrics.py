@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from people_samples import crowd, person, score, tracks
 
-from worldpose.evaluation import evaluate_joints
-from worldpose.formats import JointTracks
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
 
 # Sums of a few hundred rounded distances of some metres: 1e-9 mm is a thousand times their error.
 MM = 1e-9

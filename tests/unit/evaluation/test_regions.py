@@ -6,7 +6,7 @@ from joint_regions import SEGMENTS, group_errors, region_counts, segment_errors
 
 from data_contracts.conventions import COCO17, JOINT_GROUPS
 from worldpose.errors import InputError
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 
 
 def people(frames=60, persons=4, spread=0.03, stated=0.03, seed=0):

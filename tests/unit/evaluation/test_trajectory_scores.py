@@ -7,10 +7,10 @@ import pytest
 from people_samples import crowd, e4, person, score, tracks
 
 from worldpose.errors import InputError
-from worldpose.evaluation import evaluate_joints
-from worldpose.evaluation.metrics import path_lengths
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.evaluation.metrics import evaluate_joints, path_lengths
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 # Sums of a few thousand rounded distances, after a decomposition of 3 x 3 matrices: 1e-8 mm is
 # some thousand roundings of the metres they are made of.

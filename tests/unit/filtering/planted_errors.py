@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldpose.body_fitting import perceived_joints
-from worldpose.filtering import TriangulatedDetections, view_bodies
-from worldpose.geometry import Camera
+from worldpose.body_fitting.objective import perceived_joints
+from worldpose.filtering.judging import TriangulatedDetections, view_bodies
+from worldpose.geometry.cameras import Camera
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 

@@ -5,9 +5,8 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.filtering import measure_held_out
-from worldpose.filtering.judging import FARTHEST
-from worldpose.triangulation import TriangulationSettings
+from worldpose.filtering.judging import FARTHEST, measure_held_out
+from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = TriangulationSettings()
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from planted_errors import plant
 
-from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
+from worldpose.filtering.judging import judge_detections, learn_keypoint_spread
+from worldpose.filtering.settings import FilteringSettings
 
 SETTINGS = FilteringSettings()
 

@@ -7,8 +7,8 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.conventions import COCO17
-from worldpose.filtering import FilteringSettings, judge_detections, learn_keypoint_spread
-from worldpose.filtering.judging import Residuals
+from worldpose.filtering.judging import Residuals, judge_detections, learn_keypoint_spread
+from worldpose.filtering.settings import FilteringSettings
 from worldpose.filtering.systematic_errors import (
     TERMS,
     ClockEquations,
@@ -19,7 +19,7 @@ from worldpose.filtering.systematic_errors import (
     learn_view_bias,
     watch_motion,
 )
-from worldpose.geometry import Rigid
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import facing_axes
 
 ROWS = 3000

@@ -6,8 +6,8 @@ import pytest
 from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.evaluation.marker_reference import map_marker_names, marker_joints, read_markers
-from worldpose.formats import JointTracks
 from worldpose.formats.c3d_file import write_c3d
+from worldpose.formats.joints_file import JointTracks
 
 NOTES = {"licence": "For tests alone.\n" + "A long line. " * 40, "kind": "mixed"}
 FRAMES = np.array([100, 101, 102, 103, 105])

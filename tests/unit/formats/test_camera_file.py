@@ -4,8 +4,9 @@ import pytest
 
 from data_contracts.cameras import CameraCalibration
 from worldpose.errors import InputError
-from worldpose.formats import read_camera, write_archive, write_static_camera
-from worldpose.geometry import Camera
+from worldpose.formats.archives import write_archive
+from worldpose.formats.challenge import read_camera, write_static_camera
+from worldpose.geometry.cameras import Camera
 
 CALIBRATION = CameraCalibration(
     id="north",

@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.body import BODY25, CHALLENGE15, BodyParameters, fold_keypoints, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import BODY25, CHALLENGE15, fold_keypoints
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.challenge import (
     challenge_truth,
@@ -20,7 +22,8 @@ from worldpose.formats.challenge import (
     write_pitch_points,
     write_submission,
 )
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 FRAMES = 3
 K1 = 0.2

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from worldpose.formats import JointTracks, coco_dataset, write_coco
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.formats.motion_capture import coco_dataset, write_coco
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 
 @pytest.fixture

@@ -9,9 +9,14 @@ from test_marker_file import read_trc
 
 from data_contracts.conventions import COCO17, FEET
 from worldpose.errors import InputError
-from worldpose.formats import JointTracks, read_joints, write_joints
 from worldpose.formats.c3d_file import write_c3d
-from worldpose.formats.joints_file import ExtraTracks, fill_gaps
+from worldpose.formats.joints_file import (
+    ExtraTracks,
+    JointTracks,
+    fill_gaps,
+    read_joints,
+    write_joints,
+)
 from worldpose.formats.motion_capture import write_markers
 from worldpose.formats.tables import joints_table, write_csv
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldpose.body import SKELETONS, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.gltf_file import AnimatedBody, paint_strips, write_gltf
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 FPS, FRAMES = 50.0, 60
 MODULES = Path(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats import JointTracks, read_joints, write_joints
+from worldpose.formats.joints_file import JointTracks, read_joints, write_joints
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from worldpose.formats import JointTracks
+from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import write_markers
 
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldpose.body import SKELETONS, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.motion_capture import stretches, write_motion
 from worldpose.simulation.recordings import read_bvh

@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldpose.body import SKELETONS, BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import SKELETONS
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.motion_capture import (
     OPENSIM_COORDINATES,

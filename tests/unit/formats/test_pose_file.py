@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldpose.body import BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import read_poses, write_poses
 

@@ -1,6 +1,6 @@
 from soccernet import SOCCERNET_MARKINGS, soccernet_markings
 
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 
 def test_every_name_is_another_marking_of_the_template():

@@ -9,8 +9,7 @@ import pytest
 
 from data_contracts.conventions import COCO17
 from worldpose.errors import UsageError
-from worldpose.formats import JointTracks
-from worldpose.formats.joints_file import fill_gaps
+from worldpose.formats.joints_file import JointTracks, fill_gaps
 from worldpose.formats.tables import (
     Positions,
     joints_table,

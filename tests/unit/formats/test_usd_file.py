@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from worldpose.body import BodyParameters, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
 from worldpose.errors import InputError, UsageError
 from worldpose.formats.gltf_file import AnimatedBody
 from worldpose.formats.usd_file import write_usd
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 FPS, FRAMES = 50.0, 30
 NOTES = {"software": "worldpose", "licence": "For tests alone.", "clip": "a"}

@@ -1,6 +1,6 @@
 import pytest
 
-from worldpose.formats import whole_file
+from worldpose.formats.files import whole_file
 
 
 def test_a_block_that_raises_leaves_what_was_there(tmp_path):

@@ -1,6 +1,7 @@
 import pytest
 
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 
 @pytest.fixture(scope="session", autouse=True)

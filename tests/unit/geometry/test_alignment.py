@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.geometry import Rigid, align
+from worldpose.geometry.rigid import Rigid, align
 
 # Corners of a box of 6 x 4 x 2 m: no two axes alike.
 BOX = np.array([[x, y, z] for x in (-3.0, 3.0) for y in (-2.0, 2.0) for z in (-1.0, 1.0)])

@@ -5,7 +5,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, RayStatus, Rigid, fold_radius
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.projection import fold_radius
+from worldpose.geometry.rays import RayStatus
+from worldpose.geometry.rigid import Rigid
 
 
 def plane_camera(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0) -> Camera:

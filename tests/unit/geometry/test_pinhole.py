@@ -6,7 +6,9 @@ from pydantic import ValidationError
 from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import CONVENTIONS, DISTORTION
 from worldpose.errors import InputError
-from worldpose.geometry import Camera, RayStatus, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rays import RayStatus
+from worldpose.geometry.rigid import Rigid
 
 
 def simple_camera(**changes) -> Camera:

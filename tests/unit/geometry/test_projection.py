@@ -4,7 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldpose.geometry import Camera, RayStatus, Rigid, fold_radius
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.projection import fold_radius
+from worldpose.geometry.rays import RayStatus
+from worldpose.geometry.rigid import Rigid
 
 
 @st.composite

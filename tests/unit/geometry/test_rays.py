@@ -3,11 +3,7 @@ import pytest
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.geometry import (
-    Rays,
-    RayStatus,
-    intersect_rays,
-)
+from worldpose.geometry.rays import Rays, RayStatus, intersect_rays
 
 coordinates = st.floats(-100.0, 100.0)
 points3 = st.tuples(coordinates, coordinates, coordinates).map(np.array)

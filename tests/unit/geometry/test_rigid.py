@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from worldpose.errors import InputError
-from worldpose.geometry import Rigid
-from worldpose.geometry.rigid import nearest_rotation
+from worldpose.geometry.rigid import Rigid, nearest_rotation
 
 # Matrix products of unit-size numbers: a few roundings of 1.1e-16 each.
 ROUNDING = 1e-14

@@ -11,8 +11,8 @@ import pytest
 from flows.review.repeated_clicks import explain_repeated
 from worldpose.errors import InputError
 from worldpose.formats.annotations.marked_images import read_marked_images
-from worldpose.ingest import import_clicks
 from worldpose.ingest.annotations import read_clicked_markings
+from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch
 

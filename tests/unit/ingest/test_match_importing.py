@@ -11,7 +11,7 @@ from worldpose.formats.keypoint_files import write_keypoint_arrays
 from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match, import_videos
 from worldpose.ingest.match_folder import read_match, require_calibrated
-from worldpose.video import write_video
+from worldpose.video.files import write_video
 
 
 def results(*frames):

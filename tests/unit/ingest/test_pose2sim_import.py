@@ -12,10 +12,13 @@ from data_contracts.cameras import CameraCalibration
 from data_contracts.conventions import COCO17
 from worldpose.body.keypoints import BODY25
 from worldpose.errors import InputError
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.calibration_forms import read_calibration
 from worldpose.formats.detection_files import read_openpose_folder
-from worldpose.ingest import import_pose2sim, read_calibration, read_match, write_calibration_toml
 from worldpose.ingest.footage import read_unit
-from worldpose.video import write_video
+from worldpose.ingest.importing import import_pose2sim
+from worldpose.ingest.match_folder import read_match
+from worldpose.video.files import write_video
 
 CAMERAS = ("cam01", "cam02")
 KINDS = {"COCO-17": 17, "BODY_25": 25, "HALPE-26": 26, "COCO-WholeBody": 133}

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 PITCH = PitchTemplate.standard()
 

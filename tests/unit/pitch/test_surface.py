@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.pitch import PitchTemplate
-from worldpose.pitch.template import PRIOR_STD_M, Surface
+from worldpose.pitch.template import PRIOR_STD_M, PitchTemplate, Surface
 
 
 def test_surface_falls_to_touch_lines_and_goal_lines():

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
 from worldpose.pitch.survey import Survey, SurveySettings, fit_survey, read_survey
+from worldpose.pitch.template import PitchTemplate
 
 TRUE = PitchSpec(length=101.3, width=66.2, crown=0.31)
 CORNERS = [f"corner_{side}_{end}" for side in ("left", "right") for end in ("near", "far")]

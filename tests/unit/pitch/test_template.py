@@ -6,7 +6,7 @@ import pytest
 
 from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 # Coordinates up to 53 m round at 1e-14.
 ROUNDING = 1e-13

@@ -5,9 +5,9 @@ import pytest
 from bystander import SIZE, camera, expected
 
 from data_contracts.pitch import PitchSpec
-from worldpose.detection import Place
+from worldpose.detection.pipeline import Place
 from worldpose.detection.settings import RedetectionSettings
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.redetection import find_detected_people, select_missing_people
 
 SETTINGS = RedetectionSettings()

@@ -6,8 +6,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from worldpose.body import BodyParameters, load_open_body
-from worldpose.geometry import Camera, Rigid
+from worldpose.body.body_file import load_open_body
+from worldpose.body.model import BodyParameters
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.bodies import crowded_part, paint_bodies, plot_bodies, zoom_camera
 
 

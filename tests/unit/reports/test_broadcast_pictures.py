@@ -7,8 +7,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.broadcast import (
     camera_angles,
     largest_pose_changes,

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.clips import (
     LEFT_OUT,
     USED,

@@ -4,9 +4,11 @@ import numpy as np
 
 from data_contracts.conventions import COCO17
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyParameters
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks
 from worldpose.reports.videos import overlay_frames
 from worldpose.simulation.scene import look_at

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.clips import plot_paths
 from worldpose.reports.drawing import PALETTE
 

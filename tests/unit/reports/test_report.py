@@ -11,16 +11,14 @@ import pytest
 
 from data_contracts.evaluation import Evaluation
 from data_contracts.run import RunRecord, UnitFailure
-from worldpose.reports import (
-    CameraSummary,
+from worldpose.reports.html_page import (
     CaptionedImage,
     EmbeddedPage,
     LinkedFile,
     Section,
-    report_page,
+    compress_image,
 )
-from worldpose.reports.html_page import compress_image
-from worldpose.reports.run_report import MEANINGS, camera_table
+from worldpose.reports.run_report import MEANINGS, CameraSummary, camera_table, report_page
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"

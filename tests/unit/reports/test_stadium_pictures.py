@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.reports.clips import VIEW_LENGTH_M, plot_camera_view, plot_stadium, visible_ground
 from worldpose.reports.drawing import PALETTE
 from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, plot_calibration

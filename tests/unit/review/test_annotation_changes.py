@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.annotations import AnnotatedImage, AnnotatedPerson
+from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 from worldpose.review.detections import find_changes, image_name
 
 NAME = image_name("cam_03", 120)

@@ -23,15 +23,11 @@ from data_contracts.review import (
     RedrawnMarking,
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.ingest import MatchFolder
-from worldpose.review import (
-    add_previous_value,
-    append,
-    read_journal,
-    replay_corrections,
-)
-from worldpose.store import Store
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.review.clicks import add_previous_value, replay_corrections
+from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
+from worldpose.store.store import Store
 
 CORNER, MARK, LINE = "corner_left_near", "penalty_mark_left", "touch_line_near"
 

@@ -9,14 +9,9 @@ import pytest
 
 from data_contracts.review import Correction, MovedPoint, ReviewDecision, ReviewRequest, Withdrawal
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.review import (
-    append,
-    last_decision,
-    read_journal,
-    requests_by_id,
-    say,
-)
-from worldpose.store import Store, verify
+from worldpose.review.journal import append, last_decision, read_journal, requests_by_id, say
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
 

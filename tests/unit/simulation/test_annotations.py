@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, CalibrationErrors
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import add_calibration_errors, click
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import look_at, place_camera
-from worldpose.simulation.settings import ClickSettings
+from worldpose.simulation.settings import CalibrationErrors, ClickSettings
 
 PITCH = PitchTemplate.standard()
 NOBODY = np.empty((0, 17, 3))

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, BroadcastSettings
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.football import play
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import move_broadcast_camera, place_camera
+from worldpose.simulation.settings import BroadcastSettings
 
 TIMES = np.arange(1500) / 50.0
 PATHS, BALL = play(SCENARIOS["match"].crowd, 30.0, np.random.default_rng(2))

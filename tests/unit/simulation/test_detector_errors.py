@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import COCO17
-from worldpose.geometry import Camera, Rigid
-from worldpose.simulation import ObservationNoise
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import (
     DIFFICULTY,
     MIRRORED,
@@ -12,6 +12,7 @@ from worldpose.simulation.detector_errors import (
     detect,
     project_bodies,
 )
+from worldpose.simulation.settings import ObservationNoise
 
 FPS = 25.0
 FRAMES = 2000

@@ -3,10 +3,11 @@ import cv2
 import numpy as np
 import pytest
 
-from worldpose.formats import read_joints
-from worldpose.geometry import Camera
-from worldpose.ingest import read_match
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.formats.joints_file import read_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.match_folder import read_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import look_at
 
 

@@ -7,14 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldpose.formats import read_camera, read_joints
-from worldpose.ingest import read_match
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation.foreign import (
-    FOREIGN_SCENARIOS,
-    simulate_foreign_match,
-    simulate_foreign_scene,
-)
+from worldpose.formats.challenge import read_camera
+from worldpose.formats.joints_file import read_joints
+from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.foreign import rigs as foreign_rigs
 from worldpose.simulation.foreign.detectors import (
     PROFILES,
@@ -22,6 +18,11 @@ from worldpose.simulation.foreign.detectors import (
     defined_joints,
     detect_people,
     draw_detector,
+)
+from worldpose.simulation.foreign.matches import (
+    FOREIGN_SCENARIOS,
+    simulate_foreign_match,
+    simulate_foreign_scene,
 )
 from worldpose.simulation.foreign.rigs import view_people
 

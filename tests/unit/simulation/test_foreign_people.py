@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.simulation.foreign import FOREIGN_SCENARIOS, read_recordings, simulate_foreign_scene
-from worldpose.simulation.foreign.recordings import JOINTS, play_motion
+from worldpose.simulation.foreign.matches import FOREIGN_SCENARIOS, simulate_foreign_scene
+from worldpose.simulation.foreign.recordings import JOINTS, play_motion, read_recordings
 from worldpose.simulation.foreign.skeletons import draw_skeleton, place_joints
 from worldpose.simulation.foreign.trajectories import LEAD
 

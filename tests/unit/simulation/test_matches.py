@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats import read_joints
-from worldpose.geometry import Camera
-from worldpose.ingest import read_match, read_unit
-from worldpose.ingest.footage import read_still
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match, simulate_scene
+from worldpose.formats.joints_file import read_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.footage import read_still, read_unit
+from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
 
 TINY = SCENARIOS["tiny"]
 

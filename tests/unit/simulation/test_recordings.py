@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.simulation import SCENARIOS, MatchOptions, read_trajectories, simulate_match
 from worldpose.simulation.gait import walk
+from worldpose.simulation.matches import MatchOptions, simulate_match
 from worldpose.simulation.paths import MARGIN, STEP, GroundPath
-from worldpose.simulation.recordings import NAMES, clip_path, read_bvh, read_clip
+from worldpose.simulation.recordings import NAMES, clip_path, read_bvh, read_clip, read_trajectories
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.skeletons import draw_body
 
 CHANNELS = "CHANNELS 3 Zrotation Yrotation Xrotation"

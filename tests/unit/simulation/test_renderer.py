@@ -3,9 +3,10 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.body import BodyParameters
-from worldpose.geometry import Camera, Rigid
-from worldpose.pitch import PitchTemplate
+from worldpose.body.model import BodyParameters
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.cast import dress_people, goals
 from worldpose.simulation.image_formation import Moment
 from worldpose.simulation.matches import open_view, render_frame

@@ -1,15 +1,14 @@
 import numpy as np
 import pytest
 
-from worldpose.geometry import Camera, Rigid
-from worldpose.ingest import read_match, read_unit
-from worldpose.simulation import (
-    SCENARIOS,
-    MatchOptions,
-    ObservationNoise,
-    simulate_match,
-    simulate_scene,
-)
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.ingest.footage import read_unit
+from worldpose.ingest.match_folder import read_match
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.simulation.settings import ObservationNoise
 
 SHORT = 0.4
 

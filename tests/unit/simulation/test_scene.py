@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 
 from data_contracts.conventions import FEET
-from worldpose.body import fold_keypoints, load_open_body
-from worldpose.simulation import SCENARIOS, ObservationNoise, simulate_scene
-from worldpose.simulation.scene import detect_points
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import detect_points, simulate_scene
+from worldpose.simulation.settings import ObservationNoise
 
 TINY = SCENARIOS["tiny"]
 

@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
 
-from worldpose.body import OPEN_BODY, SKELETONS, BodyParameters, fold_keypoints, load_open_body
-from worldpose.formats import read_joints
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, MatchOptions, simulate_match
+from worldpose.body.body_file import OPEN_BODY, load_open_body
+from worldpose.body.keypoints import SKELETONS, fold_keypoints
+from worldpose.body.model import BodyParameters
+from worldpose.formats.joints_file import read_joints
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.crowd import gather
+from worldpose.simulation.matches import MatchOptions, simulate_match
+from worldpose.simulation.scenarios import SCENARIOS
 
 FPS = 50.0
 

@@ -3,14 +3,18 @@ from statistics import mean
 import numpy as np
 import pytest
 
-from worldpose.evaluation import evaluate_joints
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
-from worldpose.tracking import TrackingSettings, track_people
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 def reconstructed(scene, cameras, fps):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 
 SIZE = (1920, 1080)
 PITCH = PitchTemplate.standard()

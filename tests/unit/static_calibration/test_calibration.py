@@ -7,8 +7,9 @@ import pytest
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 PITCH, SIZE = people.PITCH, people.SIZE
 

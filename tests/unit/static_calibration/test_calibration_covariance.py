@@ -6,13 +6,14 @@ import pytest
 from scipy.stats import chi2
 
 from data_contracts.pitch import PitchSpec
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.annotations import click, survey
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import ClickSettings
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 SPREAD_OUT = ClickSettings()
 FEW = ClickSettings(clustered=1.0, clustered_points=(5, 7))

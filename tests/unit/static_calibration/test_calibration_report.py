@@ -5,8 +5,8 @@ import xarray as xr
 from data_contracts.static_calibration import STATIC_CALIBRATION
 from tasks.bundle_adjustment import _clicks
 from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
-from worldpose.static_calibration import (
-    calibrate_camera,
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import (
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import calibrate_without_clicks
 from worldpose.static_calibration.camera_candidates import refine_candidates
 from worldpose.static_calibration.circle_candidates import _painted_arcs, name_circles
 from worldpose.static_calibration.line_samples import sample_markings
@@ -18,7 +17,7 @@ from worldpose.static_calibration.paint_segments import (
     straighten_paint,
     thin_ridges,
 )
-from worldpose.static_calibration.proposal import propose_from_paint
+from worldpose.static_calibration.proposal import calibrate_without_clicks, propose_from_paint
 
 PITCH = PitchTemplate.standard()
 SIZE = (1280, 720)

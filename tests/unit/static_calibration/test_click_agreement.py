@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera, calibration
+from worldpose.static_calibration import calibration
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.click_outliers import Explanation
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 NAMES = tuple(f"point{number}" for number in range(10))
 

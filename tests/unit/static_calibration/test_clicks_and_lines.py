@@ -6,9 +6,10 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 PITCH, SIZE = people.PITCH, people.SIZE
 EXACT = StaticCalibrationSettings(survey_error_m=0.0)

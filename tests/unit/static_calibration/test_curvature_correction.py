@@ -11,8 +11,8 @@ from worldpose.pitch.template import Surface
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
-from worldpose.static_calibration import StaticCalibrationSettings, calibrate_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.curvature_correction import (
     ClicksAndBars,
     fit_with_curvature,
@@ -22,6 +22,7 @@ from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.line_samples import PaintNoise, project_lines, sample_markings
 from worldpose.static_calibration.line_search import Bars
 from worldpose.static_calibration.parameters import step_camera
+from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 SETTINGS = StaticCalibrationSettings()
 NOISE = PaintNoise(0.006, 0.001, 0.05, 1.0)

@@ -9,9 +9,9 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import calibrate_camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.adjustment import build_problem, camera_row
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.click_outliers import (
     compute_residuals,
     fit_given_inliers,

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.initialization import (

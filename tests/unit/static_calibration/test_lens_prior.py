@@ -15,7 +15,7 @@ from clicking_people import (
     wide_camera,
 )
 
-from worldpose.static_calibration import calibrate_camera
+from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.paint_segments import guess_lens
 from worldpose.static_calibration.parameters import drop_k3
 

@@ -8,8 +8,8 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
 from worldpose.simulation.settings import RenderingSettings

@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.simulation.scene import look_at
-from worldpose.static_calibration import (
-    calibrate_proposal,
-    calibrate_without_clicks,
-    propose_camera,
-)
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import look_at, simulate_scene
 from worldpose.static_calibration.camera_candidates import (
     Candidates,
     project_markings,
@@ -31,7 +26,12 @@ from worldpose.static_calibration.paint_segments import (
     guess_lens,
     straighten_paint,
 )
-from worldpose.static_calibration.proposal import propose_from_paint
+from worldpose.static_calibration.proposal import (
+    calibrate_proposal,
+    calibrate_without_clicks,
+    propose_camera,
+    propose_from_paint,
+)
 
 PITCH = PitchTemplate.standard()
 SAMPLES = sample_markings(PITCH, 1.0)

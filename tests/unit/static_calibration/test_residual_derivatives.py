@@ -4,8 +4,7 @@ import clicking_people as people
 import numpy as np
 import pytest
 
-from worldpose.geometry import Camera
-from worldpose.static_calibration import step_camera
+from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row, step_row
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.ground_error import surface_motion
@@ -14,6 +13,7 @@ from worldpose.static_calibration.parameters import (
     drawn_residuals,
     point_residuals,
     prior_residuals,
+    step_camera,
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.sides import (
     MIN_EVIDENCE,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.paint_segments import trace_marking
 from worldpose.static_calibration.proposal import MarkingSupport, Proposal

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from data_contracts.pitch import PitchSpec
-from worldpose.pitch import PitchTemplate
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
-from worldpose.static_calibration import calibrate_camera, calibration_arrays
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import calibration_arrays
 from worldpose.static_calibration.venue import join_cameras
 
 PAINTED = PitchTemplate.from_spec(PitchSpec(crown=0.12, end_fall=0.35))

@@ -9,8 +9,8 @@ import pytest
 from store_samples import SMALL_CHUNK, SMALL_SHARD
 
 import data_contracts.arrays
-from worldpose.store import Store
 from worldpose.store.blobs import install_fault_hook
+from worldpose.store.store import Store
 
 
 @pytest.fixture(params=["folder", "s3"])

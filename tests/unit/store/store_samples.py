@@ -16,8 +16,10 @@ from data_contracts.arrays import ArrayLayout, GroupLayout
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, SourceFile
 from data_contracts.run import RunRecord
 from data_contracts.work import Recipe, Work
-from worldpose.store import ResultWriter, Store, recipe_key
 from worldpose.store.blobs import install_fault_hook
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 
 FRAMES, PERSONS = 40, 3
 SMALL_CHUNK, SMALL_SHARD = 512, 2

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from worldpose.errors import StoreError
-from worldpose.store import Store, objects
+from worldpose.store import objects
+from worldpose.store.store import Store
 
 
 def test_what_is_put_is_read(store: Store) -> None:

@@ -13,7 +13,8 @@ from store_samples import (
     sample_registration,
 )
 
-from worldpose.store import ResultId, Store
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
 
 
 def filled(store: Store, folder: str) -> Store:

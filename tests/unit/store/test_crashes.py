@@ -24,10 +24,13 @@ from store_samples import (
     sample_arrays,
 )
 
-from worldpose.store import ResultId, Store, collect, plan_gc, verify
 from worldpose.store.blobs import COMMIT_POINTS, LocalBlobs, install_fault_hook, pass_commit_point
+from worldpose.store.garbage import collect, plan_gc
+from worldpose.store.integrity import verify
 from worldpose.store.objects import ObjectBlobs
+from worldpose.store.paths import ResultId
 from worldpose.store.runs import may_be_running
+from worldpose.store.store import Store
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,13 @@ from store_samples import (
 )
 
 from worldpose.errors import InputError, StoreError
-from worldpose.store import ResultId, Store, collect, groups, plan_gc, recipe_key, verify
+from worldpose.store import groups
+from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.groups import array_parts
+from worldpose.store.integrity import verify
+from worldpose.store.paths import ResultId
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 NOW = timedelta(0)
 

@@ -16,16 +16,12 @@ from store_samples import (
 
 from data_contracts.pin import Pin
 from worldpose.errors import CorruptionError
-from worldpose.store import (
-    ResultId,
-    Store,
-    list_pins,
-    pin_run,
-    plan_gc,
-    repair,
-    verify,
-)
 from worldpose.store.documents import seal
+from worldpose.store.garbage import plan_gc
+from worldpose.store.integrity import repair, verify
+from worldpose.store.paths import ResultId
+from worldpose.store.runs import list_pins, pin_run
+from worldpose.store.store import Store
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -13,9 +13,10 @@ import pytest
 from store_samples import place, publish, run_once
 
 from worldpose.errors import StoreError
-from worldpose.store import Store, verify
 from worldpose.store import blobs as folder_module
 from worldpose.store.blobs import storage_errors
+from worldpose.store.integrity import verify
+from worldpose.store.store import Store
 
 
 def failing(code: int) -> Callable[..., Any]:

@@ -10,8 +10,14 @@ import pytest
 from store_samples import sample_recipe
 
 from worldpose.errors import StoreError
-from worldpose.store import code_version, libraries, recipe_differences, recipe_key
-from worldpose.store.recipes import _read_module, _source_cache
+from worldpose.store.recipes import (
+    _read_module,
+    _source_cache,
+    code_version,
+    libraries,
+    recipe_differences,
+    recipe_key,
+)
 
 
 def describe(old, new):

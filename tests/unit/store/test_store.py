@@ -36,9 +36,10 @@ from worldpose.errors import (
     NondeterminismError,
     StoreError,
 )
-from worldpose.store import ResultId, Store, verify
 from worldpose.store.documents import canonical_json, digest
-from worldpose.store.paths import MANIFEST, PROJECT
+from worldpose.store.integrity import verify
+from worldpose.store.paths import MANIFEST, PROJECT, ResultId
+from worldpose.store.store import Store
 from worldpose.store.writer import content_digest
 
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from store_samples import place
 
 from worldpose.errors import InputError
-from worldpose.store import ResultId, Store
-from worldpose.store.paths import checked_path
+from worldpose.store.paths import ResultId, checked_path
+from worldpose.store.store import Store
 
 BAD = ["", "/", "/etc/passwd", "..", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", "a\nb", "a\\b"]
 

@@ -16,17 +16,10 @@ from store_samples import (
 
 from data_contracts.pin import Pin
 from worldpose.errors import CorruptionError, InputError, StoreError
-from worldpose.store import (
-    Store,
-    collect,
-    list_pins,
-    open_run,
-    pin_run,
-    plan_gc,
-    unpin_run,
-    verify,
-)
-from worldpose.store.runs import may_be_running
+from worldpose.store.garbage import collect, plan_gc
+from worldpose.store.integrity import verify
+from worldpose.store.runs import list_pins, may_be_running, pin_run, unpin_run
+from worldpose.store.store import Store, open_run
 
 
 def test_runs_are_numbered_from_one(store: Store) -> None:

@@ -10,8 +10,10 @@ import pytest
 from store_samples import place, run_once, sample_recipe
 
 from worldpose.errors import InputError
-from worldpose.store import Store, recipe_key, verify
 from worldpose.store.documents import canonical_json, digest
+from worldpose.store.integrity import verify
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
 
 
 def rewrite(store: Store, path: str, change: Callable[[dict[str, Any]], None]) -> None:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Rigid
-from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+from worldpose.geometry.rigid import Rigid
+from worldpose.tracking.diagnosis import diagnose_no_people
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 

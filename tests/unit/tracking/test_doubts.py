@@ -5,8 +5,9 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.tracking import Join
-from worldpose.tracking import TrackingSettings, describe_doubts, track_people
-from worldpose.tracking.joins import Takeover
+from worldpose.tracking.joins import Takeover, describe_doubts
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 

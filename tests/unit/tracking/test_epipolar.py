@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from worldpose.tracking import TrackingSettings
 from worldpose.tracking.epipolar import associate, footprints, has_adult_size, pair_distances
+from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings(pair_evidence=0.0)
 ANYWHERE = np.array([[0.0, 0.0, np.inf]] * 2)

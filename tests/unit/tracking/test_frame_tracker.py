@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.person import Person, Sighting
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 

@@ -7,19 +7,17 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from worldpose.geometry import Camera
-from worldpose.pitch import PitchTemplate
-from worldpose.static_calibration import step_camera
-from worldpose.tracking import (
+from worldpose.geometry.cameras import Camera
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.parameters import step_camera
+from worldpose.tracking.feet import (
+    ANKLE_HEIGHT,
     GroundPositions,
-    TriangulatedPeople,
     count_covering_cameras,
-    estimate_plane_clocks,
     locate_feet,
-    locate_tracks,
-    track_on_plane,
 )
-from worldpose.tracking.feet import ANKLE_HEIGHT
+from worldpose.tracking.ground_tracks import TriangulatedPeople, locate_tracks, track_on_plane
+from worldpose.tracking.plane_clocks import estimate_plane_clocks
 
 detections = KeypointDetections.from_keypoints
 

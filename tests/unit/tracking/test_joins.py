@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from worldpose.tracking import TrackingSettings
 from worldpose.tracking.epipolar import limb_lengths
 from worldpose.tracking.joins import End, choose_joins, fit_track_ends, join_costs
+from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings()
 UNKNOWN = np.full(11, np.nan)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera, Rigid
-from worldpose.tracking import TrackingSettings, diagnose_no_people, track_people
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.tracking.diagnosis import diagnose_no_people
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.pair_births import (
     CameraGates,
@@ -14,6 +15,8 @@ from worldpose.tracking.pair_births import (
     group_pairs,
     judge_pairs,
 )
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 

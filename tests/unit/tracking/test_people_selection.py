@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera, Rigid
-from worldpose.tracking import TrackingSettings, track_people
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.tracking.frame_tracker import FrameTracker
 from worldpose.tracking.people_selection import (
     drop_bystanders,
@@ -15,6 +15,8 @@ from worldpose.tracking.people_selection import (
     merge_duplicates,
 )
 from worldpose.tracking.person import Person, Sighting
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from worldpose.tracking import TrackingSettings
 from worldpose.tracking.person import BLOCK, Person, Sighting, Sightings, separations
+from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings()
 FPS = 50.0

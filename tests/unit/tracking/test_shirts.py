@@ -3,8 +3,9 @@
 import cv2
 import numpy as np
 
-from worldpose.tracking import GroundPositions, measure_shirts, track_on_plane
-from worldpose.tracking.shirts import ShirtMemory, ShirtModel
+from worldpose.tracking.feet import GroundPositions
+from worldpose.tracking.ground_tracks import track_on_plane
+from worldpose.tracking.shirts import ShirtMemory, ShirtModel, measure_shirts
 
 RED, BLUE, GRASS = (200, 20, 30), (20, 40, 180), (60, 120, 50)
 FPS = 25.0

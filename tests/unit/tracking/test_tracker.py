@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
 from worldpose.static_calibration.parameters import PARAMETERS
-from worldpose.tracking import TrackingSettings, track_people
 from worldpose.tracking.frame_tracker import FrameTracker
-from worldpose.tracking.tracker import pixel_weights
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import pixel_weights, track_people
 
 detections = KeypointDetections.from_keypoints
 

@@ -5,9 +5,10 @@ import torch
 
 from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weights, save_weights
 from worldpose.errors import InputError
-from worldpose.training import FineTuningSettings, LabelledPicture, fine_tuning
+from worldpose.training import fine_tuning
 from worldpose.training.fine_tuning import MILD, fine_tune, split
-from worldpose.training.settings import Refinement
+from worldpose.training.labels import LabelledPicture
+from worldpose.training.settings import FineTuningSettings, Refinement
 
 
 def pictures(folder, count, people=1):

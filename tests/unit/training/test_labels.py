@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.training import (
-    LabelledPicture,
-    read_labels,
-    read_yolo_labels,
-    write_labels,
-)
+from worldpose.training.labels import LabelledPicture, read_labels, read_yolo_labels, write_labels
 
 
 @pytest.fixture

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import DetectionSettings, People
+from worldpose.detection.interfaces import People
+from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
-from worldpose.training import labels, read_labels
+from worldpose.training import labels
+from worldpose.training.labels import read_labels
 
 
 class Brightness:

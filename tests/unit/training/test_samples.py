@@ -8,7 +8,6 @@ import torch
 
 from worldpose.detection.bundled_nets import CROP, KeypointNet, PeopleNet
 from worldpose.geometry.boxes import box_iou
-from worldpose.training import LabelledPicture, PictureCache
 from worldpose.training.augmentation import AugmentationSettings
 from worldpose.training.keypoint_training import (
     KeypointCrops,
@@ -17,6 +16,7 @@ from worldpose.training.keypoint_training import (
     keypoint_loss,
     labelled_people,
 )
+from worldpose.training.labels import LabelledPicture, PictureCache
 from worldpose.training.people_training import (
     PeopleWindows,
     box_overlap,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.detection import People
+from worldpose.detection.interfaces import People
 
 RECIPE = Path(__file__).parents[3] / "infra" / "embedded_detector"
 

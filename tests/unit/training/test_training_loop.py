@@ -6,8 +6,8 @@ import torch
 from torch import nn
 
 from worldpose.errors import InputError
-from worldpose.training import TrainingSettings
 from worldpose.training.fine_tuning import Training, train
+from worldpose.training.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(steps=12, check_every=4, rate=0.05, seed=3)
 

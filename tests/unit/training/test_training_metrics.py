@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from worldpose.detection.interfaces import People
-from worldpose.training import (
-    LabelledPicture,
+from worldpose.training.labels import LabelledPicture
+from worldpose.training.metrics import (
     average_precision,
     calibration_error,
     correct_keypoints,
+    torso_sizes,
 )
-from worldpose.training.metrics import torso_sizes
 
 
 def truth(boxes, ignored=None):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_contracts.conventions import COCO17
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 
 FPS = 50.0
 MIRRORED = [

@@ -6,14 +6,14 @@ import pytest
 from running_samples import FPS, MIRRORED, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation import (
-    TriangulationSettings,
+from worldpose.triangulation.chunking import (
+    MARGIN,
     learn_clip,
     reconstruct_chunks,
     reconstruct_joints,
 )
-from worldpose.triangulation.chunking import MARGIN
 from worldpose.triangulation.reports import Histogram
+from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = TriangulationSettings()
 FRAMES = 330

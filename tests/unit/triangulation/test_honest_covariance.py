@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
-from worldpose.simulation import SCENARIOS, simulate_scene
+from worldpose.geometry.cameras import Camera
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import simulate_scene
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation import (
-    TriangulationSettings,
-    estimate_clocks,
-    triangulate_joints,
-)
+from worldpose.triangulation.clocks import estimate_clocks
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 # Standard deviations of steps in the order of PARAMETERS; together some 9 cm at a player.
 CALIBRATION = np.array([3e-4] * 3 + [0.05] * 3 + [7e-4, 2.0, 2.0, 0.0, 0.0, 0.0])

@@ -5,15 +5,13 @@ from running_samples import FPS, MIRRORED, detections, runner
 from data_contracts.conventions import COCO17
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.triangulation import EXCHANGED_PARTS
-from worldpose.geometry import Camera, Rigid
-from worldpose.triangulation import (
-    TriangulationSettings,
-    reconstruct_joints,
-    triangulate_joints,
-    undo_swaps,
-)
-from worldpose.triangulation.limb_lengths import find_swaps
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.limb_lengths import find_swaps, undo_swaps
 from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution
 
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")

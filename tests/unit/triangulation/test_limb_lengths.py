@@ -3,7 +3,6 @@ import pytest
 
 from data_contracts.conventions import COCO17, COCO17_LIMBS
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
 from worldpose.triangulation.limb_lengths import (
     FEWEST,
     SLACK,
@@ -12,6 +11,8 @@ from worldpose.triangulation.limb_lengths import (
     limb_lengths,
 )
 from worldpose.triangulation.observations import Observations, Rig
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import solve_joints
 
 # Noise as stated: exact views do not make the least disagreement count.

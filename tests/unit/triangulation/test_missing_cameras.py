@@ -7,7 +7,8 @@ import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation import TriangulationSettings, reconstruct_joints
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 GONE = 2
 

@@ -3,10 +3,11 @@ import pytest
 from running_samples import detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian, step_camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.person_offsets import stated_errors
+from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0)
 PLAIN = SETTINGS.model_copy(update={"offsets": "none"})

@@ -5,8 +5,9 @@ from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
-from worldpose.triangulation import TriangulationSettings, triangulate_joints
+from worldpose.geometry.cameras import Camera
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 SETTINGS = TriangulationSettings()
 # Noise as stated, cameras as given: one joint is then a textbook least-squares problem.

@@ -7,10 +7,10 @@ import pytest
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.errors import InputError
-from worldpose.geometry import Camera
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.pitch import PitchTemplate
-from worldpose.simulation import SCENARIOS
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import simulate_scene
 from worldpose.triangulation import synchronization
 from worldpose.triangulation.synchronization import shift_frames, synchronize

@@ -3,16 +3,17 @@ import pytest
 from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation import (
-    TriangulationSettings,
-    estimate_clocks,
-    reconstruct_joints,
-    shift_in_time,
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.clocks import _Sums, estimate_clocks, shift_in_time
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.triangulation.smoothing import (
+    _factorize,
+    _invert,
+    _substitute,
+    segments,
     smooth_joints,
-    triangulate_joints,
 )
-from worldpose.triangulation.clocks import _Sums
-from worldpose.triangulation.smoothing import _factorize, _invert, _substitute, segments
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
 

@@ -7,15 +7,11 @@ import pytest
 
 from data_contracts.conventions import FEET
 from data_contracts.keypoints import KeypointDetections
-from worldpose.triangulation import (
-    TriangulationSettings,
-    learn_clip,
-    reconstruct_chunks,
-    reconstruct_joints,
-    shift_in_time,
-    triangulate_joints,
-    undo_swaps,
-)
+from worldpose.triangulation.chunking import learn_clip, reconstruct_chunks, reconstruct_joints
+from worldpose.triangulation.clocks import shift_in_time
+from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.passes import triangulate_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 NOISE = 2.0
 FPS = 50.0

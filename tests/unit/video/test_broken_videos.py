@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.ingest import UnitFrames
-from worldpose.ingest.footage import read_footage, write_still
-from worldpose.video import index_video, open_video
+from worldpose.ingest.footage import UnitFrames, read_footage, write_still
+from worldpose.video.folder import index_video, open_video
 
 SIZE = (48, 64)
 

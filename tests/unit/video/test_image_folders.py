@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.video import open_video
+from worldpose.video.folder import open_video
 
 
 def test_one_picture_of_a_folder_is_read_by_its_number(tmp_path):

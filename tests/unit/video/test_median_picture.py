@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.video import median_picture
+from worldpose.video.folder import median_picture
 
 GRASS = 90
 

@@ -3,8 +3,7 @@
 import numpy as np
 from test_broken_videos import encode, number_of
 
-from worldpose.video import open_video
-from worldpose.video.folder import jumps, some_pictures
+from worldpose.video.folder import jumps, open_video, some_pictures
 
 
 def groups(numbers, keys, count=100):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.video import FrameIndex, VideoReader, index_frames, write_video
-from worldpose.video.files import cut_video
+from worldpose.video.files import FrameIndex, VideoReader, cut_video, index_frames, write_video
 
 SIZE = (48, 64)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from worldpose.body import BodyModel
+from worldpose.body.model import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.baselines.camera_methods import read_humans4d, read_hybrik
 from worldpose.formats.baselines.result import MethodResult, resample_result

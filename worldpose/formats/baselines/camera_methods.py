@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.body import BodyModel
+from worldpose.body.model import BodyModel
 from worldpose.formats.baselines.result import (
     MethodResult,
     Track,

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats
 from data_contracts.conventions import COCO17
 from data_contracts.release import BaselineSettings
-from worldpose.body import BodyModel, BodyParameters, fold_keypoints, is_open_body
+from worldpose.body.body_file import is_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyModel, BodyParameters
 from worldpose.errors import InputError
-from worldpose.formats import JointTracks
 from worldpose.formats.archives import write_archive
 from worldpose.formats.files import whole_file
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 from worldpose.parsing import read_npz_members
 from worldpose.pickles import FILE_BYTES, plain, read_notes
 

@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worldpose.body import BodyModel, is_open_body
+from worldpose.body.body_file import is_open_body
+from worldpose.body.model import BodyModel
 from worldpose.formats.baselines.result import (
     MethodResult,
     Track,

@@ -17,9 +17,12 @@ from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings
-from worldpose.formats import JointTracks, write_archive, write_joints, write_static_camera
-from worldpose.ingest import MatchAnnotations, write_calibration_toml, write_match
-from worldpose.pitch import PitchTemplate
+from worldpose.formats.archives import write_archive
+from worldpose.formats.calibration_files import write_calibration_toml
+from worldpose.formats.challenge import write_static_camera
+from worldpose.formats.joints_file import JointTracks, write_joints
+from worldpose.ingest.writing import MatchAnnotations, write_match
+from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.foreign.detectors import (
     PROFILES,
     Report,

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
-from worldpose.geometry import Camera, Rigid
+from worldpose.geometry.cameras import Camera
 from worldpose.geometry.projection import fold_radius
-from worldpose.pitch import PitchTemplate
+from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
 
 Layout = Literal["bowl", "one-side", "low", "goals", "mixed", "hall"]
 

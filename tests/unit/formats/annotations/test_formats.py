@@ -12,13 +12,12 @@ from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats.annotations import (
     FORMATS,
-    AnnotatedImage,
-    AnnotatedPerson,
     detect_format,
     format_suffix,
     read_annotations,
     write_annotations,
 )
+from worldpose.formats.annotations.annotated_images import AnnotatedImage, AnnotatedPerson
 
 SIZE = (1920, 1080)
 

@@ -8,10 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_contracts.conventions import COCO17
-from worldpose.body import BodyParameters, fold_keypoints, load_open_body
+from worldpose.body.body_file import load_open_body
+from worldpose.body.keypoints import fold_keypoints
+from worldpose.body.model import BodyParameters
 from worldpose.evaluation.matching import joint_boxes
-from worldpose.formats import JointTracks
-from worldpose.geometry import Camera, Rigid
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
 
 FRAMES, PEOPLE, WALK = 16, 2, 8.0
 FIRST = 40

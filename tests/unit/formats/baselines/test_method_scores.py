@@ -24,8 +24,9 @@ from flows.cli.app import app
 from flows.results.baselines import score_methods, table_csv, table_latex, table_rows
 from worldpose.errors import InputError, UsageError
 from worldpose.evaluation.metrics import paper_joints
-from worldpose.formats import JointTracks, write_joints, write_moving_camera
 from worldpose.formats.baselines import METHODS
+from worldpose.formats.challenge import write_moving_camera
+from worldpose.formats.joints_file import JointTracks, write_joints
 
 LOCAL, ALONE = ("hybrik", "4dhumans"), ("wham", "gvhmr")
 NOT_SEEN = "smpl"

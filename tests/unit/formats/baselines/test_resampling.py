@@ -6,10 +6,11 @@ from method_files import FRAMES, WRITERS, scene, truth_of
 
 from flows.cli.evaluate import named_rates
 from flows.results.baselines import score_methods
-from worldpose.body import BodyParameters
+from worldpose.body.model import BodyParameters
 from worldpose.errors import UsageError
-from worldpose.formats import JointTracks, write_joints, write_moving_camera
-from worldpose.formats.baselines import MethodResult, resample_result
+from worldpose.formats.baselines.result import MethodResult, resample_result
+from worldpose.formats.challenge import write_moving_camera
+from worldpose.formats.joints_file import JointTracks, write_joints
 
 
 def straight(frames, speed, persons=1):
