@@ -1,63 +1,144 @@
-"""Code that several benchmarks share: rigs in a stadium, timing in turns, runs, distances."""
+"""Code that benchmarks share: rigs, timing in turns, runs, distances, files."""
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from registry import Table
 
+from data_contracts.arrays import Flags, Floats, Image
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
 from worldpose.geometry.cameras import Camera
-from worldpose.geometry.rigid import Rigid
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import Scene, simulate_scene
+from worldpose.simulation.settings import Scenario
 from worldpose.store.store import Store
 
+WORLDPOSE = Path(sys.executable).with_name("worldpose")
 
-def stadium_rig(count: int, rng: np.random.Generator, *, varied_lenses: bool) -> Camera:
-    """Return cameras in the stands, each of which sees a part of the pitch.
+RowOf = Callable[[str], Sequence[Any]]
+
+
+def compare_times(
+    title: str,
+    sides: Mapping[str, Callable[[], object]],
+    rounds: int,
+    *columns: str,
+    more: RowOf = lambda _: (),
+    scale: Mapping[str, float] | None = None,
+) -> Table:
+    """Return the best times of all sides, which run in turns, and their ratios to the first side.
 
     Args:
-        count: number of cameras.
-        rng: draws the cameras.
-        varied_lenses: draw principal points and k2, too; else the image centre and 0.
-
-    Returns:
-        A batch (cameras,).
+        title: of the table.
+        sides: calls by name; the first one is ours.
+        rounds: number of measured rounds.
+        columns: names of the further columns.
+        more: returns the values of the further columns.
+        scale: what a side's time is multiplied by, if it did a part of the work.
     """
-    cameras = []
-    for n in range(count):
-        angle = 2 * np.pi * (n + rng.uniform(-0.2, 0.2)) / count
-        center = np.array([85 * np.cos(angle), 65 * np.sin(angle), rng.uniform(14, 28)])
-        forward = np.array([rng.uniform(-25, 25), rng.uniform(-15, 15), 0.0]) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        focal = np.full(2, rng.uniform(1500, 2300))
-        principal_point = np.array([960.0, 540.0])
-        if varied_lenses:
-            principal_point = principal_point + rng.normal(0, 8, 2)
-        distortion = np.array([rng.uniform(-0.12, 0.02), 0.0, 0.0, 0.0, 0.0])
-        if varied_lenses:
-            distortion[1] = rng.uniform(-0.02, 0.04)
-        cameras.append(
-            Camera(
-                focal=focal,
-                principal_point=principal_point,
-                distortion=distortion,
-                cam_from_world=Rigid(rotation, -rotation @ center),
-                image_size=np.array([1920, 1080]),
-            )
-        )
-    return Camera.stack(cameras)
+    best = best_seconds(sides, rounds)
+    best = {name: seconds * (scale or {}).get(name, 1.0) for name, seconds in best.items()}
+    ours = next(iter(best.values()))
+    rows = [[name, 1e3 * each, each / ours, *more(name)] for name, each in best.items()]
+    return Table(title, ["side", "time [ms]", "times ours", *columns], rows)
+
+
+def tell(text: str) -> None:
+    """Print progress where tables do not go."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def inside_image(camera: Camera, pixels: Floats) -> Flags:
+    """Return whether pixels (..., 2) are in the camera's image."""
+    return np.asarray(((pixels > 0.0) & (pixels < camera.image_size - 1.0)).all(axis=-1))
+
+
+def simulate(name: str, seed: int, duration: float | None = None) -> tuple[Scenario, Scene]:
+    """Return a scenario without its moving camera, and its scene."""
+    changes = {"broadcast": None} | ({} if duration is None else {"duration": duration})
+    scenario = SCENARIOS[name].model_copy(update=changes)
+    return scenario, simulate_scene(scenario, seed)
+
+
+def places_of_feet(joints: Floats, pitch: PitchTemplate) -> Floats:
+    """Return where people stand (n, 3) [m], on the surface of the pitch."""
+    places: Floats = joints[:, :, 15:17].mean(axis=2).reshape(-1, 3)
+    places[:, 2] = pitch.height(places[:, 0], places[:, 1])
+    return places
+
+
+def quantile(values: Floats, share: float = 0.5) -> float:
+    """Return a quantile; NaN without values."""
+    return float(np.nanquantile(values, share)) if np.isfinite(values).any() else np.nan
+
+
+def read_settings(words: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return settings by stage from STAGE.SETTING=JSON."""
+    overrides: dict[str, dict[str, Any]] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        stage, _, setting = name.partition(".")
+        overrides.setdefault(stage, {})[setting] = json.loads(value)
+    return overrides
+
+
+def read_changes(words: Sequence[str]) -> dict[str, Any]:
+    """Return one stage's settings from NAME=VALUE."""
+    return dict(word.split("=", 1) for word in words)
+
+
+def load_module(file: Path) -> ModuleType:
+    """Return a data set's own scorer."""
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(f"no scorer {file}")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def git(*arguments: str) -> bytes:
+    """Run git and return its output."""
+    return subprocess.run(["git", *arguments], check=True, stdout=subprocess.PIPE).stdout
+
+
+def clone_repository(clones: Path, repository: str) -> str:
+    """Return a clone of a public repository; one in the folder takes the place of the network."""
+    clone = clones / repository.replace("/", "+")
+    if not clone.is_dir():
+        url = f"https://github.com/{repository}"
+        git("clone", "--quiet", "--no-checkout", "--filter=blob:none", url, str(clone))
+    return str(next(each for each in (clone / "repo", clone) if each.is_dir()))
+
+
+def fetch_file(clones: Path, repository: str, commit: str, path: str) -> bytes:
+    """Return a file of a public repository; git checks the content by its commit."""
+    clone = clone_repository(clones, repository)
+    return git("-C", clone, "cat-file", "blob", f"{commit}:{path}")
+
+
+def read_image(content: bytes) -> Image:
+    """Return the image (height, width, 3), in OpenCV's order of colours, of a file's content."""
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise SystemExit("expected an image, found other bytes")
+    return np.asarray(picture, np.uint8)
 
 
 def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
@@ -75,9 +156,6 @@ def best_seconds(sides: Mapping[str, Callable[[], object]], rounds: int) -> dict
         print(f"\r  round {done} of {rounds}", end="", file=sys.stderr, flush=True)
     print("\r" + " " * 30, end="\r", file=sys.stderr, flush=True)
     return best
-
-
-WORLDPOSE = Path(sys.executable).with_name("worldpose")
 
 
 def run_worldpose(*words: object, accepted: Collection[int] = (0,)) -> str:
@@ -136,23 +214,3 @@ def distances_to_polyline(
     nearest = offset - np.clip(share, 0.0, 1.0)[..., None] * step
     distances: NDArray[np.float64] = np.linalg.norm(nearest, axis=-1).min(axis=1)
     return distances
-
-
-def print_held_out(label: str, figures: Mapping[str, float]) -> None:
-    """Print how far bodies and triangulated joints are from keypoints of held-out cameras.
-
-    Args:
-        label: what the figures belong to.
-        figures: those of a unit; nothing is printed for one without such distances.
-    """
-    for kind in ("fitted", "triangulated"):
-        start = f"held_out_{kind}_m."
-        groups = {
-            name.removeprefix(start): 1000.0 * value
-            for name, value in figures.items()
-            if name.startswith(start)
-        }
-        if groups:
-            print(f"{label}, {kind}, from held-out cameras, rms [mm]: ", end="")
-            print(", ".join(f"{name} {value:.1f}" for name, value in groups.items()), end="")
-            print(f"; mean {sum(groups.values()) / len(groups):.1f}", flush=True)

@@ -17,17 +17,6 @@ from worldpose.evaluation.matching import (
 )
 from worldpose.formats.joints_file import JointTracks
 
-SEGMENTS = {
-    "shoulders": ((5, 6),),
-    "upper arms": ((5, 7), (6, 8)),
-    "forearms": ((7, 9), (8, 10)),
-    "trunk": ((5, 11), (6, 12)),
-    "hips": ((11, 12),),
-    "thighs": ((11, 13), (12, 14)),
-    "shanks": ((13, 15), (14, 16)),
-}
-"""Joints at both ends, left before right; shoulders and hips are across the body."""
-
 
 def group_joints(group: str) -> list[int]:
     """Return the indices of a group's joints in COCO-17."""
@@ -56,13 +45,7 @@ def _match(
 def group_errors(
     prediction: JointTracks, reference: JointTracks, settings: EvaluationSettings | None = None
 ) -> dict[str, tuple[float, int]]:
-    """Return the sum of distances [mm] and the number of joints per group.
-
-    Args:
-        prediction: estimated joints.
-        reference: true joints; with `views`, only joints seen by enough cameras count.
-        settings: gate and views; the defaults if None.
-    """
+    """Return the sum of distances [mm] and the number of joints per group."""
     found, _, counts = _match(prediction, reference, settings or EvaluationSettings())
     away = np.where(counts, 1e3 * np.linalg.norm(found - reference.joints, axis=-1), 0.0)
     groups = {name: group_joints(name) for name in JOINT_GROUPS}
@@ -70,32 +53,6 @@ def group_errors(
         name: (float(away[..., some].sum()), int(counts[..., some].sum()))
         for name, some in groups.items()
     }
-
-
-def segment_errors(prediction: JointTracks, reference: JointTracks) -> dict[str, list[float]]:
-    """Return the relative errors of segments' lengths [1], one per true person and side.
-
-    Lengths are medians over frames in which both ends are known in both.
-
-    Args:
-        prediction: estimated joints.
-        reference: true joints; with `views`, only joints seen by enough cameras count.
-    """
-    found, _, counts = _match(prediction, reference, EvaluationSettings())
-    errors: dict[str, list[float]] = {}
-    for name, bones in SEGMENTS.items():
-        errors[name] = []
-        for bone in bones:
-            both: Flags = np.asarray(counts[..., list(bone)].all(axis=-1))
-            ours, true = (
-                np.linalg.norm(np.diff(each[..., list(bone), :], axis=-2)[..., 0, :], axis=-1)
-                for each in (found, reference.joints)
-            )
-            for person in np.flatnonzero(both.any(axis=0)):
-                rows = both[:, person]
-                ratio = np.median(ours[rows, person]) / np.median(true[rows, person])
-                errors[name].append(float(ratio - 1.0))
-    return errors
 
 
 def region_counts(

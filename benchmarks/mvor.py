@@ -1,33 +1,17 @@
-"""Prints error and coverage on MVOR: real detections of an operating room from three cameras.
-
-    python benchmarks/mvor.py DATA [--set birth_views=3 ...]
-
-DATA holds `mvor` with camma_mvor_2018.json (cameras, 2D and 3D) and openpose_kps.json of the
-repository CAMMA-public/MVOR (CC BY-NC-SA 4.0). Every annotated moment is a clip of one frame, in
-metres and without a pitch; tracking and triangulation run in process with default settings. A
-person counts as seen by a camera when one of its detections is within 0.25 m of the annotated
-upper-body joints on average, measured at their depth, each detection used once. A person is found
-if a result is within 0.5 m, by the mean over shoulders, hips, elbows and wrists. Annotated hips are
-some 17 cm from COCO's. Published errors are of mv3dreg, which selects people differently.
-
-Not all people are annotated in 3D. Boxes in the images tell about the others: annotators drew one
-around every person that they saw, with an identity over all views where they recognised the person.
-A result beyond the people in 3D is a person if two of its detections have one identity, or if one
-has it and the other lies in a box without identity, in a view where this person has no other box.
-It cannot be judged if all its boxes lack an identity. All others are false: detections of two
-people, of none, or of a person that another result shows.
-"""
+"""Error and coverage on MVOR: real detections of an operating room from three cameras."""
 
 from __future__ import annotations
 
-import argparse
 import json
+from argparse import Namespace
 from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import read_changes
 from numpy.typing import NDArray
+from registry import DATA, SET, Table, Tables, benchmark
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.keypoints import KeypointDetections
@@ -40,16 +24,57 @@ from worldpose.triangulation.settings import TriangulationSettings
 
 PUBLISHED = {3: 9.9, 2: 18.3}
 """mv3dreg's mean error by views [cm]."""
+
 GROUPS = {"shoulder": (5, 6), "hip": (11, 12), "elbow": (7, 8), "wrist": (9, 10)}
+
 COCO = [5, 6, 11, 12, 7, 8, 9, 10]
+
 MVOR = [2, 3, 4, 5, 6, 7, 8, 9]
 """Left and right shoulder, hip, elbow, wrist."""
+
 SEEN_M, FOUND_M = 0.25, 0.5
+
 NO_BOX, NO_IDENTITY = -2, -1
 """Identities of detections outside of all boxes, and in a box whose person was not recognised."""
+
 VERDICTS = ("real", "false", "unknown")
+
 INSIDE, BORDER = 0.6, 0.1
 """Share of a detection's joints in its box, and border that is added, of the box's size [1]."""
+
+
+@benchmark("mvor", "an operating room from two and three cameras (MVOR)", DATA, SET)
+def score_room(options: Namespace) -> Tables:
+    """DATA holds `mvor` with camma_mvor_2018.json and openpose_kps.json of CAMMA-public/MVOR.
+
+    Every annotated moment is a clip of one frame, in metres and without a pitch. A person counts as
+    seen by a camera when one of its detections is within 0.25 m of the annotated upper-body joints
+    on average, measured at their depth, each detection used once. A person is found if a result is
+    within 0.5 m, by the mean over shoulders, hips, elbows and wrists. Annotated hips are some 17 cm
+    from COCO's. Published errors are of mv3dreg, which selects people differently.
+
+    Not all people are annotated in 3D, but each has a box in every image, most with an identity. A
+    result beyond the people in 3D is a person if two of its detections have one identity, or if one
+    has it and the other lies in a box without identity, in a view where this person has no other
+    box. It cannot be judged if all its boxes lack an identity. All others are false.
+    """
+    settings = TrackingSettings.model_validate(read_changes(options.settings))
+    result, rows = measure(*load_moments(options.data / "mvor"), settings), []
+    for views, published in PUBLISHED.items():
+        groups = mean_error(result["errors"][views])
+        counts = [result[name][views] for name in ("results", "extra", "false", "unknown")]
+        found = [len(result["errors"][views]), result["people"][views], groups.mean(), published]
+        rows.append([views, *found, *groups, *counts])
+    columns = [
+        "views",
+        "found",
+        "of",
+        "error [cm]",
+        "published [cm]",
+        *(f"{g} [cm]" for g in GROUPS),
+    ]
+    columns += ["results", "beyond the annotated", "false", "unknown"]
+    return {"room": Table(f"{result['moments']} moments", columns, rows)}
 
 
 def load_cameras(info: dict[str, Any]) -> Camera:
@@ -241,32 +266,3 @@ def mean_error(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
         np.array(errors).reshape(-1, len(GROUPS), 2), axis=(0, 2)
     )
     return means
-
-
-def main() -> None:
-    """Print one line for three views and one for two."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
-    options = parser.parse_args()
-    changes = dict(each.split("=", 1) for each in options.set)
-    settings = TrackingSettings.model_validate(changes)
-    result = measure(*load_moments(options.data / "mvor"), settings)
-    for views, published in PUBLISHED.items():
-        errors = result["errors"][views]
-        groups = mean_error(errors)
-        parts = ", ".join(f"{name} {value:.1f}" for name, value in zip(GROUPS, groups, strict=True))
-        print(
-            f"{views} views: found {len(errors)} of {result['people'][views]}, mean error "
-            f"{groups.mean():.1f} cm ({parts}); published {published} cm"
-        )
-    for views in PUBLISHED:
-        counts = [result[name][views] for name in ("results", "extra", "false", "unknown")]
-        print(
-            f"{views} views: {counts[0]} results, {counts[1]} beyond the people annotated in 3D; "
-            f"{counts[2]} of these are false and {counts[3]} cannot be judged"
-        )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,57 +1,49 @@
-"""Compares the triangulation of Pose2Sim's demos with Pose2Sim's own, from the same 2D poses.
-
-    pip install --no-deps --target TOOL pose2sim==0.10.49 rtoml anytree lxml
-    python infra/real_demo/fetch.py NETS
-    python benchmarks/pose2sim_demo.py TOOL NETS [--demo SinglePerson] [--out FOLDER]
-
-The stage `detection` finds 2D poses in the demo's videos, and this script writes them in
-OpenPose's JSON into a copy of the demo. `worldpose import --pose2sim` imports this copy, and
-`worldpose run` computes it. Pose2Sim associates and triangulates the same files with its own
-defaults, once with the demo's calibration and once with that of the imported match. There is no
-truth: the table shows distances to the 2D poses, missing joints and the spread of limb lengths, and
-below it distances of bodies and joints to keypoints of cameras that they do not use.
-Pose2Sim (BSD-3) is called, and nothing of it is copied here.
-"""
+"""Pose2Sim's demos, next to Pose2Sim's own triangulation."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from argparse import Namespace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from common import print_held_out, run_worldpose
+from common import run_worldpose
 from numpy.typing import NDArray
+from registry import OUT, Table, Tables, benchmark, option
 
 import worldpose
 from data_contracts.conventions import COCO17
-from flows.results.best_results import static_cameras
+from flows.results.best_results import joint_tracks, static_cameras
 from worldpose.formats.detection_files import read_openpose_folder
-from worldpose.formats.joints_file import read_joints
 from worldpose.formats.keypoint_files import on_frames
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.match_folder import read_match
 
 LIMBS = ((5, 7), (6, 8), (7, 9), (8, 10), (11, 13), (12, 14), (13, 15), (14, 16))
 """Upper arms, forearms, thighs and shanks in COCO-17."""
+
 BODY = tuple(range(5, 17))
 """Joints that are scored: the face is blurred in the demo's videos."""
+
 MIN_CONFIDENCE = 0.3
 """Least confidence of a scored 2D keypoint [1]; Pose2Sim's threshold."""
+
 NEAR_PX = 150.0
 """Largest mean distance of a person's joints from the 2D poses of that person [px]."""
+
 NAMES = {
     f"{long[0].upper()}{short}": f"{long}_{short.lower()}"
     for long in ("left", "right")
     for short in ("Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle")
 }
 """Pose2Sim's names of joints to those of COCO-17."""
+
 SCRIPT = """
 import sys, tomllib
 from pathlib import Path
@@ -64,6 +56,33 @@ personAssociation.associate_all(config)
 triangulation.triangulate_all(config)
 """
 """Pose2Sim's own functions, run in the folder of a trial."""
+
+
+@benchmark(
+    "pose2sim_demo",
+    "triangulation of Pose2Sim's demos, next to Pose2Sim's own, from the same 2D poses",
+    option("tool", type=Path, help="folder into which Pose2Sim was installed"),
+    option("nets", type=Path, help="folder with MoveNet in ONNX"),
+    option("--demo", action="append", choices=("SinglePerson", "MultiPerson")),
+    OUT,
+)
+def compare_demos(options: Namespace) -> Tables:
+    """`pip install --no-deps --target TOOL pose2sim==0.10.49 rtoml anytree lxml`.
+
+    `python infra/real_demo/fetch.py NETS` gets the nets. The stage `detection` finds 2D poses in
+    the demo's videos, which a copy of the demo has in OpenPose's JSON. `worldpose import` and `run`
+    compute this copy; Pose2Sim associates and triangulates the same files with its own defaults,
+    with the demo's calibration and with that of the imported match. There is no truth: distances to
+    the 2D poses, missing joints, the spread of limb lengths, and distances of bodies and joints to
+    keypoints of cameras that they do not use. Pose2Sim (BSD-3) is called, not copied.
+    """
+    tables: Tables = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        work = (options.out or Path(temporary)).resolve()
+        work.mkdir(parents=True, exist_ok=True)
+        for name in options.demo or ("SinglePerson", "MultiPerson"):
+            tables |= compare(options.tool.resolve(), options.nets.resolve(), name, work)
+    return tables
 
 
 def detect(demo: Path, nets: Path, work: Path) -> tuple[Path, str]:
@@ -187,8 +206,8 @@ def distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(np.median(off)) if len(off) else np.inf
 
 
-def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
-    """Print the table of one demo."""
+def compare(tool: Path, nets: Path, name: str, work: Path) -> Tables:
+    """Return the tables of one demo."""
     demo, several = tool / "Pose2Sim" / f"Demo_{name}", name == "MultiPerson"
     trial, match, project = work / name, work / f"{name}-match", work / "project"
     for folder in (trial, match):
@@ -212,60 +231,37 @@ def compare(tool: Path, nets: Path, name: str, work: Path) -> None:
     }
     (trial / "calibration" / "Calib_qualisys.toml").unlink()
     shutil.copy(match / "calibration.toml", trial / "calibration" / "Calib_match.toml")
-    methods["Pose2Sim, the match's calibration"] = (
-        run_pose2sim(tool, trial, convert=False),
-        asked,
-    )
+    methods["Pose2Sim, the match's calibration"] = (run_pose2sim(tool, trial, convert=False), asked)
     for stage, label in (
         ("triangulation", "worldpose, joints, the same cameras"),
         ("retriangulation", "worldpose, joints, adjusted cameras"),
         ("body_fitting", "worldpose, bodies, adjusted cameras"),
     ):
-        out = work / f"{name}-{stage}"
-        run_worldpose(
-            *("export", match.name, "--format", "joints", "--stage", stage, "--project", project),
-            *("--definition", "detector", "--out", out),
-        )
-        tracks = read_joints(out / "joints.npz")
+        run = worldpose.open_run(str(project), match.name)
+        tracks = joint_tracks(run, "clip", stage, "detector")
         whole = np.full((100, len(tracks.person_ids), 17, 3), np.nan)
         whole[tracks.frames] = tracks.joints
         cameras = asked
         if stage != "triangulation":
-            run = worldpose.open_run(str(project), match.name)
             # A camera that contradicts the others is left out, and scored as given.
             best = static_cameras(run, read_match(match).spec)
             cameras = Camera.stack([best.get(name, given[name]) for name in given])
         methods[label] = (list(np.moveaxis(whole, 1, 0)), cameras)
-    print(f"\n{name}: median and 90 % distance to 2D poses [px], missing joints [%], limbs [mm]")
+    rows = []
     first = next(iter(methods.values()))[0]
     for label, (people, cameras) in methods.items():
         for number, other in enumerate(first):
             one = min(people, key=partial(distance, other))
-            median, high, missing, limbs = score(one, cameras, seen)
-            print(
-                f"{label:38s} person {number} of {len(people)} "
-                f"{median:6.1f} {high:6.1f} {missing:6.1f} {limbs:6.1f}",
-                flush=True,
-            )
+            rows.append([f"{label}, {number} of {len(people)}", *score(one, cameras, seen)])
     record = worldpose.open_run(str(project), match.name).record
-    for unit, figures in record.figures.items():
-        print_held_out(unit, figures)
-
-
-def main() -> None:
-    """Print the table of each demo."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("tool", type=Path, help="folder into which Pose2Sim was installed")
-    parser.add_argument("nets", type=Path, help="folder with MoveNet in ONNX")
-    parser.add_argument("--demo", action="append", choices=("SinglePerson", "MultiPerson"))
-    parser.add_argument("--out", type=Path, help="folder to keep; temporary by default")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        work = asked.out or Path(temporary)
-        work.mkdir(parents=True, exist_ok=True)
-        for name in asked.demo or ("SinglePerson", "MultiPerson"):
-            compare(asked.tool.resolve(), asked.nets.resolve(), name, work.resolve())
-
-
-if __name__ == "__main__":
-    main()
+    said = [
+        [f"{unit}, {name}", 1000.0 * value]
+        for unit, each in record.figures.items()
+        for name, value in each.items()
+        if name.startswith(("held_out_fitted_m.", "held_out_triangulated_m."))
+    ]
+    columns = ["method, person", "distance [px]", "90 % [px]", "missing [%]", "limbs [mm]"]
+    return {
+        name: Table(f"{name}, to 2D poses", columns, rows),
+        f"{name}_held_out": Table("from held-out cameras", ["of", "rms"], said, "mm"),
+    }

@@ -1,4 +1,4 @@
-"""Prints every metric on real data in one table.
+"""Every metric on real data in one table.
 
     python benchmarks/real.py DATA [--only NAME ...] [--json] [--frames N]
 
@@ -6,14 +6,12 @@ DATA is a folder with any of these; what is absent is skipped:
 
 - `static_pair`: left_camera.mp4, right_camera.mp4, left_keypoints.xml, right_keypoints.xml (two
   cameras on one mast, clicks of CVAT whose known wrong names tests/real/static_pair.py lists);
-- `panorama_people`: see panorama_people.py;
-- `shelf_dev`: see shelf.py;
+- `panorama_people`, `shelf_dev`, `mvor`: see `run.py NAME --help` of panorama_people, shelf, mvor;
 - `moving_clip`: one video of a moving broadcast camera, `key_frames.json` (clicks in the form of
   annotations/broadcast_calibration), optionally `lines.json` (drawn lines in the same form, which
   are scored and not fitted; without it those of the key frames are scored) and `pitch.json`.
   Markings are where the Laws or pitch.json have them, on the surface that the fit shows;
-- `stills`: images, and one JSON file with boxes and 17 joints of people in COCO form;
-- `mvor`: see mvor.py.
+- `stills`: images, and one JSON file with boxes and 17 joints of people in COCO form.
 
 Left out: each click in turn, predicted by the camera of the others, with the names of the places
 that were clicked. Wrong names found and right clicks rejected: with the names as given. Feet: both
@@ -21,9 +19,8 @@ cameras are calibrated on one pitch, and each alone tracks people on it; per fra
 neighbours within 2 m are compared, after the clock offset that makes them agree best. Errors count
 from 8 pairs per frame on: fewer people are easier. Recall and precision: boxes of the detector from
 its high score threshold on, at an IoU of 0.5. PCK: visible joints within a fifth of the torso, in
-the labelled boxes.
-`--frames N` takes N frames, stills, moments or left-out clicks of each part: a quick look, not a
-result.
+the labelled boxes. `--frames N` takes N frames, stills, moments or left-out clicks of each part: a
+quick look, not a result.
 """
 
 from __future__ import annotations
@@ -31,25 +28,22 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import shutil
 import sys
 import tempfile
+from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
-
 import mvor
-import panorama_people
+import numpy as np
 import shelf
-import static_pair
+import stills
 from common import distances_to_polyline, run_in_process
+from numpy.typing import NDArray
+from registry import DATA, Table, Tables, as_data, benchmark, format_table, option
 from scipy.spatial import KDTree
 
 from data_contracts.broadcast_calibration import KeyFrames
@@ -61,7 +55,6 @@ from worldpose.detection.models import load_pose
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import read_json
-from worldpose.geometry.boxes import box_iou
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
@@ -76,16 +69,23 @@ from worldpose.training.labels import PictureCache, read_labels
 from worldpose.training.metrics import score_keypoints
 from worldpose.video.folder import index_video, open_video
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "real"))
+import static_pair
+
 Metrics = dict[str, Any]
+
 PAIR_M = 2.0
 """Largest distance of two cameras' positions of one person [m]."""
+
 WANTED_PAIRS = 8.0
 """Least number of pairs per frame from which distances of feet are comparable."""
+
 MAX_OFFSET_FRAMES = 3.0
 """Largest clock offset between the cameras of the static pair, beyond the stated one [frame]."""
+
 FPS = 25.0
 """Of the static pair."""
-TRUE_IOU = 0.5
+
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi")
 
 
@@ -280,31 +280,26 @@ def _quantile(values: NDArray[np.float64], share: float, otherwise: float) -> fl
 
 def score_panorama(folder: Path, frames: int | None) -> Metrics:
     """Return AP50 of small people in a panorama."""
-    return {"ap50": panorama_people.measure(folder, DetectionSettings(), frames)["ap50"]}
+    return {"ap50": stills.measure(folder, DetectionSettings(), frames)["ap50"]}
 
 
 def score_shelf(folder: Path, frames: int | None) -> Metrics:
     """Return PCP3D of joints and bodies of the Shelf sequence [%]."""
     _require(folder, ["import/calibration.toml", "import/detections", "gt.npz", "pcp.py"])
+    window = shelf.ALL_FRAMES
+    if frames is not None:
+        files = sorted((folder / "import" / "detections").glob("*.json"))
+        first = min(one["image_id"] for file in files for one in json.loads(file.read_text()))
+        window = range(first, first + frames)
     with tempfile.TemporaryDirectory() as temporary:
-        given = Path(shutil.copytree(folder / "import", Path(temporary) / "import"))
-        if frames is not None:
-            _shorten_detections(given / "detections", frames)
-        joints, bodies, seen = shelf.scores(folder, given, Path(temporary))
+        out, cameras = Path(temporary), shelf.list_cameras(folder)
+        match = shelf.write_case(folder / "import", cameras, window, out)
+        joints, bodies, seen = shelf.scores(folder, match, out)
     return {
         "joints_pcp3d_percent": joints,
         "bodies_pcp3d_percent": bodies,
         "bodies_as_detected_pcp3d_percent": seen,
     }
-
-
-def _shorten_detections(folder: Path, frames: int) -> None:
-    """Keep the people of the first frames."""
-    people = {file: json.loads(file.read_text()) for file in folder.glob("*.json")}
-    first = min(person["image_id"] for each in people.values() for person in each)
-    for file, each in people.items():
-        kept = [person for person in each if person["image_id"] < first + frames]
-        file.write_text(json.dumps(kept))
 
 
 def score_moving_clip(folder: Path, frames: int | None) -> Metrics:
@@ -380,35 +375,14 @@ def score_stills(folder: Path, frames: int | None) -> Metrics:
             found=", ".join(file.name for file in files) or "none",
             todo="Keep the labels of all stills in one file.",
         )
-    stills = read_labels(files[0])
-    if not (folder / stills[0].path.name).exists() and (folder / "images").is_dir():
-        stills = read_labels(files[0], folder / "images")
-    stills = stills[:frames]
-    settings = DetectionSettings()
-    hits = asked = boxes = 0
-    for found, still in zip(panorama_people.detect_people(stills, settings), stills, strict=True):
-        sure = found.boxes[found.scores >= settings.high_score_threshold]
-        true = _match(sure, still.boxes[~still.ignored])
-        stray = box_iou(sure[~true], still.boxes[still.ignored]) >= TRUE_IOU
-        hits += int(true.sum())
-        asked += int((~still.ignored).sum())
-        boxes += len(sure) - int(stray.any(axis=1).sum())
-    pck = score_keypoints(load_pose(settings), stills, PictureCache(1 << 28)).pck
-    return {
-        "recall": hits / asked if asked else math.nan,
-        "precision": hits / boxes if boxes else math.nan,
-        "pck": pck,
-    }
-
-
-def _match(boxes: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether boxes, best first, take a labelled person that no better box has taken."""
-    right, free = np.zeros(len(boxes), dtype=np.bool_), np.ones(len(true), dtype=np.bool_)
-    for row, overlap in enumerate(box_iou(boxes, true) if len(true) else ()):
-        best = int(np.where(free, overlap, -1.0).argmax())
-        if free[best] and overlap[best] >= TRUE_IOU:
-            right[row], free[best] = True, False
-    return right
+    labelled = read_labels(files[0])
+    if not (folder / labelled[0].path.name).exists() and (folder / "images").is_dir():
+        labelled = read_labels(files[0], folder / "images")
+    labelled, settings = labelled[:frames], DetectionSettings()
+    found = stills.detect_people(labelled, settings)
+    boxes = stills.score_boxes(found, labelled, settings.high_score_threshold)
+    pck = score_keypoints(load_pose(settings), labelled, PictureCache(1 << 28)).pck
+    return {"recall": boxes["recall"], "precision": boxes["precision"], "pck": pck}
 
 
 def score_mvor(folder: Path, frames: int | None) -> Metrics:
@@ -442,40 +416,22 @@ def _require(folder: Path, names: Sequence[str]) -> None:
             )
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of the data.
-
-    Attributes:
-        score: returns its metrics, from its folder and the number of frames; None = all.
-        notes: the last column of the table, by metric.
-    """
-
-    score: Callable[[Path, int | None], Metrics]
-    notes: Mapping[str, str]
-
-
-PARTS: dict[str, Part] = {
-    "static_pair": Part(
-        score_static_pair,
-        {
-            "left.left_out_px_median": "leave-one-out, median",
-            "right.left_out_px_median": "leave-one-out, median",
-            "left.left_out_line_px_median": "each painted marking predicted by the others",
-            "right.left_out_line_px_median": "each painted marking predicted by the others",
-            "feet_m_median": "0.15 wanted",
-            "feet_m_p95": "0.5 wanted",
-            "people_per_frame": f"pairs; {WANTED_PAIRS:g} or more wanted",
-        },
-    ),
-    "panorama_people": Part(score_panorama, {"ap50": "bundled detector"}),
-    "shelf_dev": Part(score_shelf, {}),
-    "moving_clip": Part(score_moving_clip, {"stated_px": "expected error, median over frames"}),
-    "mvor": Part(
-        score_mvor,
-        {"three.error_cm": "9.9 published (mv3dreg)", "two.error_cm": "18.3 published (mv3dreg)"},
-    ),
-    "stills": Part(score_stills, {}),
+PARTS: dict[str, Callable[[Path, int | None], Metrics]] = {
+    "static_pair": score_static_pair,
+    "panorama_people": score_panorama,
+    "shelf_dev": score_shelf,
+    "moving_clip": score_moving_clip,
+    "mvor": score_mvor,
+    "stills": score_stills,
+}
+"""Return metrics of a part from its folder and the number of frames; None = all."""
+NOTES = {
+    "feet_m_median": "0.15 wanted",
+    "feet_m_p95": "0.5 wanted",
+    "people_per_frame": f"pairs; {WANTED_PAIRS:g} or more wanted, or feet are not comparable",
+    "stated_px": "expected error, median over frames",
+    "three.error_cm": "9.9 published (mv3dreg)",
+    "two.error_cm": "18.3 published (mv3dreg)",
 }
 
 
@@ -488,26 +444,6 @@ def flatten(metrics: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             found[prefix + name] = value
     return found
-
-
-def as_json(value: Any) -> Any:
-    """Return metrics with null in place of NaN."""
-    if isinstance(value, Mapping):
-        return {name: as_json(each) for name, each in value.items()}
-    if isinstance(value, list):
-        return [as_json(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def show(value: Any) -> str:
-    """Return a value as the table has it."""
-    if isinstance(value, list):
-        return ", ".join(f"{each:.2f}" for each in value)
-    if isinstance(value, (int, str)):
-        return str(value)
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.1f}" if abs(value) >= 20.0 else f"{value:.3f}"
 
 
 def measure(data: Path, only: Sequence[str], frames: int | None) -> dict[str, Any]:
@@ -526,27 +462,34 @@ def measure(data: Path, only: Sequence[str], frames: int | None) -> dict[str, An
     for name in there:
         print(f"{name} ...", file=sys.stderr, flush=True)
         try:
-            result[name] = PARTS[name].score(data / name, frames)
+            result[name] = PARTS[name](data / name, frames)
         except (OSError, ValueError, KeyError, ElementTree.ParseError) as error:
             # A file of another form: which one, its reader alone knows.
             raise WorldposeError(f"{name}: {type(error).__name__}: {error}") from error
     return {**result, "skipped": skipped}
 
 
-def print_table(result: Mapping[str, Any]) -> None:
-    """Print a Markdown table, then what was skipped."""
-    print("| data | metric | value | |\n| --- | --- | --- | --- |")
-    for name, part in PARTS.items():
-        for metric, value in flatten(result.get(name, {})).items():
-            print(f"| {name} | {metric} | {show(value)} | {part.notes.get(metric, '')} |")
-    pairs = result.get("static_pair", {}).get("people_per_frame", WANTED_PAIRS)
-    if pairs < WANTED_PAIRS:
-        print(
-            f"\nstatic_pair: fewer than {WANTED_PAIRS:g} pairs per frame, so that the distances of "
-            "feet are not comparable"
-        )
-    for name, reason in result["skipped"].items():
-        print(f"\n{name} skipped: {reason}")
+@benchmark(
+    "real",
+    "every metric on real data in one table",
+    DATA,
+    option("--only", action="append", choices=tuple(PARTS), default=[]),
+    option("--frames", type=int, help="frames, stills or moments per part"),
+)
+def score_parts(options: Namespace) -> Tables:
+    """See the head of benchmarks/real.py, which prints the same numbers by itself."""
+    return {"metrics": tabulate(measure(options.data, options.only, options.frames))}
+
+
+def tabulate(result: Mapping[str, Any]) -> Table:
+    """Return all metrics as a table, then what was skipped."""
+    rows = [
+        [name, metric, as_data(value), NOTES.get(metric, "")]
+        for name in PARTS
+        for metric, value in flatten(result.get(name, {})).items()
+    ]
+    rows += [[name, "skipped", "", reason] for name, reason in result["skipped"].items()]
+    return Table("real data", ["data", "metric", "value", ""], rows)
 
 
 def main() -> None:
@@ -564,9 +507,9 @@ def main() -> None:
     except WorldposeError as error:
         sys.exit(f"error: {error}")
     if options.json:
-        print(json.dumps(as_json(result), indent=2))
+        print(json.dumps(as_data(result), indent=2))
     else:
-        print_table(result)
+        print(format_table(tabulate(result)))
 
 
 if __name__ == "__main__":

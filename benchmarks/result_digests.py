@@ -4,26 +4,26 @@
     python benchmarks/result_digests.py FILE --compare OTHER
 
 A change of structure must not change a number. The command line simulates and runs the matches, and
-this script reads their stores with zarr alone, so that it needs no name of the code that changes.
-DATA holds `shelf_dev`, see `shelf.py`; without it that case is omitted. For an array whose digest
-differs, the comparison prints the number of missing values, the mean and the standard deviation in
-both records.
+this script reads their stores with zarr alone. DATA holds `shelf_dev`, see `shelf.py`; without it
+that case is omitted. For an array whose digest differs, the comparison has the number of missing
+values, the mean and the standard deviation in both records, and exits with 1.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
-import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
+from common import run_worldpose
+from registry import Table, Tables, benchmark, option
 
 CASES: dict[str, tuple[list[str], list[str]]] = {
     "tiny": (["--scenario", "tiny", "--seed", "11", "--no-stills"], []),
@@ -46,7 +46,49 @@ CASES: dict[str, tuple[list[str], list[str]]] = {
     ),
 }
 """Options of `worldpose simulate` and `worldpose run`."""
+
 SHELF = "shelf"
+
+
+@benchmark(
+    "result_digests",
+    "digests of all result arrays of a fixed set of matches",
+    option("file", type=Path, help="record to write, or to compare"),
+    option("--compare", type=Path, metavar="OTHER"),
+    option("--data", type=Path),
+    option("--cases", nargs="+", choices=[*CASES, SHELF]),
+    option("--keep", type=Path, metavar="FOLDER"),
+)
+def record_digests(options: Namespace) -> Tables:
+    """See the head of benchmarks/result_digests.py, which is a command of its own."""
+    rows: list[list[Any]] = []
+    if options.compare is not None:
+        ours, theirs = (json.loads(file.read_text()) for file in (options.file, options.compare))
+        rows = compare(ours, theirs)
+        return {"differences": Table("arrays that differ", ["array", "one", "other"], rows)}
+    names = options.cases or [*CASES, *([SHELF] if options.data else [])]
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            begun = time.monotonic()
+            found[name] = run_case(name, options.data, folder)
+            rows.append([name, len(found[name]), time.monotonic() - begun])
+    options.file.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+    return {"cases": Table("recorded", ["case", "arrays", "time [s]"], rows)}
+
+
+def compare(ours: dict[str, Any], theirs: dict[str, Any]) -> list[list[Any]]:
+    """Return the arrays that differ, and what is known of them."""
+    rows: list[list[Any]] = []
+    for case in sorted(ours.keys() | theirs.keys()):
+        one, other = ours.get(case, {}), theirs.get(case, {})
+        for name in sorted(one.keys() | other.keys()):
+            pair = (one.get(name), other.get(name))
+            if pair[0] is None or pair[1] is None or pair[0]["digest"] != pair[1]["digest"]:
+                rows.append([f"{case} {name}", *pair])
+    return rows
 
 
 def run_case(name: str, data: Path | None, folder: Path) -> dict[str, Any]:
@@ -59,24 +101,12 @@ def run_case(name: str, data: Path | None, folder: Path) -> dict[str, Any]:
         given = data / "shelf_dev" / "import"
         calibration, detections = given / "calibration.toml", given / "detections"
         cameras = ["--calibration", str(calibration), "--detections", str(detections)]
-        worldpose(["import", *cameras, "--fps", "25", "--out", str(match)])
+        run_worldpose("import", *cameras, "--fps", "25", "--out", match)
     else:
         simulate, options = CASES[name]
-        worldpose(["simulate", *simulate, "--out", str(match)])
-    worldpose(["run", str(match), *options, "--project", str(project)], accepted=(0, 4))
+        run_worldpose("simulate", *simulate, "--out", match)
+    run_worldpose("run", match, *options, "--project", project, accepted=(0, 4))
     return digests_of_project(project)
-
-
-def worldpose(arguments: list[str], accepted: tuple[int, ...] = (0,)) -> None:
-    """Run the command line; exit with its output if its exit code is not accepted."""
-    ended = subprocess.run(
-        [Path(sys.executable).parent / "worldpose", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if ended.returncode not in accepted:
-        sys.exit(f"worldpose {' '.join(arguments)}: exit code {ended.returncode}\n{ended.stderr}")
 
 
 def digests_of_project(project: Path) -> dict[str, Any]:
@@ -105,46 +135,8 @@ def describe_array(values: np.ndarray) -> dict[str, Any]:
     return told
 
 
-def compare(ours: dict[str, Any], theirs: dict[str, Any]) -> int:
-    """Print the arrays that differ; return their number."""
-    count = 0
-    for case in sorted(ours.keys() & theirs.keys()):
-        one, other = ours[case], theirs[case]
-        for name in sorted(one.keys() | other.keys()):
-            if name in one and name in other and one[name]["digest"] == other[name]["digest"]:
-                continue
-            count += 1
-            print(f"{case} {name}\n  {one.get(name, 'absent')}\n  {other.get(name, 'absent')}")
-        print(f"{case}: {len(one)} and {len(other)} arrays compared")
-    for case in sorted(ours.keys() ^ theirs.keys()):
-        count += 1
-        print(f"{case}: only in one record")
-    return count
-
-
-def main() -> None:
-    """Record the cases, or compare two records."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--compare", type=Path, metavar="OTHER")
-    parser.add_argument("--data", type=Path)
-    parser.add_argument("--cases", nargs="+", choices=[*CASES, SHELF])
-    parser.add_argument("--keep", type=Path, metavar="FOLDER")
-    options = parser.parse_args()
-    if options.compare is not None:
-        records = (json.loads(file.read_text()) for file in (options.file, options.compare))
-        sys.exit(1 if compare(*records) else 0)
-    names = options.cases or [*CASES, *([SHELF] if options.data else [])]
-    found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = options.keep or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in names:
-            begun = time.monotonic()
-            found[name] = run_case(name, options.data, folder)
-            print(f"{name}: {len(found[name])} arrays, {time.monotonic() - begun:.0f} s")
-    options.file.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    from run import main
+
+    tables = main(["result_digests", *sys.argv[1:]])
+    sys.exit(1 if "differences" in tables and tables["differences"].rows else 0)

@@ -1,25 +1,7 @@
-"""Scores every stage on matches of the second simulator, or on scenarios of the first.
-
-    python benchmarks/second_world.py --matches 40 --duration 4 --seed 1 --resume DIR
-    python benchmarks/second_world.py --scenarios match hard tiny --matches 2 --seed 1 --resume DIR
-    python benchmarks/second_world.py --resume DIR --report
-
-Every match is simulated, run with default settings and scored in a separate process, one after the
-other; stages are called in the flow's order, without Prefect or Dask. Its row goes to
-DIR/rows.jsonl, and existing rows are not recomputed. With --recordings every second match replays
-recordings. --iterations N runs N passes over the stages. --calibrated gives the exact cameras.
-
-Seen: people in the detections of two cameras or more in at least half of the frames. With a body:
-those of them with a body in at least half of these frames, within 1 m. Of joints seen by two
-cameras: mean error by joint group; median error of segments' lengths over people and sides, and its
-signed median; and the share whose true place is in the stated 95 % region, by joint group. Regions
-by the body model's definition are compared with the true joints, those by the detector's
-definition with what the detector takes for joints.
-"""
+"""Every stage of whole runs on matches of the second simulator, scored against the truth."""
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import multiprocessing
@@ -29,15 +11,19 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joint_regions import SEGMENTS, group_errors, region_counts, segment_errors
+from common import tell
+from joint_regions import group_errors, region_counts
 from numpy.typing import NDArray
+from registry import Table, Tables, benchmark, duration, integer, option
 
 from data_contracts.conventions import JOINT_GROUPS
 from data_contracts.run import RunRecord
@@ -63,10 +49,151 @@ MIX = (
     *("foreign-mixed", "foreign-lab", "foreign-match", "foreign-many", "foreign-mixed"),
 )
 """Scenarios of ten matches in a row."""
+
 STAGES = ("triangulation", "retriangulation", "body_fitting")
+
 GATE = 1.0
 """Maximum mean joint distance between a true person and a result [m]."""
+
 SCORES = ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm", "coverage", "idf1", "switches")
+
+
+@benchmark(
+    "second_world",
+    "every stage of whole runs on matches of the second simulator, or of the first",
+    integer("matches", 40, "of the mix, or of each scenario"),
+    option("--scenarios", nargs="+", choices=[*SCENARIOS, *FOREIGN_SCENARIOS]),
+    duration(4.0),
+    integer("seed", 1, "of the first match"),
+    integer("iterations", 1),
+    option("--recordings", type=Path, help="folder that every second match replays"),
+    option("--calibrated", action="store_true", help="exact cameras"),
+    option("--limit", type=float, default=3600.0, help="for one match [s]"),
+    option("--resume", type=Path, default=Path("second_world"), metavar="DIR"),
+    option("--keep", action="store_true", help="keep match folders and projects"),
+    option("--report", action="store_true", help="only show what DIR holds"),
+)
+def score_matches(options: Namespace) -> Tables:
+    """Every match is simulated, run with default settings and scored in a separate process.
+
+    Stages are called in the flow's order, without Prefect or Dask. A match's row goes to
+    DIR/rows.jsonl, and existing rows are not recomputed. Seen: people in the detections of two
+    cameras or more in at least half of the frames. With a body: those of them with a body in at
+    least half of these frames, within 1 m. Of joints seen by two cameras: mean error by joint
+    group, and the share whose true place is in the stated 95 % region. Regions by the body model's
+    definition are compared with the true joints, those by the detector's definition ("as detected")
+    with what the detector takes for joints.
+    """
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # also ends the match's process
+    options.resume.mkdir(parents=True, exist_ok=True)
+    file = options.resume / "rows.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    asked = [] if options.report else plans(options)
+    for plan in asked:
+        if any(plan.items() <= row.items() for row in rows):
+            continue
+        keep = options.resume / f"{plan['scenario']}-{plan['seed']}" if options.keep else None
+        row = measure_apart(plan, options.limit, keep)
+        rows.append(row)
+        with file.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+        tell(" ".join(map(str, list_match(row))))
+    shown = [row for row in rows if not asked or any(p.items() <= row.items() for p in asked)]
+    return report(shown)
+
+
+def list_match(row: dict[str, Any]) -> list[Any]:
+    """Return a match's row of the table."""
+    said = [each.strip().splitlines()[-1][:200] for each in row.get("failures", [])]
+    said += [f"warning: {each[:200]}" for each in row.get("warnings", [])]
+    numbers = [row.get(name) for name in ("cameras", "people", "seen", "with_bodies")]
+    return [f"{row['scenario']} {row['seed']}", row["state"], *numbers, "; ".join(said)]
+
+
+def report(rows: list[dict[str, Any]]) -> Tables:
+    """Return outcomes of matches, and errors and regions by scenario, stage and iteration."""
+    columns = ["match", "state", "cameras", "people", "seen", "with a body", "said"]
+    enough = [
+        row
+        for row in rows
+        if row["state"] == "complete" and row["with_bodies"] >= 0.95 * row["seen"]
+    ]
+    title = f"{len(enough)} of {len(rows)} matches complete, with 95 % of the bodies"
+    names = list(dict.fromkeys(row["scenario"] for row in rows))
+    foreign = [name for name in names if name in FOREIGN_SCENARIOS]
+    groups = {name: [name] for name in names} | ({"second world": foreign} if foreign else {})
+    errors = ["MPJPE [mm]", "G-MPJPE [mm]", "PA-MPJPE [mm]", "coverage", "IDF1", "switches"]
+    of_groups = [*JOINT_GROUPS, "all"]
+    tables = {
+        "errors": Table("errors, means over matches", [], []),
+        "groups": Table("mean error", of_groups, [], "mm"),
+        "groups_defined": Table("mean error, as detected", of_groups, [], "mm"),
+        "regions": Table("joints in 95 % regions", of_groups, [], "%"),
+        "regions_defined": Table("joints in 95 % regions, as detected", of_groups, [], "%"),
+    }
+    values: dict[str, list[list[Any]]] = {key: [] for key in tables}
+    for name, members in groups.items():
+        some = [row["stages"] for row in rows if row["scenario"] in members and "stages" in row]
+        for iteration, stage in product(range(max(map(len, some), default=0)), STAGES):
+            scored = [
+                passes[iteration][stage]
+                for passes in some
+                if len(passes) > iteration and stage in passes[iteration]
+            ]
+            if scored:
+                first = [f"{name}, {stage}, iteration {iteration + 1}", len(scored)]
+                for key, numbers in summarize(scored).items():
+                    values[key].append([*first, *numbers])
+    shown = {
+        key: replace(table, columns=["of", "matches", *(table.columns or errors)], rows=values[key])
+        for key, table in tables.items()
+    }
+    return {"matches": Table(title, columns, [list_match(row) for row in rows]), **shown}
+
+
+def summarize(scored: list[dict[str, Any]]) -> dict[str, list[float]]:
+    """Return the values of some matches' rows, by table."""
+    means = [
+        float(np.mean([one[name] for one in scored if one[name] is not None] or [np.nan]))
+        for name in SCORES
+    ]
+    means[-1] *= len(scored)
+    return {
+        "errors": means,
+        "groups": _ratios(scored, "errors_mm"),
+        "groups_defined": _ratios(scored, "errors_defined_mm"),
+        "regions": _ratios(scored, "regions"),
+        "regions_defined": _ratios(scored, "regions_defined"),
+    }
+
+
+def _ratios(scored: list[dict[str, Any]], name: str) -> list[float]:
+    """Return the ratio of both numbers of each joint group, summed over matches, and of all."""
+    sums = np.array([[one[name][group] for group in JOINT_GROUPS] for one in scored]).sum(axis=0)
+    sums = np.append(sums, [sums.sum(axis=0)], axis=0)
+    ratios = sums[:, 0] / np.maximum(sums[:, 1], 1)
+    found: list[float] = (100.0 * ratios if name.startswith("regions") else ratios).tolist()
+    return found
+
+
+def plans(options: Namespace) -> list[dict[str, Any]]:
+    """Return the measurements to make."""
+    if options.scenarios:
+        numbers = [(s, options.seed + k) for s in options.scenarios for k in range(options.matches)]
+    else:
+        numbers = [(MIX[k % len(MIX)], options.seed + k) for k in range(options.matches)]
+    recordings = None if options.recordings is None else str(options.recordings)
+    return [
+        {
+            "scenario": name,
+            "seed": seed,
+            "duration": options.duration,
+            "iterations": options.iterations,
+            "calibrated": options.calibrated,
+            "recordings": recordings if k % 2 and name in FOREIGN_SCENARIOS else None,
+        }
+        for k, (name, seed) in enumerate(numbers)
+    ]
 
 
 def run_in_process(project: Path, folder: Path, iteration: int) -> RunRecord:
@@ -113,7 +240,6 @@ def score_stage(run: Run, stage: str, reference: Path, fps: float) -> dict[str, 
         "regions_defined": region_counts(seen, defined),
         "errors_mm": group_errors(tracks, truth),
         "errors_defined_mm": group_errors(seen, defined),
-        "segments": segment_errors(tracks, truth),
     }
 
 
@@ -215,159 +341,3 @@ def measure_apart(plan: dict[str, Any], limit: float, keep: Path | None) -> dict
         if not answer.exists():
             return plan | {"state": "crash", "failures": [f"exit code {process.exitcode}"]}
         return dict(json.loads(answer.read_text()))
-
-
-def line_of(row: dict[str, Any]) -> str:
-    """Return a match's row as readable text."""
-    text = (
-        f"{row['scenario']:15s} {row['seed']:5d} {row.get('cameras', 0):3d} cameras "
-        f"{row.get('people', 0):3d} people {row['state']:9s}"
-    )
-    if "seen" in row:
-        text += f" bodies {row['with_bodies']:2d} of {row['seen']:2d} seen"
-    for scored in row.get("stages", []):
-        pairs = [
-            f"{one['g_mpjpe_mm'] or np.nan:.1f}/{one['pa_mpjpe_mm'] or np.nan:.1f}"
-            for one in scored.values()
-        ]
-        text += "  " + " ".join(pairs)
-    for failure in row.get("failures", []):
-        text += f"\n    {failure.strip().splitlines()[-1][:300]}"
-    for warning in row.get("warnings", []):
-        text += f"\n    warning: {warning[:300]}"
-    return text
-
-
-def print_report(rows: list[dict[str, Any]]) -> None:
-    """Print outcomes of matches, and errors and regions by scenario, stage and iteration."""
-    enough = [
-        row
-        for row in rows
-        if row["state"] == "complete" and row["with_bodies"] >= 0.95 * row["seen"]
-    ]
-    print(f"\n{len(rows)} matches: {dict(Counter(row['state'] for row in rows))}")
-    print(f"with bodies for at least 95 % of the people that two cameras see: {len(enough)}")
-    names = list(dict.fromkeys(row["scenario"] for row in rows))
-    foreign = [name for name in names if name in FOREIGN_SCENARIOS]
-    groups = {name: [name] for name in names} | ({"second world": foreign} if foreign else {})
-    for heading, line in (
-        ("mean MPJPE / G-MPJPE / PA-MPJPE [mm], identity switches", _error_line),
-        (f"mean error [mm]: {', '.join(JOINT_GROUPS)}; all", _group_line),
-        (
-            f"segments' lengths [%]: {', '.join(SEGMENTS)}; all, median error (signed)",
-            _segment_line,
-        ),
-        (f"in 95 % regions, true joints [%]: {', '.join(JOINT_GROUPS)}; all", _region_line),
-        ("in 95 % regions, joints as the detector takes them [%]", _defined_line),
-    ):
-        print(f"\n{heading}")
-        for title, members in groups.items():
-            some = [row["stages"] for row in rows if row["scenario"] in members and "stages" in row]
-            for iteration in range(max(map(len, some), default=0)):
-                for stage in STAGES:
-                    scored = [
-                        passes[iteration][stage]
-                        for passes in some
-                        if len(passes) > iteration and stage in passes[iteration]
-                    ]
-                    if scored:
-                        text = f"{title:15s} {iteration + 1} {stage:15s} {len(scored):2d}  "
-                        print(text + line(scored))
-
-
-def _error_line(scored: list[dict[str, Any]]) -> str:
-    errors = [
-        np.mean([one[name] for one in scored if one[name] is not None] or [np.nan])
-        for name in ("mpjpe_mm", "g_mpjpe_mm", "pa_mpjpe_mm")
-    ]
-    switches = sum(one["switches"] or 0 for one in scored)
-    return " / ".join(f"{error:6.1f}" for error in errors) + f"  {switches:3d}"
-
-
-def _ratios(scored: list[dict[str, Any]], name: str) -> str:
-    """Return the ratio of both numbers of each joint group, summed over matches, and of all."""
-    sums = np.array([[one[name][group] for group in JOINT_GROUPS] for one in scored]).sum(axis=0)
-    sums = np.append(sums, [sums.sum(axis=0)], axis=0)
-    ratios = sums[:, 0] / np.maximum(sums[:, 1], 1)
-    ratios = 100.0 * ratios if name.startswith("regions") else ratios
-    return " ".join(f"{ratio:5.1f}" for ratio in ratios[:-1]) + f"; {ratios[-1]:5.1f}"
-
-
-def _group_line(scored: list[dict[str, Any]]) -> str:
-    return f"{_ratios(scored, 'errors_mm')}   detector's: {_ratios(scored, 'errors_defined_mm')}"
-
-
-def _segment_line(scored: list[dict[str, Any]]) -> str:
-    found = {name: [e for one in scored for e in one["segments"][name]] for name in SEGMENTS}
-    parts = [*found.values(), [error for errors in found.values() for error in errors]]
-    shown = [100.0 * np.array([np.median(np.abs(p)), np.median(p)]) for p in parts if p]
-    return "  ".join(f"{size:4.1f} ({signed:+5.1f})" for size, signed in shown)
-
-
-def _region_line(scored: list[dict[str, Any]]) -> str:
-    return _ratios(scored, "regions")
-
-
-def _defined_line(scored: list[dict[str, Any]]) -> str:
-    return _ratios(scored, "regions_defined")
-
-
-def plans(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the measurements to make."""
-    if options.scenarios:
-        numbers = [(s, options.seed + k) for s in options.scenarios for k in range(options.matches)]
-    else:
-        numbers = [(MIX[k % len(MIX)], options.seed + k) for k in range(options.matches)]
-    recordings = None if options.recordings is None else str(options.recordings)
-    return [
-        {
-            "scenario": name,
-            "seed": seed,
-            "duration": options.duration,
-            "iterations": options.iterations,
-            "calibrated": options.calibrated,
-            "recordings": recordings if k % 2 and name in FOREIGN_SCENARIOS else None,
-        }
-        for k, (name, seed) in enumerate(numbers)
-    ]
-
-
-def main() -> None:
-    """Measure missing matches, print one line per match, then the report."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--matches", type=int, default=40, help="of the mix, or of each scenario")
-    parser.add_argument("--scenarios", nargs="+", choices=[*SCENARIOS, *FOREIGN_SCENARIOS])
-    parser.add_argument("--duration", type=float, default=4.0, help="[s]")
-    parser.add_argument("--seed", type=int, default=1, help="of the first match")
-    parser.add_argument("--iterations", type=int, default=1)
-    parser.add_argument("--recordings", type=Path, help="folder for every second match")
-    parser.add_argument("--calibrated", action="store_true", help="exact cameras")
-    parser.add_argument("--limit", type=float, default=3600.0, help="for one match [s]")
-    parser.add_argument("--resume", type=Path, default=Path("second_world"), metavar="DIR")
-    parser.add_argument("--keep", action="store_true", help="keep match folders and projects")
-    parser.add_argument("--report", action="store_true", help="only print what DIR holds")
-    options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # also ends the match's process
-    options.resume.mkdir(parents=True, exist_ok=True)
-    file = options.resume / "rows.jsonl"
-    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    asked = [] if options.report else plans(options)
-    for plan in asked:
-        if any(plan.items() <= row.items() for row in rows):
-            continue
-        keep = options.resume / f"{plan['scenario']}-{plan['seed']}" if options.keep else None
-        row = measure_apart(plan, options.limit, keep)
-        rows.append(row)
-        with file.open("a") as out:
-            out.write(json.dumps(row) + "\n")
-        print(line_of(row), flush=True)
-    shown = [row for row in rows if not asked or any(p.items() <= row.items() for p in asked)]
-    if options.report:
-        print("\n".join(line_of(row) for row in shown))
-    print_report(shown)
-    if not shown:
-        sys.exit("no rows yet")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,59 +1,109 @@
-"""Prints PCP3D of the Shelf sequence through whole runs: all cameras, one less, and causally.
-
-    python benchmarks/shelf.py DATA
-    python benchmarks/shelf.py DATA --groups [--set STAGE.SETTING=JSON ...]
-
-DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`, the
-sequence's own evaluator. Every line is an import and a run by the command line; scored are the
-joints of `retriangulation` and the fitted bodies, in the definition of the body model and of the
-detector, actors 1 and 3, alpha 0.5.
-
-With --groups, frames 300 to 420 and 421 to 510 are two matches of all cameras, whose stages run in
-this process. For each stage and joint group: mean distance to the labels; the same less a constant
-offset per joint in the body's frame, which is the mean over all people of the window; and the share
-of labels in 95 % regions, as they are and less that offset. Before it, the distances of bodies and
-triangulated joints to keypoints of held-out cameras. Labels have no joints of the face but a
-bottom and a top of the head. Then lengths of limbs, medians over frames and sides, relative to the
-labels', per person.
-"""
+"""The Shelf sequence: whole runs, joint groups, subsets and pairs of its cameras."""
 
 from __future__ import annotations
 
-import argparse
-import importlib.util
+import itertools
 import json
 import re
-import shutil
 import tempfile
+from argparse import Namespace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
-from common import print_held_out, run_in_process, run_worldpose
-from joint_regions import group_joints
-from scipy.special import chdtri
+from common import (
+    load_module,
+    read_settings,
+    run_in_process,
+    run_worldpose,
+    tell,
+)
+from registry import DATA, SET, Table, Tables, benchmark, integer, option
+from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats
+from data_contracts.keypoints import KeypointDetections
 from flows.results.best_results import JointDefinition, joint_tracks
-from worldpose.body_fitting.objective import body_axes
-from worldpose.formats.joints_file import read_joints
+from worldpose.body_fitting.objective import perceived_joints
+from worldpose.errors import WorldposeError
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match
-from worldpose.store.store import Store
+from worldpose.ingest.match_folder import read_match
+from worldpose.store.store import Store, open_run
+from worldpose.tracking.settings import TrackingSettings
+from worldpose.tracking.tracker import track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.settings import TriangulationSettings
 
 FPS = 25.0
+
+ALL_FRAMES = range(1_000_000)
+
 WINDOWS = (range(300, 421), range(421, 511))
 """Frames in which settings are chosen, and in which they are scored."""
 
 
-def load_scorer(folder: Path) -> ModuleType:
-    """Return the sequence's evaluator."""
-    spec = importlib.util.spec_from_file_location("pcp", folder / "pcp.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+STAGES = ("triangulation", "retriangulation", "body_fitting")
+
+SCORED: tuple[tuple[str, JointDefinition], ...] = (
+    *((stage, "detector") for stage in STAGES[:2]),
+    *((STAGES[2], definition) for definition in ("body", "detector")),
+)
+"""Stages, and the definition of their joints."""
+
+POINTS, MILLIMETERS = 0.3, 1.0
+"""Loss through a stage that counts as worse."""
+
+LETTERS = {"triangulation": "T", "retriangulation": "R", "body_fitting": "B"}
+
+FOUND_M = 0.5
+
+
+@benchmark("shelf", "Shelf through whole runs: all cameras, causally, without each camera", DATA)
+def score_runs(options: Namespace) -> Tables:
+    """DATA holds `shelf_dev`: `import/` (calibration.toml, detections), `gt.npz` and `pcp.py`.
+
+    `pcp.py` is the sequence's own evaluator. Every row is a run by the command line; scored are the
+    joints of `retriangulation` and the fitted bodies, in the definition of the body model and of
+    the detector: PCP3D of actors 1 and 3 at alpha 0.5.
+    """
+    data = options.data / "shelf_dev"
+    cameras = list_cameras(data)
+    runs: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        "all cameras": (cameras, ()),
+        "causal": (cameras, ("--set", "tracking.causal=true")),
+        **{
+            f"without {camera}": (tuple(c for c in cameras if c != camera), ())
+            for camera in cameras
+        },
+    }
+    rows = []
+    for label, (chosen, settings) in runs.items():
+        with tempfile.TemporaryDirectory() as temporary:
+            match = write_case(data / "import", chosen, ALL_FRAMES, Path(temporary))
+            rows.append([label, *scores(data, match, Path(temporary), *settings)])
+        tell(str(rows[-1]))
+    columns = ["cameras", "joints", "bodies", "bodies as detected"]
+    return {"pcp3d": Table("PCP3D", columns, rows, "%")}
+
+
+def list_cameras(data: Path) -> tuple[str, ...]:
+    """Return the names of the cameras."""
+    return tuple(sorted(file.stem for file in (data / "import" / "detections").glob("*.json")))
+
+
+def scores(data: Path, match: Path, folder: Path, *settings: str) -> list[float]:
+    """Return PCP3D of retriangulated joints and of bodies in both definitions [%]."""
+    scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
+    run_worldpose("run", match, "--project", folder / "project", *settings)
+    run, values = open_run(str(folder / "project"), match.name), []
+    for stage, definition in SCORED[1:]:
+        tracks = joint_tracks(run, "clip", stage, definition)
+        poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
+        score, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf")
+        values.append(float(score["avg_pcp_actors_1_3"]))
+    return values
 
 
 def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Path) -> Path:
@@ -78,189 +128,158 @@ def write_case(given: Path, cameras: tuple[str, ...], frames: range, folder: Pat
     return match
 
 
-def read_settings(words: list[str]) -> dict[str, Any]:
-    """Return settings by stage from STAGE.SETTING=JSON."""
-    overrides: dict[str, Any] = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        stage, _, setting = name.partition(".")
-        overrides.setdefault(stage, {})[setting] = json.loads(value)
-    return overrides
-
-
-def without(given: Path, camera: str, folder: Path) -> Path:
-    """Return a copy of the import form without one camera."""
-    out = folder / "import"
-    shutil.copytree(given, out)
-    (out / "detections" / f"{camera}.json").unlink()
-    parts = re.split(r"(?m)^(?=\[)", (given / "calibration.toml").read_text())
-    kept = [part for part in parts if f'name = "{camera}"' not in part]
-    assert len(kept) == len(parts) - 1
-    (out / "calibration.toml").write_text("".join(kept))
-    return out
-
-
-def scores(data: Path, given: Path, folder: Path, *settings: str) -> list[float]:
-    """Return PCP3D of retriangulated joints and of bodies in both definitions [%]."""
-    scorer, truth = load_scorer(data), np.load(data / "gt.npz")
-    match, project = folder / "shelf", folder / "project"
-    calibration, detections = given / "calibration.toml", given / "detections"
-    run_worldpose(
-        *("import", "--calibration", calibration, "--detections", detections),
-        *("--fps", 25, "--out", match),
-    )
-    run_worldpose("run", match, "--project", project, *settings)
-    values = []
-    for stage, definition in (
-        ("retriangulation", "detector"),
-        ("body_fitting", "body"),
-        ("body_fitting", "detector"),
-    ):
-        out = folder / stage / definition
-        run_worldpose(
-            *("export", "shelf", "--format", "joints", "--stage", stage),
-            *("--definition", definition, "--out", out, "--project", project),
-        )
-        tracks = read_joints(out / "joints.npz")
-        poses = dict(zip(tracks.frames.tolist(), tracks.joints, strict=True))
-        score, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf")
-        values.append(float(score["avg_pcp_actors_1_3"]))
-    return values
-
-
-GROUPS = ("head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-STAGES = ("triangulation", "retriangulation", "body_fitting")
-SCORED: tuple[tuple[str, JointDefinition], ...] = (
-    *((stage, "detector") for stage in STAGES[:2]),
-    *((STAGES[2], definition) for definition in ("body", "detector")),
+@benchmark(
+    "shelf_subsets",
+    "Shelf with few cameras and in short windows: each stage against its input",
+    DATA,
+    option("--windows", type=int, nargs="+", default=[211, 121, 60, 30], help="lengths [frame]"),
+    option("--first", type=int, help="first frame; that of the labels if not given"),
+    option("--cameras", type=int, nargs="+", default=[5, 4, 3, 2], help="numbers of cameras"),
+    option("--without", nargs="*", default=[], help="the subset without these alone"),
+    integer("iterations", 1),
+    option("--until", default="body_fitting"),
+    option("--keep", type=Path, help="folder whose results are not recomputed"),
+    SET,
 )
-"""Stages, and the definition of their joints."""
-LIMBS = {"upper arms": (7, 8, 9, 10), "forearms": (6, 7, 10, 11), "thighs": (1, 2, 3, 4)}
-LIMBS |= {"shanks": (0, 1, 4, 5)}
-"""Ends of the right limb and of the left one, in the order of the labels."""
+def score_subsets(options: Namespace) -> Tables:
+    """Every subset of cameras is a match, and so is every window of frames, in sequence.
 
-
-def compare_groups(data: Path, folder: Path, overrides: dict[str, Any]) -> None:
-    """Print distances, regions and lengths of limbs of both windows."""
-    scorer, truth = load_scorer(data), np.load(data / "gt.npz")
-    joints = {name: group_joints(name) for name in GROUPS[1:]}
-    rows = {name: np.flatnonzero(np.isin(scorer.COCO_FOR_SHELF, joints[name])) for name in joints}
-    rows["head"] = np.array([12, 13])
-    store = Store.create(folder / "project")
-    cameras = tuple(sorted(file.stem for file in (data / "import" / "detections").glob("*.json")))
-    for frames in WINDOWS:
-        case = write_case(data / "import", cameras, frames, folder)
-        match, (keys,) = run_in_process(store, case, "body_fitting", 1, overrides)
-        run: Any = {
-            f"{stage}/clip": store.open_result(match, stage, "clip", keys[f"{stage}/clip"])
-            for stage in ("tracking", *STAGES)
-        }
-        labels = truth["gt"][np.isin(truth["frames"], frames)]
-        label = f"frames {frames.start} to {frames.stop - 1}"
-        key = keys["body_fitting/clip"]
-        print_held_out(label, store.manifest(match, "body_fitting", "clip", key).figures)
-        print(f"{label}: {', '.join(GROUPS)}")
-        for stage, definition in SCORED:
-            tracks = joint_tracks(run, "clip", stage, definition)
-            found, covariance = match_labels(scorer, labels, tracks.joints, tracks.covariance)
-            error = found - labels
-            axes = label_axes(scorer, labels)
-            local = np.einsum("fpba,fpjb->fpja", axes, error)
-            rest = local - np.nanmean(local, axis=(0, 1))
-            turned = np.einsum("fpba,fpjbc,fpcd->fpjad", axes, covariance, axes)
-            print(f"  {stage}, {definition}")
-            for what, each in (("distance [mm]", error), ("less offset [mm]", rest)):
-                away = 1e3 * np.linalg.norm(each, axis=-1)
-                print(
-                    f"    {what:18s}", *(f"{np.nanmean(away[..., rows[g]]):6.1f}" for g in GROUPS)
-                )
-            for what, each in (("in regions [%]", local), ("less offset [%]", rest)):
-                known = np.isfinite(each[..., :12, 0])
-                squared = np.einsum(
-                    "fpja,fpjab,fpjb->fpj",
-                    each[..., :12, :],
-                    np.linalg.inv(turned),
-                    each[..., :12, :],
-                )
-                inside = 100.0 * np.where(known, squared <= chdtri(3, 0.05), np.nan)
-                shown = (f"{np.nanmean(inside[..., rows[g]]):6.1f}" for g in GROUPS[1:])
-                print(f"    {what:18s}", " " * 6, *shown)
-            print(f"    lengths [%]       {length_errors(found, labels)}", flush=True)
-
-
-def match_labels(
-    scorer: ModuleType, labels: Floats, joints: Floats, covariance: Floats | None
-) -> tuple[Floats, Floats]:
-    """Return the nearest person of each labelled one: joints of the labels, and covariances."""
-    assert covariance is not None
-    poses = scorer.coco17_to_shelf14(joints)
-    found = np.full(labels.shape, np.nan)
-    stated = np.full((*labels.shape[:2], 12, 3, 3), np.nan)
-    for frame, person in np.argwhere(np.isfinite(labels).all(axis=(2, 3))):
-        away = scorer.pose_distance(labels[frame, person], poses[frame])
-        nearest = int(away.argmin())
-        if away[nearest] < 0.5:
-            found[frame, person] = poses[frame, nearest]
-            stated[frame, person] = covariance[frame, nearest][scorer.COCO_FOR_SHELF]
-    return found, stated
-
-
-def label_axes(scorer: ModuleType, labels: Floats) -> Floats:
-    """Return forward, left and up (frames, persons, 3, 3) of the labels."""
-    places = np.full((*labels.shape[:2], 17, 3), np.nan)
-    places[:, :, scorer.COCO_FOR_SHELF] = labels[:, :, :12]
-    return body_axes(places)
-
-
-def length_errors(found: Floats, labels: Floats) -> str:
-    """Return the errors of limbs' median lengths relative to the labels', per person [%].
-
-    Medians are over frames and both sides: the labels of both forearms of a person differ by 31 %.
+    Scored are joints of `triangulation` (T), `retriangulation` (R), and bodies in the definition of
+    the body model (B) and of the detector (D): PCP3D at alpha 0.5 and mean error. The second table
+    counts the cases in which a stage is worse than its input by more than 0.3 points or 1 mm.
     """
-    parts = []
-    people = np.isfinite(labels[..., 0, 0]).any(axis=0)
-    for name, ends in LIMBS.items():
-        ours, theirs = (
-            np.nanmedian(
-                np.linalg.norm(
-                    each[:, people][..., ends[::2], :] - each[:, people][..., ends[1::2], :],
-                    axis=-1,
-                ),
-                axis=(0, 2),
-            )
-            for each in (found, labels)
-        )
-        parts.append(f"{name} " + " ".join(f"{100.0 * (r - 1.0):+.1f}" for r in ours / theirs))
-    return "; ".join(parts)
-
-
-def main() -> None:
-    """Print one line per run."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--groups", action="store_true", help="distances by joint group")
-    parser.add_argument("--set", nargs="*", default=[], dest="settings")
-    options = parser.parse_args()
     data = options.data / "shelf_dev"
-    if options.groups:
-        with tempfile.TemporaryDirectory() as temporary:
-            compare_groups(data, Path(temporary), read_settings(options.settings))
-        return
-    cameras = sorted(file.stem for file in (data / "import" / "detections").glob("*.json"))
-    runs: dict[str, tuple[str | None, tuple[str, ...]]] = {
-        "all cameras": (None, ()),
-        "causal": (None, ("--set", "tracking.causal=true")),
-        **{f"without {camera}": (camera, ()) for camera in cameras},
+    scorer, truth = load_module(data / "pcp.py"), np.load(data / "gt.npz")
+    every, last = list_cameras(data), int(truth["frames"][-1])
+    first = options.first or int(truth["frames"][0])
+    rows: list[list[Any]] = []
+    worse: dict[str, list[bool]] = {}
+    how = (options.until, options.iterations, read_settings(options.settings))
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.keep or Path(temporary)
+        store = Store.open_or_new(str(folder / "project"))
+        for length, number in itertools.product(options.windows, options.cameras):
+            windows = [range(n, n + length) for n in range(first, last + 2 - length, length)]
+            for frames, cameras in itertools.product(
+                windows, itertools.combinations(every, number)
+            ):
+                rest, shown = set(every) - set(cameras), np.isin(truth["frames"], frames)
+                if options.without and rest != set(options.without):
+                    continue
+                if not np.isfinite(truth["gt"][shown][:, [0, 2], 0, 0]).any():
+                    continue
+                label = f"{' '.join(cameras)}, {frames.start} to {frames.stop - 1}"
+                try:
+                    folder_of_case = write_case(data / "import", cameras, frames, folder)
+                    match, found = run_in_process(store, folder_of_case, *how)
+                except WorldposeError as error:
+                    rows.append([label, type(error).__name__, None, None])
+                    continue
+                marks: dict[str, tuple[float, float]] = {}
+                for turn, keys in enumerate(found, 1):
+                    for stage in (each for each in STAGES if f"{each}/clip" in keys):
+                        both = score(scorer, truth, store, match, keys, stage)
+                        marks |= {f"{letter}{turn}": pair for letter, pair in both.items()}
+                rows += [[label, name, *pair] for name, pair in marks.items()]
+                for before, after in itertools.pairwise(("T1", "R1", "B1")):
+                    if after in marks:
+                        lost = marks[before][0] - marks[after][0]
+                        risen = marks[after][1] - marks[before][1] if after == "R1" else 0.0
+                        is_bad = lost > POINTS or risen > MILLIMETERS
+                        worse.setdefault(f"{before} to {after}", []).append(is_bad)
+                tell(f"{label} {marks}")
+    counts = [[name, sum(cases), len(cases)] for name, cases in worse.items()]
+    return {
+        "cases": Table("cases", ["case", "joints", "PCP3D [%]", "error [mm]"], rows),
+        "worse": Table("worse than the input", ["step", "cases", "of"], counts),
     }
-    print("PCP3D: joints, bodies by the body model and by the detector [%]")
-    for label, (left_out, settings) in runs.items():
-        with tempfile.TemporaryDirectory() as temporary:
-            folder, given = Path(temporary), data / "import"
-            if left_out is not None:
-                given = without(given, left_out, folder)
-            values = scores(data, given, folder, *settings)
-        print(f"{label:16s}", *(f"{value:6.2f}" for value in values), flush=True)
 
 
-if __name__ == "__main__":
-    main()
+def score(
+    scorer: Any, truth: Any, store: Store, match: str, keys: dict[str, str], stage: str
+) -> dict[str, tuple[float, float]]:
+    """Return PCP3D [%] and the mean error of matched people [mm], by letter."""
+    (unit,) = (name for name in keys if name.startswith(f"{stage}/"))
+    _, name = unit.split("/")
+    stored = store.open_result(match, stage, name, keys[unit])
+    frames, joints = stored["frame"].values, stored["joints"].values
+    by_letter = {LETTERS[stage]: joints}
+    if stage == "body_fitting":
+        by_letter["D"] = perceived_joints(joints, stored["joint_offsets"].values)
+    scores: dict[str, tuple[float, float]] = {}
+    for letter, places in by_letter.items():
+        poses = dict(zip(frames.tolist(), places, strict=True))
+        found, _ = scorer.evaluate(truth["gt"], truth["frames"], poses, "shelf", frames=frames)
+        error = found["mpjpe_mm_matched"]
+        scores[letter] = found["avg_pcp_actors_1_3"], np.nan if error is None else error
+    return scores
+
+
+@benchmark(
+    "shelf_pairs",
+    "who is found in single frames of the pairs of Shelf's cameras",
+    DATA,
+    option("--odds", type=float, nargs="+", default=[3.0], help="values of tracking.pair_odds"),
+    integer("every", 4),
+)
+def score_pairs(options: Namespace) -> Tables:
+    """Every 4th of the frames 300 to 420 is a clip of one frame for each pair of cameras.
+
+    The people of all cameras, tracked over all frames, are the truth: asked are those whom both
+    cameras of a pair detect. A person is found if a result is within 0.5 m, by the mean over the
+    joints; results without a person are false.
+    """
+    data, rows = options.data / "shelf_dev", []
+    with tempfile.TemporaryDirectory() as temporary:
+        case = write_case(data / "import", list_cameras(data), WINDOWS[0], Path(temporary))
+        match = read_match(case)
+        ids = [camera.id for camera in match.spec.static_cameras]
+        cameras = Camera.stack([Camera.from_calibration(match.calibrations[name]) for name in ids])
+        seen = KeypointDetections.stack([read_unit(match, name)[0] for name in ids])
+    truth, index = find_people(cameras, seen, TrackingSettings())
+    for odds in options.odds:
+        settings = TrackingSettings(pair_odds=odds)
+        asked = found = false = 0
+        errors: list[float] = []
+        for pair in itertools.combinations(range(len(ids)), 2):
+            views = np.array(pair)
+            for frame in range(0, len(truth), options.every):
+                both = (index[frame, views] >= 0).all(axis=0)
+                now = seen[frame : frame + 1]
+                one = KeypointDetections.from_keypoints(
+                    now.keypoints[:, views], now.confidence[:, views]
+                )
+                joints, _ = find_people(cameras[views], one, settings)
+                matched, _, distance = pair_people(truth[frame], joints[0])
+                asked += int(both.sum())
+                found += int(both[matched].sum())
+                false += joints.shape[1] - len(matched)
+                errors += distance.tolist()
+        rows.append([odds, found, asked, 100.0 * found / asked, 100.0 * np.mean(errors), false])
+    columns = ["odds", "found", "of", "found [%]", "mean error [cm]", "false"]
+    return {"pairs": Table("people of pairs of cameras", columns, rows)}
+
+
+def find_people(
+    cameras: Camera, detections: KeypointDetections, settings: TrackingSettings
+) -> tuple[Floats, Floats]:
+    """Return joints (frames, persons, 17, 3) [m], and detection indices (frames, cameras, ...)."""
+    tracks = track_people(cameras, detections, FPS, settings)
+    index = tracks.detection_index
+    if not len(tracks.person):
+        return np.empty((len(index), 0, 17, 3)), np.asarray(index, dtype=np.float64)
+    assigned = detections.assign_people(index)
+    placed = reconstruct_joints(cameras, assigned, FPS, TriangulationSettings())
+    joints = placed.triangulation.joints.astype(np.float64)
+    return joints, np.asarray(index, dtype=np.float64)
+
+
+def pair_people(truth: Floats, found: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return rows and columns of people and results of one frame, and their distances [m]."""
+    off = np.linalg.norm(truth[:, None] - found[None], axis=-1)
+    known = np.isfinite(off)
+    mean = np.where(known, off, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+    mean = np.where(known.any(axis=-1), mean, np.inf)
+    rows, columns = linear_sum_assignment(np.minimum(mean, 1e3))
+    near = mean[rows, columns] <= FOUND_M
+    return rows[near], columns[near], mean[rows[near], columns[near]]

@@ -1,13 +1,11 @@
 """Real moving cameras alone, with clicked key frames; skipped where the data is absent.
 
-WORLDPOSE_TEST_DATA names a folder with `broadcast_clip` (benchmarks/broadcast_clip.py fetch), and
-with `static_pair`, which moving cameras are cut out of.
+WORLDPOSE_TEST_DATA names a folder with `broadcast_clip` (run.py broadcast_clip --fetch),
+and with `static_pair`, which moving cameras are cut out of.
 """
 
 import csv
-import importlib.util
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,6 @@ from command_line import succeed
 
 GIVEN = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 DATA = GIVEN / "broadcast_clip"
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "broadcast_clip.py"
 
 needs_clip = pytest.mark.skipif(
     not DATA.is_dir(), reason="WORLDPOSE_TEST_DATA has no broadcast_clip"
@@ -28,11 +25,9 @@ needs_pair = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def bench():
-    sys.path.insert(0, str(SCRIPT.parent))
-    spec = importlib.util.spec_from_file_location("broadcast_clip", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    import real_cameras  # late: it loads the simulators
+
+    return real_cameras
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broadcast_line_sets import SIZE, cameras, line_sets
-from pitch_lines import jaccards, load_scorer
+from line_sets import SIZE, cameras, jaccards, line_sets, load_scorer
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
 

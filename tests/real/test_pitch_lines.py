@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pitch_lines import (
+from line_sets import (
     BROADCAST,
     SETS,
     fit,

@@ -4,14 +4,14 @@ WORLDPOSE_TEST_DATA names a folder with `static_pair`, `wc14` and `sn22_lines`.
 """
 
 import argparse
-import importlib.util
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import static_pair
+from common import run_in_process
+from line_sets import RIGHT_PX, drawn_lines
 
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.proposal import calibrate_without_clicks
@@ -19,18 +19,6 @@ from worldpose.store.store import Store
 from worldpose.video.folder import median_picture, open_video
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent"))
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
-
-@pytest.fixture(scope="module")
-def bench():
-    sys.path.insert(0, str(BENCHMARKS))
-    spec = importlib.util.spec_from_file_location("proposals", BENCHMARKS / "proposals.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["proposals"] = module
-    spec.loader.exec_module(module)
-    yield module
-    sys.path.remove(str(BENCHMARKS))
 
 
 @pytest.mark.skipif(
@@ -54,15 +42,13 @@ def test_a_wide_static_camera_is_found_without_a_click_and_without_its_lens():
 @pytest.mark.skipif(
     not (DATA / "static_pair").is_dir(), reason="WORLDPOSE_TEST_DATA has no static_pair"
 )
-@pytest.mark.usefixtures("bench")
 def test_both_static_cameras_of_a_match_are_calibrated_from_their_videos_alone(tmp_path):
     # Guesses by the centre circle once crowded out those by three lines: the right one was refused.
     match, store = tmp_path / "match", Store.create(tmp_path / "project")
     static_pair.write_static_pair(
         DATA / "static_pair", match, first_frame=0, frame_count=40, clicked=False
     )
-    compute = importlib.import_module("common").run_in_process
-    name, (keys,) = compute(store, match, "static_calibration", 1, {})
+    name, (keys,) = run_in_process(store, match, "static_calibration", 1, {})
     units = [f"static_calibration/{side}" for side in static_pair.SIDES]
     left_out = [store.manifest(name, *unit.split("/"), keys[unit]).left_out for unit in units]
     assert left_out == [{}, {}]
@@ -72,9 +58,9 @@ def test_both_static_cameras_of_a_match_are_calibrated_from_their_videos_alone(t
     not ((DATA / "wc14").is_dir() and (DATA / "sn22_lines").is_dir()),
     reason="WORLDPOSE_TEST_DATA has no drawn lines",
 )
-def test_drawn_lines_without_names_give_their_cameras_and_no_wrong_one(bench):
+def test_drawn_lines_without_names_give_their_cameras_and_no_wrong_one():
     options = argparse.Namespace(first=0, count=10, drop=0.2, clutter=4)
-    outcomes = list(bench.drawn_lines(DATA, options))
+    outcomes = list(drawn_lines(DATA, options))
     accepted = [each for each in outcomes if each.accepted]
     assert len(accepted) >= 6
-    assert max(each.error for each in accepted) < bench.RIGHT_PX
+    assert max(each.error for each in accepted) < RIGHT_PX

@@ -145,7 +145,7 @@ def test_a_made_up_folder_gives_known_metrics_and_says_what_is_absent(table, tmp
     # Of the two labelled people one is found, with a false box and one that is too unsure.
     boxes = np.array([[31, 21, 71, 121], [100, 100, 140, 200], [200, 20, 240, 120.0]])
     found = People(boxes, np.array([0.9, 0.8, 0.3]))
-    monkeypatch.setattr(table.module.panorama_people, "detect_people", lambda *_: [found])
+    monkeypatch.setattr(table.module.stills, "detect_people", lambda *_: [found])
     failure, out = table(tmp_path, "--json")
     assert failure is None
     result = json.loads(out)
@@ -162,7 +162,7 @@ def test_a_made_up_folder_gives_known_metrics_and_says_what_is_absent(table, tmp
     assert np.linalg.norm(np.array(clip["center_m"]) - CENTER) < 1.5
     failure, out = table(tmp_path, "--only", "mvor")
     assert failure is None
-    assert "| mvor | three.matched_percent | 100.0 |" in out
+    assert "| mvor | three.matched_percent | 100 |" in out
 
 
 def test_bad_data_is_one_clear_error(table, tmp_path):

@@ -1,11 +1,9 @@
 """Cameras of real stills without a click; skipped where the stills are absent.
 
-WORLDPOSE_TEST_DATA names a folder with `still_cameras` (benchmarks/still_cameras.py fetch).
+WORLDPOSE_TEST_DATA names a folder with `still_cameras` (run.py still_cameras --fetch).
 """
 
-import importlib.util
 import os
-import sys
 from pathlib import Path
 
 import cv2
@@ -17,17 +15,14 @@ from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 
 DATA = Path(os.environ.get("WORLDPOSE_TEST_DATA", "absent")) / "still_cameras"
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "still_cameras.py"
 MIDFIELD, AREA = "che0", "var9"
 
 
 @pytest.fixture(scope="module")
 def bench():
-    spec = importlib.util.spec_from_file_location("still_cameras", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["still_cameras"] = module
-    spec.loader.exec_module(module)
-    return module
+    import real_cameras  # late: it loads the simulators
+
+    return real_cameras
 
 
 def overhead():
@@ -82,6 +77,6 @@ def test_jaccard_counts_right_wrong_and_unlabelled_markings(bench):
 def test_a_real_still_is_calibrated_without_a_click(bench, name):
     (still,) = bench.read_labels(only=[name])
     picture = cv2.imread(str(DATA / f"{name}.png"))
-    score = bench.score_still(np.ascontiguousarray(picture[..., ::-1]), still, None)
+    score = bench.score_still(np.ascontiguousarray(picture[..., ::-1]), still)
     assert score.accepted
     assert score.jaccard[0] == 1.0

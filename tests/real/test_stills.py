@@ -58,12 +58,3 @@ def test_a_second_box_and_a_shifted_box_are_false(labels):
     assert scores.tolist() == [0.9, 0.8, 0.7]
     assert right.tolist() == [True, False, False]
     assert taken.sum() == 1
-
-
-def test_agreement_of_confidence_and_shares():
-    sure = np.repeat(np.linspace(0.1, 0.8, 8), 10)
-    right = np.concatenate([np.arange(10) < 10 * share for share in np.linspace(0.1, 0.8, 8)])
-    found = stills.agreement(sure, right)
-    np.testing.assert_allclose(found.confidence, np.linspace(0.1, 0.8, 8))
-    assert found.gap < 0.1
-    assert stills.agreement(np.full(80, 0.9), np.zeros(80, dtype=bool)).gap == pytest.approx(0.9)

@@ -3,7 +3,7 @@
 The paper looks up samples of the markings in a map of the distance to the nearest edge pixel. This
 module searches each sample across its own projected line, which gives a signed offset, separates
 neighboring markings, and adds no half-width and no rounding.
-`benchmarks/static_calibration.py` measures both.
+`benchmarks/run.py static_calibration` measures both.
 
 Where clicks are noisier than stated, or wrong, the painted lines decide.
 """

@@ -1,4 +1,4 @@
-from soccernet import SOCCERNET_MARKINGS, soccernet_markings
+from line_sets import SOCCERNET_MARKINGS, soccernet_markings
 
 from worldpose.pitch.template import PitchTemplate
 

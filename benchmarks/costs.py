@@ -1,0 +1,473 @@
+"""Time and memory of detection, of whole runs and their units, and of data sets."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import partial
+from itertools import chain, starmap
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import psutil
+import torch
+from common import WORLDPOSE, run_worldpose, tell
+from distributed import LocalCluster
+from registry import OUT, Table, Tables, benchmark, integer, option
+
+from data_contracts.arrays import Image
+from data_contracts.work import Work
+from flows.results.dataset import check, count
+from tasks.unit import keep_freed_memory
+from worldpose.body.body_file import OPEN_BODY, find_body
+from worldpose.body.model import BodyParameters
+from worldpose.detection.enlargement import SeesParts, expect_parts
+from worldpose.detection.interfaces import People
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_detector, load_bundled_pose
+from worldpose.detection.settings import DetectionSettings
+from worldpose.formats.challenge import write_moving_camera
+from worldpose.formats.joints_file import write_poses
+from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rigid import Rigid
+from worldpose.ingest.match_folder import read_match
+from worldpose.pitch.template import PitchTemplate
+from worldpose.simulation.cast import assign_roles, dress_people
+from worldpose.simulation.crowd import gather
+from worldpose.simulation.matches import open_view, render_frame
+from worldpose.simulation.scenarios import SCENARIOS
+from worldpose.simulation.scene import place_camera
+from worldpose.simulation.settings import RenderingSettings, RigSettings
+from worldpose.store.paths import ResultId
+from worldpose.store.store import Store
+from worldpose.video.files import write_video
+from worldpose.video.folder import open_video
+
+RUN = Path(__file__).with_name("run.py")
+Result = TypeVar("Result")
+
+FPS = 50.0
+
+MATCH_FRAMES = 90 * 60 * 50 * 16
+"""Images of a match: 90 minutes, 50 frames per second, 16 cameras."""
+
+SURE = 0.4
+"""Minimum score of boxes that get a pose here: the stage's high score threshold."""
+
+INTERVAL_S = 0.25
+
+PERIOD_US = 20_000
+"""Period in which a group gets its share [us]."""
+
+GROUPS = Path("/sys/fs/cgroup")
+
+
+@benchmark(
+    "detection",
+    "cost of person detection and poses, in integers and in floating point",
+    integer("people", 25),
+    integer("frames", 8),
+)
+def measure_detection(options: Namespace) -> Tables:
+    """A crowd in images of 1920 x 1080 is rendered, decoded, searched and posed, in one thread.
+
+    Times are processor time, so other work on the machine does not count. The last table
+    extrapolates to 90 minutes at 50 frames per second of 16 cameras, without rendering.
+    """
+    torch.set_num_threads(1)
+    rendering, pictures, camera, pitch = render_crowd(options.people, options.frames)
+    decoding = time_decoding(pictures)
+    parts = expect_parts(camera, pitch, DetectionSettings().pitch_margin_m)
+    work, persons = {"rendering": rendering, "decoding": decoding}, 0
+    for kind, weights in ((", float", BUNDLED_WEIGHTS), ("", (None, None))):
+        detector = load_bundled_detector(weights[0])
+        assert isinstance(detector, SeesParts)
+        looking, found = time_work(partial(detector.detect_parts, pictures, parts))
+        people = [People(p.boxes[p.scores >= SURE], p.scores[p.scores >= SURE]) for p in found]
+        pose = load_bundled_pose(weights[1])
+        pairs = list(zip(pictures, (each.boxes for each in people), strict=True))
+        posing, _ = time_work(partial(list, starmap(pose.estimate, pairs)))
+        work |= {f"boxes{kind}": looking, f"poses{kind}": posing}
+        persons = sum(len(each.scores) for each in people)
+    number, whole = len(pictures), looking + posing
+    before = work["boxes, float"] + work["poses, float"]
+    rows = [
+        [name, 1e3 * each / number, number / each, persons / each] for name, each in work.items()
+    ]
+    match = []
+    for stride in (1, 2, 5):
+        hours = (decoding + looking / stride + posing) / number * MATCH_FRAMES / 3600.0
+        match.append([stride, hours, hours / 2, hours / 16])
+    title = f"{persons / number:.1f} people per image; floating point over integers "
+    names = ["stride", "core hours", "hours on 2 cores", "hours on 16 cores"]
+    return {
+        "work": Table(
+            f"{title}{before / whole:.2f}", ["work", "ms/image", "images/s", "people/s"], rows
+        ),
+        "match": Table("a match", names, match),
+    }
+
+
+def render_crowd(people: int, frames: int) -> tuple[float, list[Image], Camera, PitchTemplate]:
+    """Return seconds of rendering, images of a moving crowd, and their camera and pitch."""
+    scenario = SCENARIOS["match"]
+    pitch = PitchTemplate.from_spec(scenario.pitch)
+    crowd = gather(
+        scenario.model_copy(update={"crowd": scenario.crowd.model_copy(update={"people": people})}),
+        pitch,
+        np.random.SeedSequence(5),
+    )
+    times = 1.0 + np.arange(frames) / FPS
+    looks = RenderingSettings()
+    poses, later = crowd.poses(times), crowd.poses(times + looks.exposure_s)
+    cast = dress_people(
+        poses.betas[:, 0], assign_roles(scenario.crowd, len(crowd.paths)), 5, looks.patterns
+    )
+    middle = np.median(crowd.joints(times[:1])[0, :, 11], axis=0)
+    rig = RigSettings(person_height_px=60.0, image_size_px=(1920, 1080))
+    camera = place_camera(rig, 3, middle, scenario.pitch, np.random.default_rng(5))
+    view = open_view(camera, pitch, 5, looks)
+
+    def film(frame: int) -> Image:
+        moment = (cast.pose(poses[:, frame]), cast.pose(later[:, frame]))
+        return render_frame(view, cast, *moment, frame=frame).image
+
+    film(0)
+    return *time_work(lambda: [film(frame) for frame in range(frames)]), camera, pitch
+
+
+def time_decoding(pictures: list[Image]) -> float:
+    """Return the seconds to decode as many images from a video."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pictures.mp4"
+        write_video(path, pictures, FPS)
+        with open_video(path) as video:
+            seconds, _ = time_work(lambda: list(video.frames(0, len(pictures))))
+    return seconds
+
+
+def time_work(work: Callable[[], Result]) -> tuple[float, Result]:
+    """Return processor seconds of some work, and its result."""
+    start = time.process_time()
+    result = work()
+    return time.process_time() - start, result
+
+
+@benchmark(
+    "run_memory",
+    "time and peak memory of each stage of whole runs, and their growth with the duration",
+    option("matches", type=Path, nargs="+", help="match folders of different durations"),
+    option("--to", type=float, default=5400.0, help="duration to extrapolate to [s]"),
+    OUT,
+)
+def measure_runs(options: Namespace) -> Tables:
+    """`worldpose simulate --scenario match --duration 60 --no-stills --no-video --out m60`.
+
+    Every match runs as `worldpose run` in a new project, and the resident memory of all its
+    processes is read from /proc four times per second. A stage's peak is that of the largest
+    process while its units are computed; `all` is the largest sum over all processes. With several
+    matches a straight line through the shortest and the longest one is extrapolated.
+    """
+    runs: list[tuple[float, dict[str, Cost]]] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        parent = options.out or Path(temporary)
+        parent.mkdir(parents=True, exist_ok=True)
+        for folder in options.matches:
+            spec = read_match(folder).spec
+            length = sum(clip.frame_count for clip in spec.clips) / spec.fps
+            tell(f"{folder.name}: {length:g} s of match")
+            runs.append((length, measure_run(folder, parent / folder.name)))
+    runs.sort(key=lambda run: run[0])
+    columns = [f"{length:g} s: {what}" for length, _ in runs for what in ("time [s]", "peak [MB]")]
+    share = 0.0
+    if len(runs) > 1:
+        columns += [f"{options.to:g} s: {what}" for what in ("time [s]", "peak [MB]")]
+        share = (options.to - runs[0][0]) / (runs[-1][0] - runs[0][0])
+    rows = []
+    for stage in runs[-1][1]:
+        costs = [run.get(stage, Cost(0.0, 0, 0)) for _, run in runs]
+        peaks = [cost.total if stage == "all" else cost.largest for cost in costs]
+        cells = [(cost.seconds, peak / 1e6) for cost, peak in zip(costs, peaks, strict=True)]
+        if share:
+            ends = zip(cells[0], cells[-1], strict=True)
+            cells.append(tuple(a + share * (b - a) for a, b in ends))  # type: ignore[arg-type]
+        rows.append([stage, *chain.from_iterable(cells)])
+    return {"stages": Table("whole runs", ["stage", *columns], rows)}
+
+
+@dataclass
+class Memory:
+    """Resident memory over time: moment [s since the epoch], largest process and sum [byte]."""
+
+    samples: list[tuple[float, int, int]] = field(default_factory=list)
+
+    def follow(self, root: int, ended: threading.Event) -> None:
+        """Sample a process and those that descend from it until `ended`."""
+        while not ended.wait(INTERVAL_S):
+            with suppress(psutil.Error):  # a process ended meanwhile
+                family = [psutil.Process(root), *psutil.Process(root).children(recursive=True)]
+                sizes = [each.memory_info().rss for each in family]
+                self.samples.append((time.time(), max(sizes), sum(sizes)))
+
+    def peak(self, begin: float, end: float) -> tuple[int, int]:
+        """Return the largest process and the largest sum between two moments."""
+        inside = [each for each in self.samples if begin <= each[0] <= end + INTERVAL_S]
+        return (
+            max((largest for _, largest, _ in inside), default=0),
+            max((total for _, _, total in inside), default=0),
+        )
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a stage or of the whole run.
+
+    Attributes:
+        seconds: from the start of its first unit to the end of its last [s].
+        largest: peak of the largest process [byte].
+        total: peak of all processes together [byte].
+    """
+
+    seconds: float
+    largest: int
+    total: int
+
+
+def stage_spans(project: Path, folder: Path) -> dict[str, tuple[float, float]]:
+    """Return start of the first and end of the last unit of each stage of the latest run [s]."""
+    store = Store.open(str(project))
+    record = store.run(read_match(folder).spec.match_id, "latest")
+    spans: dict[str, tuple[float, float]] = {}
+    for name in record.executed:
+        stage, _, unit = name.partition("/")
+        manifest = store.manifest(record.match_id, stage, unit, record.results[name])
+        last = manifest.created_at.timestamp()
+        first = (manifest.created_at - timedelta(seconds=manifest.seconds)).timestamp()
+        known = spans.get(stage, (first, last))
+        spans[stage] = min(first, known[0]), max(last, known[1])
+    return spans
+
+
+def measure_run(folder: Path, project: Path) -> dict[str, Cost]:
+    """Run a match in a new project and return the cost of its stages and of `all`."""
+    command = [str(WORLDPOSE), "run", str(folder), "--project", str(project)]
+    begin = time.time()
+    with (project.parent / f"{project.name}.log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        memory, ended = Memory(), threading.Event()
+        watcher = threading.Thread(target=memory.follow, args=(process.pid, ended))
+        watcher.start()
+        code = process.wait()
+        ended.set()
+        watcher.join()
+    whole = time.time() - begin
+    if code != 0:
+        raise SystemExit(f"{' '.join(command)} ended with {code}: see {log.name}")
+    spans = stage_spans(project, folder)
+    costs = {
+        stage: Cost(last - first, *memory.peak(first, last))
+        for stage, (first, last) in sorted(spans.items(), key=lambda item: item[1])
+    }
+    return {**costs, "all": Cost(whole, *memory.peak(begin, begin + whole))}
+
+
+@benchmark(
+    "scaling",
+    "time of stages by the number of workers on slow machines",
+    option("match", type=Path),
+    option("--workers", type=int, nargs="+", default=[1, 2, 4]),
+    option("--share", type=float, default=0.25, help="of one processor, for each worker"),
+)
+def measure_scaling(options: Namespace) -> Tables:
+    """`worldpose simulate --scenario tiny --duration 0.32 --cameras 8 --render --out tiny-8`.
+
+    Each worker is a Dask worker process that Linux gives a share of one processor (control group
+    `cpu`; needs its permission), as a machine of that speed would be. For each number of workers
+    the match runs up to detection in a new project on a scheduler of its own. Efficiency is the
+    time with one worker over the number of workers times the time with them. The serial part is
+    that of Amdahl's law for the largest number.
+    """
+    found: dict[int, dict[str, float]] = {}
+    folder = Path(tempfile.mkdtemp(prefix="scaling-"))
+    for number in sorted({1, *options.workers}):
+        part = folder / str(number)
+        part.mkdir()
+        found[number] = measure_workers(options.match, part, number, options.share)
+        tell(f"{number} workers: {sum(found[number].values()):.1f} s")
+    most, rows = max(found), []
+    for stage, alone in found[1].items():
+        cells: list[Any] = [stage]
+        for number, times in found.items():
+            cells += [times[stage], 100.0 * alone / (number * times[stage])]
+        serial = (found[most][stage] / alone - 1 / most) / (1 - 1 / most) if most > 1 else 1.0
+        rows.append([*cells, 100.0 * serial])
+    kinds = ("[s]", "efficiency [%]")
+    columns = [f"{n} workers {kind}" for n in found for kind in kinds]
+    return {"stages": Table("scaling", ["stage", *columns, "serial part [%]"], rows)}
+
+
+@contextmanager
+def limited_group(name: str, share: float) -> Iterator[Path]:
+    """Yield a new control group whose processes get `share` of one processor together."""
+    is_v2 = (GROUPS / "cgroup.controllers").exists()
+    group = (GROUPS if is_v2 else GROUPS / "cpu") / name
+    group.mkdir()
+    try:
+        quota = int(share * PERIOD_US)
+        if is_v2:
+            (group / "cpu.max").write_text(f"{quota} {PERIOD_US}")
+        else:
+            (group / "cpu.cfs_period_us").write_text(str(PERIOD_US))
+            (group / "cpu.cfs_quota_us").write_text(str(quota))
+        yield group
+    finally:
+        for _ in range(100):  # ended processes leave it a little later
+            try:
+                group.rmdir()
+                break
+            except OSError:
+                time.sleep(0.1)
+
+
+def measure_workers(match: Path, folder: Path, workers: int, share: float) -> dict[str, float]:
+    """Return the time of each stage up to detection with so many workers [s]."""
+    project = folder / "project"
+    with ExitStack() as stack:
+        names = [f"scaling-{os.getpid()}-{n}" for n in range(workers)]
+        groups = [stack.enter_context(limited_group(name, share)) for name in names]
+        options = {"threads_per_worker": 1, "memory_limit": 0, "preload": ["tasks.preload"]}
+        address = {"host": "127.0.0.1", "dashboard_address": None}
+        cluster = stack.enter_context(LocalCluster(n_workers=workers, **options, **address))
+        for group, worker in zip(groups, cluster.workers.values(), strict=True):
+            (group / "cgroup.procs").write_text(str(worker.pid))
+        where = ("--project", project, "--dask", cluster.scheduler_address)
+        run_worldpose("run", match, *where, "--until", "detection")
+    return {stage: last - first for stage, (first, last) in stage_spans(project, match).items()}
+
+
+@benchmark(
+    "unit_cost",
+    "CPU time of one unit of a project's latest run",
+    option("project", type=Path),
+    option("match", type=Path, help="match folder"),
+    option("unit", help="STAGE/UNIT"),
+    integer("repeat", 2),
+    option("--as-dask", action="store_true", help="without keep_freed_memory"),
+)
+def measure_unit(options: Namespace) -> Tables:
+    """The unit is computed in a thread of this process, as a Dask worker does.
+
+    Inputs are those of the run, in a copy of the project whose files are links. The first
+    computation includes the loading of kernels, and their compilation after a change of code.
+    """
+    if not options.as_dask:
+        keep_freed_memory()
+    given = Store.open(options.project)
+    (match_id,) = given.matches()
+    stage, _, unit = options.unit.partition("/")
+    result = ResultId(match_id, stage, unit, given.run(match_id).results[options.unit])
+    manifest = given.manifest(match_id, stage, unit, result.key)
+    task = getattr(importlib.import_module(f"tasks.{stage}"), stage)
+    rows = []
+    with tempfile.TemporaryDirectory(dir=options.project.parent) as scratch:
+        copy, folder = Path(scratch) / "project", str(options.match.resolve())
+        shutil.copytree(options.project, copy, copy_function=os.link)
+        work = Work(
+            project=str(copy),
+            folder=folder,
+            recipe=manifest.recipe,
+            key=manifest.key,
+            run_id="0001",
+        )
+        for turn in range(options.repeat):
+            Store.open(copy).withdraw(result)
+            before = os.times()
+            with ThreadPoolExecutor(1) as thread:
+                # Below the wrapper, which refuses code other than the run's.
+                thread.submit(task.fn.__wrapped__, work).result()
+            after = os.times()
+            rows.append([turn + 1, after.user + after.system - before.user - before.system])
+    return {"cost": Table(f"CPU time of {options.unit}", ["computation", "time"], rows, "s")}
+
+
+STEPS = ("write", "check", "count")
+
+
+@benchmark(
+    "data_set_size",
+    "time and peak memory of writing, checking and counting a data set",
+    option("folder", type=Path),
+    integer("clips", 88),
+    integer("frames", 1694, "of each clip"),
+    integer("people", 17),
+    option("--step", choices=STEPS, help="this step alone, in this process"),
+)
+def measure_data_set(options: Namespace) -> Tables:
+    """The defaults give 2.53 million poses, the size of the paper's data set (X1, X2).
+
+    People run straight on before a panning, zooming camera. Each step runs in a separate process,
+    to measure its own peak.
+    """
+    rows = []
+    if options.step is None:
+        for step in STEPS:
+            words = [str(options.folder), "--step", step, "--json", f"{options.folder}-{step}.json"]
+            words += [f"--{n}={getattr(options, n)}" for n in ("clips", "frames", "people")]
+            command = [sys.executable, str(RUN), "data_set_size", *words]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            rows += json.loads(Path(words[4]).read_text())["tables"]["steps"]["rows"]
+    else:
+        base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        begin = time.perf_counter()
+        if options.step == "write":
+            for clip in range(options.clips):
+                write_clip(options.folder, clip, options.frames, options.people)
+        found: Any = None
+        if options.step == "check":
+            found = len(check(options.folder).findings)
+        elif options.step == "count":
+            found = count([options.folder]).poses
+        peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) / 1024
+        rows.append([options.step, time.perf_counter() - begin, peak, found])
+    columns = ["step", "time [s]", "peak above the start [MB]", "findings or poses"]
+    return {"steps": Table("a data set", columns, rows)}
+
+
+def write_clip(folder: Path, clip: int, frames: int, people: int) -> None:
+    """Write the poses and the camera of one clip."""
+    model, rng = find_body(OPEN_BODY), np.random.default_rng(clip)
+    time_s = np.arange(frames) / FPS
+    start, way = rng.normal(0.0, 15.0, (people, 1, 2)), rng.normal(0.0, 2.0, (people, 1, 2))
+    place = start + way * time_s[:, None]
+    height = np.full((people, frames, 1), 0.95)  # of a standing body's pelvis [m]
+    transl = np.concatenate([place, height], axis=-1) - model.joint_template[0]
+    pose = 0.1 * rng.standard_normal((people, frames, 23, 3))
+    orient = np.tile([np.pi / 2, 0.0, 0.0], (people, frames, 1))
+    bodies = BodyParameters(np.zeros(10), orient, pose.reshape(people, frames, 69), transl)
+    write_poses(folder / "poses" / f"C_{clip:03d}.npz", bodies, model.name)
+    down = Rigid.from_rotvec([np.pi / 2 + np.arctan2(14.0, 70.0), 0.0, 0.0], np.zeros(3))
+    pan = np.zeros((frames, 3))
+    pan[:, 2] = 0.15 * np.sin(0.2 * time_s)
+    turn = down.rotation @ Rigid.from_rotvec(pan, np.zeros(3)).rotation
+    camera = Camera(
+        focal=np.repeat(2200.0 + 200.0 * np.sin(0.1 * time_s)[:, None], 2, axis=1),
+        principal_point=np.tile([960.0, 540.0], (frames, 1)),
+        distortion=np.zeros((frames, 5)),
+        cam_from_world=Rigid(turn, -turn @ np.array([0.0, -70.0, 14.0])),
+        image_size=np.array([1920, 1080]),
+    )
+    write_moving_camera(folder / "cameras" / f"C_{clip:03d}.npz", camera)
