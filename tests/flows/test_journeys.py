@@ -202,6 +202,7 @@ def test_two_cameras_on_a_mast(server, tmp_path):
     spec = tmp_path / "mast/match/match.yaml"
     spec.write_text(spec.read_text().replace("pitch: none\n", ""))  # they stand on a pitch
     mast = travel(tmp_path / "mast", accepted=4)
+    assert "contradicts" not in (mast.folder / "said.txt").read_text()
     page = mast.report(tmp_path / "report.html")
     assert "<td>plane</td>" in page
     rows = mast.export("positions", tmp_path / "out") / "positions/clip.csv"

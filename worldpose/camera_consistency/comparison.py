@@ -382,7 +382,7 @@ def _meeting_place(view: View, partner: View) -> Floats:
     ray, other = (_mean_ray(each) for each in (view, partner))
     way = partner.center - view.center
     cosine = float(ray @ other)
-    depth = float(way @ ray - cosine * (way @ other)) / max(1e-3, 1.0 - cosine**2)
+    depth = float(way @ ray - cosine * (way @ other)) / max(1e-9, 1.0 - cosine**2)
     return np.asarray(view.center + np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]) * ray)
 
 

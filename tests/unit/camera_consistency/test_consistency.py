@@ -272,6 +272,15 @@ def test_two_cameras_at_one_place_with_videos_of_their_own_are_right():
     assert check(cameras, keypoints).faults == ()
 
 
+@pytest.mark.parametrize("pitch", [PITCH, None])
+@pytest.mark.parametrize("apart", [0.2, 0.6, 0.9])
+def test_two_cameras_on_one_mast_blame_each_other_for_nothing(apart, pitch):
+    # 36 m from people whose rays meet at 0.3 to 1.4 degrees.
+    cameras = [looking((x, -35.0, 3.0), (22.0, 1.0, 1.0)) for x in (22.0, 22.0 + apart)]
+    for seed in range(3):
+        assert check(cameras, seen(cameras, walkers(), seed), pitch=pitch).faults == ()
+
+
 def test_people_who_move_symmetrically_about_the_centre_spot_hide_no_other_fault():
     cameras = [
         looking(p, (0, 0, 1)) for p in ((-30, -45, 10), (25, -44, 12), (40, 42, 9), (-8, 46, 14))
