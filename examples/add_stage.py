@@ -3,9 +3,8 @@
     worldpose run match
     python examples/add_stage.py worldpose-data tiny-1-1s
 
-The result lies in the project like any other: its key is the digest of all that determines it (its
-input, its settings, the version of this code), so that a second call finds it, and computes again
-only if one of these has changed. CONTRIBUTING.md says how to add a stage to the method itself.
+Its key is the digest of its input, its settings and the version of this code: a second call finds
+the result unless one of these has changed. CONTRIBUTING.md: how to add a stage to the method.
 """
 
 import sys

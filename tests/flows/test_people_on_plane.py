@@ -48,7 +48,7 @@ def test_the_end_of_a_partial_run_says_what_is_missing(project_copy, monkeypatch
     assert "0 " not in text
     message = f"Flow run encountered an exception: IncompleteRunError: {text}"
     last = SimpleNamespace(state="FAILED", message=message, link="http://prefect")
-    seen = SimpleNamespace(active=[], latest={match: last})
+    seen = SimpleNamespace(active=[], ended={match: last})
     monkeypatch.setattr(Continuing, "_look", lambda self: seen)
     state = Continuing(store).state(match)
     assert (state["code"], state["lines"]) == (4, [text])
