@@ -121,14 +121,12 @@ def write_poses(folder, cameras, joints):
         (folder / f"{name}.JSON").write_text(json.dumps(results))
 
 
-TINY = ("--scenario", "tiny", "--seed", 77, "--duration", 0.6, "--no-video")
+TINY = ("--scenario", "tiny", "--seed", 77, "--duration", 0.4, "--no-video")
 
 
-def import_people(folder, places, **lens):
+def import_people(folder, joints, places, **lens):
     """Import calibration and 2D poses of five people who walk at the centre of the world."""
     folder.mkdir()
-    joints = simulate(folder, *TINY)
-    shutil.rmtree(folder / "match")
     joints[..., :2] -= joints[..., :2].mean(axis=(0, 1, 2))
     np.save(folder / "truth.npy", joints)
     cameras = {f"cam{n}": camera_at(*place, **lens) for n, place in enumerate(places)}
@@ -154,14 +152,14 @@ def pitch(server, shared_folder):
 
 
 @pytest.fixture(scope="session")
-def hall(server, shared_folder):
+def hall(pitch, shared_folder):
     """Four calibrated cameras around people, no pitch, and a body file of the user's own.
 
     Only the first run names the body.
     """
 
     def make(folder):
-        import_people(folder, RING)
+        import_people(folder, np.load(pitch.folder / "truth.npy"), RING)
         (folder / "bodies").mkdir()
         save_body(folder / "bodies/mine.npz", replace(load_open_body(), name="mine"))
         bodies = ("--body-folder", folder / "bodies")
@@ -197,8 +195,9 @@ def test_a_second_match_does_not_replace_the_first_one_s_export(hall, pitch, tmp
     assert file.read_bytes() == before
 
 
-def test_two_cameras_on_a_mast(server, tmp_path):
-    import_people(tmp_path / "mast", MAST, focal=2500.0)
+def test_two_cameras_on_a_mast(pitch, tmp_path):
+    truth = np.load(pitch.folder / "truth.npy")
+    import_people(tmp_path / "mast", truth, MAST, focal=2500.0)
     spec = tmp_path / "mast/match/match.yaml"
     spec.write_text(spec.read_text().replace("pitch: none\n", ""))  # they stand on a pitch
     mast = travel(tmp_path / "mast", accepted=4)
@@ -207,10 +206,15 @@ def test_two_cameras_on_a_mast(server, tmp_path):
     assert "<td>plane</td>" in page
     rows = mast.export("positions", tmp_path / "out") / "positions/clip.csv"
     with rows.open() as file:
-        found = [(float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(file)]
-    assert len(found) > 50
-    refused = mast.command("export", "--format", "joints", "--out", tmp_path / "none")
-    assert refused.code == 0, refused.err
+        found = [
+            (int(row["frame"]), float(row["x_m"]), float(row["y_m"]))
+            for row in csv.DictReader(file)
+        ]
+    assert len(found) > 30
+    hips = truth[:, :, 11:13, :2].mean(axis=2)
+    off = [np.linalg.norm(hips[frame] - place, axis=-1).min() for frame, *place in found]
+    # A foot is known within 6 cm in height, seen from 3 m above the ground at 33 m.
+    assert np.median(off) < 0.06 * 33.0 / 3.0
 
 
 def write_ten_bits(file):
@@ -229,7 +233,7 @@ def write_ten_bits(file):
 
 
 def test_a_broadcast_camera_alone_in_ten_bits(server, tmp_path):
-    pan = ("--scenario", "broadcast-pan", "--seed", 2, "--duration", 0.3, "--cameras", 1)
+    pan = ("--scenario", "broadcast-pan", "--seed", 2, "--duration", 0.2, "--cameras", 1)
     folder = tmp_path / "broadcast"
     folder.mkdir()
     simulate(folder, *pan)
