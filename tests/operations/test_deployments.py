@@ -236,22 +236,6 @@ async def planned_runs(client, deployment):
     return found
 
 
-def test_deployments_of_an_earlier_version_are_removed(plan):
-    async def leave():
-        async with get_client() as client:
-            match = await client.read_deployment_by_name(deployment_name("ops", "match"))
-            for project in (plan.project, "/elsewhere"):
-                name = "ops" if project == plan.project else "others"
-                given = {"project": project}
-                await client.create_deployment(match.flow_id, name=name, parameters=given)
-        await install(plan)
-        async with get_client() as client:
-            return [each.name for each in await client.read_deployments()]
-
-    names = asyncio.run(leave())
-    assert "ops" not in names and "others" in names
-
-
 def test_the_worker_takes_installed_runs_with_parameters_of_their_own_alone(plan):
     installed = asyncio.run(install(plan))
     ids = {each.entrypoint.rpartition(".")[2]: number for number, each in installed.items()}
