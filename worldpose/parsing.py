@@ -2,14 +2,14 @@
 
 Python 3.11 keeps one recursion depth for the syntax trees of all threads (python/cpython issue
 106905). If a thread begins a tree while another thread is within one, the other one ends with a
-SystemError. The header of an npy array is a literal, so that a good file would be refused. All
-readers of npy arrays and of Python text are here, or parse through `parse_in_turn`.
+SystemError. NumPy reads the header of an npy array as a syntax tree, so that it would refuse a good
+file. The headers are read here without a tree; Python text is parsed through `parse_in_turn`.
 """
 
 from __future__ import annotations
 
-import io
 import math
+import re
 import zipfile
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -29,6 +29,13 @@ BLOCK_BYTES: Final = 1 << 18
 
 Header = tuple[tuple[int, ...], bool, np.dtype[np.generic]]
 """Shape, whether in Fortran order, type."""
+
+_HEADER_ITEM: Final = re.compile(
+    r"\s*(?:'descr'\s*:\s*'(?P<descr>[<>|=]?[A-Za-z]\d*(?:\[\w+\])?)'"
+    r"|'fortran_order'\s*:\s*(?P<fortran>True|False)"
+    r"|'shape'\s*:\s*\((?P<shape>[-\d\sL,]*)\))\s*(?:,|(?=\}))\s*"
+)
+"""One item of the header of an npy array with plain values, in any order of items."""
 
 # Reentrant: garbage collection can run any code while a tree is made.
 _TURN = RLock()
@@ -53,13 +60,24 @@ def read_npy_header(stream: IO[bytes]) -> Header:
     """Return the header of the npy array at the start of a stream; the array's bytes follow.
 
     Raises:
-        ValueError: this is no npy array, or not one of version 1.0.
+        ValueError: this is no npy array of version 1.0, or one of records.
     """
     if npy.read_magic(stream) != (1, 0):
         raise ValueError("another version than npy 1.0")  # later ones allow headers of 4 GB
-    length = stream.read(2)
-    text = length + stream.read(int.from_bytes(length, "little"))
-    return parse_in_turn(lambda: npy.read_array_header_1_0(io.BytesIO(text)))
+    length = int.from_bytes(stream.read(2), "little")
+    text = stream.read(length).decode("latin-1").strip()
+    found: dict[str, str] = {}
+    end = 1
+    while item := _HEADER_ITEM.match(text, end):
+        found |= {key: value for key, value in item.groupdict().items() if value is not None}
+        end = item.end()
+    if len(found) < 3 or text[:1] != "{" or text[end:] != "}":
+        raise ValueError(f"another header than of plain values: {text[:80]!r}")
+    shape = tuple(int(size.strip("L ")) for size in found["shape"].split(",") if size.strip())
+    try:
+        return shape, found["fortran"] == "True", np.dtype(found["descr"])
+    except TypeError as error:
+        raise ValueError(f"{error}") from error
 
 
 def read_npy(stream: IO[bytes]) -> NDArray[np.generic]:

@@ -50,6 +50,8 @@ def test_arrays_come_back_in_either_order(tmp_path):
         (header("{'descr': '<f4', 'fortran_order': False, 'shape': (-1,), }\n"), "bytes"),
         (header("[" * 3000 + "]" * 3000), "npy array"),
         (header("__import__('os').system('id')\n"), "npy array"),
+        (header("{'descr': '<z9', 'fortran_order': False, 'shape': (1,), }\n"), "z9"),
+        (header("{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (1,)}\n"), "plain"),
         (b"", "npy array"),
         (b"\x93NUMPY\x02\x00", "npy 1.0"),
     ],
