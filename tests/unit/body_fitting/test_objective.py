@@ -118,22 +118,3 @@ def test_a_track_of_two_intervals_has_the_equations_of_both(track):
         np.testing.assert_allclose(getattr(joined, name), expected, rtol=1e-9, atol=1e-9)
     tied = equations([pose, moved], both)
     assert np.abs(tied.gradient - joined.gradient).max() > 1e-3 * np.abs(joined.gradient).max()
-
-
-def test_the_pose_prior_counts_by_time_and_not_by_frames():
-    settings = BodyFittingSettings(pose_time_s=0.5)
-    # Two poses per second, in 25 or in 100 frames; no frame is more than one pose.
-    assert 25 * settings.pose_weight(25.0) == pytest.approx(2.0)
-    assert 100 * settings.pose_weight(100.0) == pytest.approx(2.0)
-    assert settings.pose_weight(1.0) == 1.0
-
-
-def test_information_is_the_inverse_of_the_covariance():
-    settings = BodyFittingSettings(noise_scale=1.0, noise_time_s=0.0, min_joint_std_m=1e-3)
-    rng = np.random.default_rng(2)
-    # Ten points, as of hands: their spread has no scale by joint. Depth is a hundred times worse.
-    root = rng.normal(size=(4, 10, 3, 3)) * [[0.01], [0.01], [1.0]]
-    covariance = root @ root.swapaxes(-1, -2)
-    evidence = Evidence.of(rng.normal(size=(4, 10, 3)), covariance, 50.0, settings)
-    product = evidence.information @ (covariance + 1e-6 * np.eye(3))
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-8)

@@ -14,12 +14,6 @@ def people(*rows):
     return People(rows[:, :4], rows[:, 4])
 
 
-def test_a_frame_without_people_is_legal():
-    nobody = people()
-    assert len(suppress(nobody, 0.5).scores) == 0
-    assert len(fuse([nobody, nobody], 0.5).scores) == 0
-
-
 def test_the_best_of_two_boxes_of_a_person_stays():
     found = suppress(people([0, 0, 10, 20, 0.5], [1, 0, 11, 20, 0.9], [50, 0, 60, 20, 0.2]), 0.6)
     assert found.scores.tolist() == [0.9, 0.2]

@@ -164,13 +164,6 @@ def test_people_who_are_seen_too_shortly(ring, people, seen):
     assert "4 tracks were started" in found.message
 
 
-def test_settings_out_of_reach_are_named(ring, people, seen):
-    settings = TrackingSettings(size_range=(3.0, 4.0))
-    found = reason(ring(4), *seen(ring(4), walk(people)), settings=settings)
-    assert found.cause == "wrong_size"
-    assert "size_range accepts 3 to 4" in found.message
-
-
 def test_two_cameras_at_one_place(ring, people, seen):
     cameras = beside(ring, 0.0)
     found = reason(cameras, *seen(cameras, walk(people)))

@@ -89,9 +89,3 @@ def test_damaged_yolo_labels_name_file_and_line(tmp_path, line):
     (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
     with pytest.raises(InputError, match=r"a\.txt.*line 2"):
         read_yolo_labels(tmp_path / "a.png")
-
-
-def test_missing_yolo_labels_are_named(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 200, 3), dtype=np.uint8))
-    with pytest.raises(InputError, match=r"a\.txt"):
-        read_yolo_labels(tmp_path / "a.png")

@@ -119,19 +119,6 @@ def test_no_more_than_a_part_and_its_margins_is_read_at_once(clip):
     assert max(values.most for values in watched) <= 128 + 2 * MARGIN * FPS + 2
 
 
-def test_parts_with_corrected_clocks_are_those_of_the_whole_clip(clip):
-    camera, arrays = clip
-    settings = SETTINGS.model_copy(update={"correct_clocks": True, "max_clock_error_frames": 10.0})
-    whole = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, settings)
-    seen = KeypointDetections.from_keypoints(*arrays)
-    model = learn_clip(camera, seen, FPS, settings)
-    assert model.clocks.determined.all()
-    parts = list(reconstruct_chunks(camera, seen, model, FPS, settings, length=128))
-    joined = np.concatenate([part.triangulation.joints for part in parts])
-    # Shares of a frame are rounded by where a part begins.
-    np.testing.assert_allclose(joined, whole.triangulation.joints, rtol=0, atol=1e-9)
-
-
 def test_clip_without_frames_or_people_has_one_empty_part(ring):
     camera = ring(3)
     for frames, persons in ((0, 2), (5, 0)):

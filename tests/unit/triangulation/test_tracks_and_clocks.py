@@ -4,7 +4,7 @@ from running_samples import FPS, detections, runner
 
 from data_contracts.keypoints import KeypointDetections
 from worldpose.triangulation.chunking import reconstruct_joints
-from worldpose.triangulation.clocks import _Sums, estimate_clocks, shift_in_time
+from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.smoothing import (
@@ -86,27 +86,6 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
     assert smooth.report.filled == 170
 
 
-def test_single_frame_and_no_joint_are_passed_through(ring):
-    camera = ring(4)
-    keypoints, confidence, index = detections(camera, runner(1, 1), 1.0)
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
-    np.testing.assert_allclose(smooth.joints, raw.joints, atol=1e-2)
-    index[:] = -1
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
-    assert np.isnan(smooth.joints).all()
-    assert smooth.report.filled_share is None
-
-
 def late_detections(camera, frames, late, noise=1.0, seed=0):
     """Return the views of cameras whose frame t shows the time t + late."""
     views = [
@@ -140,35 +119,6 @@ def test_late_clocks_are_found(ring):
     )
 
 
-def test_stated_errors_of_clocks_are_those_that_are_made(ring):
-    late = np.array([0.0, 0.7, -0.3, 0.5, -0.5, 1.0])
-    camera = ring(6)
-    anyhow = SETTINGS.model_copy(update={"max_clock_error_frames": 1.0})
-    errors, stated = [], []
-    for seed in range(8):
-        arrays = late_detections(camera, 50, late, noise=4.0, seed=10 * seed)
-        clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, anyhow)
-        assert clocks.determined.all()
-        errors.append(clocks.late - late + late.mean())
-        stated.append(clocks.standard_error)
-    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stated)))
-    # 48 errors tell their size to 10 %, three of that above one. White noise is all there is
-    # here: what a detector has in common for all people makes the stated errors larger.
-    assert 0.3 < ratio < 1.3
-
-
-def test_camera_that_sees_nobody_hides_no_other_clock(ring):
-    late = np.array([0.0, 2.0, -1.0, 0.5, 0.0, 0.0])
-    keypoints, confidence, index = late_detections(ring(6), 100, late)
-    index[:, 4:] = -1
-    clocks = estimate_clocks(
-        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), FPS, SETTINGS
-    )
-    assert clocks.determined.tolist() == [True] * 4 + [False] * 2
-    np.testing.assert_allclose(clocks.late[:4], late[:4] - late[:4].mean(), atol=0.1)
-    assert clocks.report.clock_late_frames[4:] == (None, None)
-
-
 def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
     camera = ring(4)
     still = np.broadcast_to(runner(1), (60, 2, 17, 3))
@@ -194,28 +144,3 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
         pixels[:-1, 2], 0.5 * (keypoints[:-1, 2] + keypoints[1:, 2]), atol=1e-9
     )
     assert (moved[-1, 2] == -1).all()
-
-
-@pytest.mark.parametrize(
-    ("weights", "seen", "error"),
-    [
-        # They say 3, -1 and 1, together 1: a third each, which leaves 2, -2 and 0 of 1 - 1/3.
-        ([100.0, 100.0, 100.0], [3.0, -1.0, 1.0], np.sqrt(2.0) * 100.0 * 2.0 / (2.0 / 3.0)),
-        # 1, 0 and 0, together 0.6; a weight above half counts as half.
-        ([180.0, 60.0, 60.0], [1.0, 0.0, 0.0], np.hypot(180.0 * 0.4 / 0.5, np.sqrt(2.0) * 45.0)),
-    ],
-)
-def test_a_clock_errs_by_what_each_person_misses_the_others_by(
-    ring, monkeypatch, weights, seen, error
-):
-    weights = np.array(weights)
-    information = np.zeros((3, 2, 2))
-    information[:, 0, 0] = information[:, 1, 1] = weights
-    # Only in front of the first camera there is evidence.
-    score = np.stack([weights * seen, np.zeros(3)], axis=-1)
-    sums = _Sums(information, score, np.zeros(2), np.zeros(2), np.zeros(2))
-    monkeypatch.setattr("worldpose.triangulation.clocks._sum_equations", lambda *_: sums)
-    nothing = detections(ring(2), runner(5), 1.0)
-    found = estimate_clocks(ring(2), KeypointDetections.from_keypoints(*nothing), FPS, SETTINGS)
-    # Over the sum of weights, and half of it from the mean of two clocks. 0.01 is known before.
-    np.testing.assert_allclose(found.standard_error, 0.5 * error / 300.0, rtol=1e-3)
