@@ -26,7 +26,7 @@ from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.bundle_adjustment.solver import _System
 from worldpose.triangulation.batched_gauss_newton import LANES, ROWS, STATE, start, step
 from worldpose.triangulation.observations import Rig
-from worldpose.triangulation.smoothing import prepare_tiles
+from worldpose.triangulation.track_solver import prepare_tiles
 
 STEPS = 8
 """Steps of a joint, about as many as the robust solver takes."""

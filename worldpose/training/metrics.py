@@ -16,8 +16,6 @@ from worldpose.detection.suppression import suppress_poses
 from worldpose.geometry.boxes import box_iou
 from worldpose.training.labels import LabelledPicture, PictureCache
 
-HEIGHTS = ((34.0, 46.0), (52.0, 70.0), (70.0, 160.0))
-"""Classes of people's heights [px]: of about 40, of about 60, and taller."""
 MIN_TRUE_IOU: Final = 0.5
 """Least intersection over union of a true positive [1]."""
 MAX_ERROR_SHARE: Final = 0.05
@@ -61,12 +59,6 @@ def detect_labelled(
     ]
 
 
-def score_people(found: Sequence[People], pictures: Sequence[LabelledPicture]) -> tuple[float, ...]:
-    """Return AP50 of all detections, and in each class of heights [px]."""
-    classes = [(0.0, np.inf), *HEIGHTS]
-    return tuple(average_precision(found, pictures, each) for each in classes)
-
-
 def stored_people(
     people: People,
     picture: Image,
@@ -79,7 +71,7 @@ def stored_people(
     """
     chosen = settings or DetectionSettings()
     kept = people.scores >= chosen.low_score_threshold
-    people = People(people.boxes[kept], people.scores[kept])
+    people = people.select(kept)
     found = find_poses(estimator, picture, people, chosen)
     distinct = suppress_poses(found, chosen.min_keypoint_confidence, chosen.oks_nms)
     return People.from_detections(distinct)
@@ -133,8 +125,7 @@ def average_precision(
 
     As in COCO, the best boxes choose first, and each chooses the person that it overlaps most.
     Ignored people, people of other heights, and boxes on them count neither as true nor as false
-    positives. The same applies to boxes of other heights that match no person. Precision is made to
-    fall with recall, and integrated at every step of recall instead of at COCO's 101 points.
+    positives. The same applies to boxes of other heights that match no person.
 
     Args:
         found: detections in each image.
@@ -179,30 +170,16 @@ def _match_boxes(boxes: Floats, true: Floats, wanted: Flags) -> Integers:
     return verdict
 
 
-def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags, Flags]:
-    """Return scores and verdicts of boxes that count, best first, and which people were found.
+def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags]:
+    """Return scores (boxes,) of the boxes that count, best first, and which are right.
 
-    A box is right if it overlaps a person by `MIN_TRUE_IOU` whom no better box has. Boxes on
-    ignored people do not count.
-
-    Args:
-        people: detections in an image.
-        picture: the truth of the image.
+    A box is right if it overlaps a person whom no better box has. Boxes on ignored people do not
+    count.
     """
     order = np.argsort(-people.scores, kind="stable")
-    overlap = box_iou(people.boxes[order], picture.boxes)
-    free = ~picture.ignored
-    scores, right = [], []
-    for row, score in zip(overlap, people.scores[order], strict=True):
-        best = int(np.where(free, row, -1.0).argmax()) if len(row) else 0
-        hit = bool(len(row)) and bool(free[best]) and row[best] >= MIN_TRUE_IOU
-        if hit:
-            free[best] = False
-        elif np.any(row[picture.ignored] >= MIN_TRUE_IOU):
-            continue
-        scores.append(score)
-        right.append(hit)
-    return np.array(scores), np.array(right, dtype=np.bool_), ~picture.ignored & ~free
+    verdict = _match_boxes(people.boxes[order], picture.boxes, ~picture.ignored)
+    counted = verdict >= 0
+    return people.scores[order][counted], verdict[counted] == 1
 
 
 def torso_sizes(keypoints: Floats) -> Floats:

@@ -47,18 +47,6 @@ def test_orientation_turns_about_the_pelvis_and_translation_comes_after(open_bod
     np.testing.assert_allclose(open_body.vertices(turned), expected, atol=SINGLE)
 
 
-def test_a_batch_is_its_people_one_by_one(corrected_body, people):
-    together = corrected_body.vertices(people)
-    assert together.shape == (5, 6890, 3)
-    for row in range(5):
-        alone = corrected_body.vertices(people[row])
-        # The order of additions in matrix products may depend on the batch.
-        np.testing.assert_allclose(together[row], alone, atol=ROUNDING)
-        np.testing.assert_allclose(
-            corrected_body.joints(people)[row], corrected_body.joints(people[row]), atol=ROUNDING
-        )
-
-
 def test_batches_broadcast_and_longer_ones_than_a_chunk_work(open_body):
     frames = BodyParameters(
         betas=np.zeros((1, 10)),

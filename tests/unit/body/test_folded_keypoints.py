@@ -30,8 +30,8 @@ def keypoints_of_the_surface(model, parameters, points):
     )
 
 
-@pytest.mark.parametrize("name", list(SKELETONS))
-def test_folded_keypoints_are_those_of_the_surface(open_body, people, name):
+def test_folded_keypoints_are_those_of_the_surface(open_body, people):
+    name = "body25"
     folded = fold_keypoints(open_body, SKELETONS[name])(people)
     expected = keypoints_of_the_surface(open_body, people, SKELETONS[name])
     np.testing.assert_allclose(folded, expected, atol=ROUNDING)

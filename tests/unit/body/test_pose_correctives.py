@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worldpose.body.keypoints import JOINT_NAMES, LANDMARKS, VERTEX_OF_POINT
+from worldpose.body.keypoints import JOINT_NAMES
 from worldpose.body.model import BodyParameters
 
 
@@ -33,12 +33,6 @@ def test_arms_move_without_taking_volume_from_the_body(open_body, pose):
     resting = volume(open_body, BodyParameters.rest())
     # Both arms have 5 litres of 74; a shoulder's skin folds or stretches by a twentieth of it.
     assert volume(open_body, POSES[pose]) == pytest.approx(resting, rel=0.04)
-
-
-def test_face_and_feet_have_no_correctives(open_body):
-    # The simulation's and the fitting's keypoints there are moved by their own joint alone.
-    own = [vertex for point, vertex in VERTEX_OF_POINT.items() if point not in LANDMARKS]
-    assert not open_body.pose_directions[own].any()
 
 
 def test_correctives_belong_to_shoulders_and_elbows(open_body):

@@ -76,16 +76,3 @@ def test_a_person_of_several_clips_is_what_they_say_together_with_anybody_counte
     # Two correlated_frames of precision 4 and the prior's 1: (4 x 1 + 4 x 2) / 9.
     np.testing.assert_allclose(pooled.betas, [12.0 / 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(pooled.covariance, np.diag([1.0 / 9.0, 1.0]), atol=1e-12)
-
-
-@pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
-def test_clips_that_say_nothing_leave_the_betas_of_anybody_whatever_these_weigh(weight):
-    silent = Shape(np.zeros(3), np.eye(3) / weight)
-    # Additional information of one clip on the first component: precision 4, at 2.
-    told = Shape(
-        np.array([8.0 / (weight + 4.0), 0.0, 0.0]), np.diag(1.0 / (weight + np.r_[4.0, 0.0, 0.0]))
-    )
-    for clips in ([silent] * 3, [told, silent, silent]):
-        pooled = pool_shapes(clips, weight)
-        np.testing.assert_allclose(pooled.betas, clips[0].betas, atol=1e-12)
-        np.testing.assert_allclose(pooled.covariance, clips[0].covariance, atol=1e-12)

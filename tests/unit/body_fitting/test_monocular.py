@@ -210,8 +210,8 @@ def test_the_pull_is_the_gradient_of_its_cost():
     np.testing.assert_array_equal(gradient[2], 0.0)
 
 
-@pytest.mark.parametrize("error", [0.05, 0.6])
-def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known(error):
+def test_methods_are_believed_as_far_as_they_agree_where_the_truth_is_known():
+    error = 0.6
     orient, angles = RNG.normal(0.0, 0.5, (400, 1, 3)), RNG.normal(0.0, 0.5, (400, 1, 30))
     off = error * RNG.standard_normal((400, 1, 33))
     glimpses = MonocularPoses(rotation(off[..., :3]) @ rotation(orient), angles + off[..., 3:])

@@ -70,17 +70,6 @@ def test_gradient_by_offsets_agrees_with_finite_differences(track):
     assert at.border_gradient[MODEL.shapes :] @ unknowns == pytest.approx(slope, rel=1e-5)
 
 
-def test_the_gradient_by_frames_is_exact_without_offsets(track):
-    made, pose = track
-    at = made.equations(pose, np.zeros((17, 3)), bordered=False)
-    step = np.random.default_rng(3).standard_normal((5, 36))
-    costs = [
-        made.equations(pose.apply_step(sign * 1e-6 * step), np.zeros((17, 3)), bordered=False).cost
-        for sign in (1.0, -1.0)
-    ]
-    assert (at.gradient * step).sum() == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-5)
-
-
 def test_a_track_of_two_intervals_has_the_equations_of_both(track):
     made, pose = track
     # Contacts found in the joined intervals do not tie them either: the second is 5 cm off.

@@ -13,7 +13,6 @@ from worldpose.body.model import BodyParameters
 from worldpose.body_fitting.monocular import MonocularEstimates, parse_monocular
 from worldpose.body_fitting.objective import ankle_height
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
-from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.detector_errors import MonocularErrors, estimate_bodies
@@ -218,9 +217,3 @@ def test_missing_values_leave_gaps_and_no_failure():
     assert not bodies.views[5:8, 0].any()
     assert not bodies.views[:, 1, 9:11].any()
     assert np.nanmean(centred(clip, bodies.fit.joints)) < 0.08
-
-
-def test_arrays_of_different_people_are_refused():
-    clip = Clip(15)
-    with pytest.raises(InputError, match="the same frames and persons"):
-        clip.evidence(keypoints=clip.keypoints[:, :1])

@@ -17,14 +17,12 @@ from worldpose.detection.bundled_nets import (
 )
 from worldpose.detection.bundled_pose import (
     BundledPoseEstimator,
-    CropEstimates,
     crops_around,
     cut_crop,
     frame_from_crop,
 )
 from worldpose.detection.models import (
     BUNDLED_WEIGHTS,
-    QUANTIZED_WEIGHTS,
     load_bundled_detector,
     load_bundled_pose,
 )
@@ -125,7 +123,7 @@ def test_people_and_poses_do_not_depend_on_the_batch():
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_nets_in_integers_are_of_the_shipped_weights(which):
-    net = QuantizedNet(QUANTIZED_WEIGHTS[which])
+    net = QuantizedNet(BUNDLED_WEIGHTS[which].with_suffix(".onnx"))
     assert net.weights_sha256 == digest_of_files(BUNDLED_WEIGHTS[which])
 
 
@@ -148,22 +146,6 @@ def test_nets_in_integers_see_what_they_see_in_floating_point(tmp_path):
     tall = sure[0][:, 3] - sure[0][:, 1]
     assert known.sum() > 30 and np.median(moved) < 0.005 * np.median(tall)
     assert np.abs(poses[1].confidence - poses[0].confidence)[known].mean() < 0.03
-
-
-def looks(monkeypatch, seen_of):
-    """A pose estimator that returns `seen_of(boxes)` as boxes, and a list of what it received."""
-    pose, asked = BundledPoseEstimator(shaken(KeypointNet())), []
-
-    def look(picture, boxes, others):
-        asked.append((boxes, others))
-        places = np.full((len(boxes), 17, 4, 2), float(len(asked)))
-        mass = np.tile([0.9, 0.0, 0.0, 0.0], (len(boxes), 17, 1))
-        return CropEstimates(
-            places, mass, np.full(mass.shape, 0.9), seen_of(boxes), np.ones(len(boxes))
-        )
-
-    monkeypatch.setattr(pose, "_estimate_crops", look)
-    return pose, asked
 
 
 def test_weights_come_back_and_give_equal_bytes(tmp_path):

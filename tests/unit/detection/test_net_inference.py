@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from worldpose.detection.bundled_nets import CROP, KeypointNet, Seen, load_weights
-from worldpose.detection.models import BUNDLED_WEIGHTS, QUANTIZED_WEIGHTS, load_bundled_pose
+from worldpose.detection.models import BUNDLED_WEIGHTS, load_bundled_pose
 from worldpose.detection.net_inference import CROPS, FloatNet, QuantizedNet
 from worldpose.detection.pipeline import detect_people
 from worldpose.detection.settings import DetectionSettings
@@ -35,15 +35,15 @@ def still(tmp_path_factory):
     return read_picture(sorted((folder / "stills").iterdir())[0])
 
 
-@pytest.mark.parametrize("count", [1, 5, 7, CROPS])
+@pytest.mark.parametrize("count", [5, CROPS])
 def test_integers_give_equal_bytes_in_every_batch(crops, count):
-    net = QuantizedNet(QUANTIZED_WEIGHTS[1])
+    net = QuantizedNet(BUNDLED_WEIGHTS[1].with_suffix(".onnx"))
     some, whole = (Seen._make(net(crops[0][:n], crops[1][:n])) for n in (count, CROPS))
     for name in ("maps", "doubt", "boxes", "fit"):
         np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[:count])
 
 
-@pytest.mark.parametrize("count", range(1, 9))
+@pytest.mark.parametrize("count", [3, 8])
 def test_a_person_has_the_same_pose_whoever_else_is_asked_for(still, count):
     pose = load_bundled_pose()
     x = 20.0 + 90.0 * np.arange(8)  # apart: neighbours may change a pose

@@ -5,8 +5,10 @@ import pytest
 from planted_errors import plant
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.filtering.judging import FARTHEST, measure_held_out
+from worldpose.filtering.held_out import FARTHEST, measure_held_out
 from worldpose.triangulation.settings import TriangulationSettings
+
+as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings()
 
@@ -22,7 +24,7 @@ def measured(scene, index=None, used=None):
         (suspects.detections.keypoints, suspects.detections.confidence) if used is None else used
     )
     index = suspects.detections.detection_index if index is None else index
-    detections = KeypointDetections.from_keypoints(keypoints, confidence, index.astype(np.int16))
+    detections = as_detections(keypoints, confidence, index.astype(np.int16))
     return measure_held_out(scene.cameras, detections, suspects.detections.keypoints, SETTINGS)
 
 
@@ -42,7 +44,7 @@ def test_what_nobody_foresees_counts_as_the_farthest(scene):
 def test_without_keypoints_there_is_nothing_to_foresee(scene):
     nothing = np.full_like(scene.suspects.detections.keypoints, np.nan)
     index = scene.suspects.detections.detection_index.astype(np.int16)
-    used = KeypointDetections.from_keypoints(nothing, nothing[..., 0], index)
+    used = as_detections(nothing, nothing[..., 0], index)
     assert measure_held_out(scene.cameras, used, nothing, SETTINGS) is None
 
 
@@ -51,7 +53,7 @@ def test_left_out_cameras_judge_only_where_enough_others_are_left(scene, count, 
     suspects, some = scene.suspects, slice(count)
     found = measure_held_out(
         scene.cameras[some],
-        KeypointDetections.from_keypoints(
+        as_detections(
             suspects.detections.keypoints[:, some],
             suspects.detections.confidence[:, some],
             suspects.detections.detection_index[:, some].astype(np.int16),

@@ -53,12 +53,6 @@ def test_person_who_takes_the_detection_that_another_loses_is_a_takeover(hidden)
     assert result.report.takeovers == 1
 
 
-def test_person_who_is_seen_again_beside_the_other_is_no_takeover(hidden):
-    result = track_people(hidden[0], detections(*hidden[1:]), FPS, TrackingSettings())
-    assert len(result.person) == 2
-    assert result.takeovers == ()
-
-
 def test_takeovers_are_named_by_person_and_frame_of_the_clip():
     text = describe_doubts(FRAMES, 4, [Takeover(25, 0, 2), Takeover(99, 3, -1)], [])
     assert text == (

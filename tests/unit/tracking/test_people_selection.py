@@ -169,13 +169,6 @@ def test_a_duel_that_few_cameras_see_is_the_players():
     assert found(*duel()) == [[0], [1, 2, 3]]
 
 
-def test_a_shadow_in_several_tracks_goes():
-    person = track(0, (0, 6), 0.0)
-    shadows = [track(n, (2 * n - 2, 2 * n - 1), 0.2, views=2) for n in (1, 2, 3)]
-    assert found(person, *shadows) == [[0]]
-    assert len(found(person, *shadows, shadow_distance_m=0.0)) > 1
-
-
 def test_a_shadow_breaks_no_join_of_accepted_tracks():
     person, after = track(0, (0, 7), 0.0), track(3, (5.8, 6.8), np.linspace(0.4, 2.5, 50))
     before = track(1, (0, 3), np.interp(np.arange(150), [0, 130], [4.0, 0.4]))

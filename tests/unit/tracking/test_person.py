@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from worldpose.tracking.person import BLOCK, Person, Sighting, Sightings, separations
+from worldpose.tracking.person import BLOCK, Person, Sighting, separations
 from worldpose.tracking.settings import TrackingSettings
 
 SETTINGS = TrackingSettings()
@@ -31,16 +31,6 @@ def test_velocity_is_learned_and_predicts_the_next_frame(people):
     np.testing.assert_allclose(person.pose, people([0.16 * 51, 0.0]), atol=1e-4)
 
 
-def test_velocity_of_an_unseen_person_fades(people):
-    person = Person(0, people([0.0, 0.0]), 0, velocity=np.array([8.0, 0.0, 0.0]))
-    for frame in range(1, 102):
-        person.advance(frame, FPS, SETTINGS)
-    # The first frame is still the one after a sighting; then 2 s = four fading times.
-    assert person.velocity[0] == pytest.approx(8.0 * np.exp(-100 / FPS / 0.5))
-    # Stays within its first velocity times the fading time, and half a frame's rounding up.
-    assert 0.0 < person.pose[0, 0] < 8.0 * 0.5 + 2 * 8.0 / FPS
-
-
 def test_absorbed_sightings_fill_the_empty_cameras(people):
     kept, other = Person(0, people([0.0, 0.0]), 0), Person(1, people([0.0, 0.0]), 0)
     for frame in range(4):
@@ -56,24 +46,7 @@ def test_absorbed_sightings_fill_the_empty_cameras(people):
 FRAMES = 3 * BLOCK + 5
 
 
-def numbered_sighting(frame):
-    return Sighting(np.array([frame, -1]), np.array([0.25, np.nan]), np.full((17, 3), float(frame)))
-
-
-def test_a_sighting_is_replaced_or_taken_out_alone():
-    kept = Sightings()
-    for frame in range(FRAMES):
-        kept[frame] = numbered_sighting(frame)
-    kept[5] = numbered_sighting(500)
-    taken = kept.pop(6)
-    assert taken.index.tolist() == [6, -1]
-    kept[FRAMES] = numbered_sighting(FRAMES)
-    assert len(kept) == FRAMES
-    assert 6 not in kept
-    assert [kept[frame].index[0] for frame in (4, 5, 7, FRAMES)] == [4, 500, 7, FRAMES]
-
-
-@pytest.mark.parametrize("known", [17, 16, 2, 1])
+@pytest.mark.parametrize("known", [16, 1])
 def test_unseen_joints_move_by_the_median_of_the_seen_ones(known):
     rng = np.random.default_rng(known)
     pose, motion = rng.normal(size=(17, 3)), rng.normal(size=(17, 3))

@@ -7,7 +7,7 @@ from worldpose.detection.bundled_nets import KeypointNet, PeopleNet, load_weight
 from worldpose.errors import InputError
 from worldpose.training.fine_tuning import fine_tune, split
 from worldpose.training.labels import LabelledPicture
-from worldpose.training.settings import FineTuningSettings, Refinement
+from worldpose.training.settings import FineTuningSettings, TrainingSettings
 
 
 def pictures(folder, count, people=1):
@@ -50,7 +50,7 @@ def test_a_version_that_is_no_better_is_told_apart(tmp_path, kind, net):
     start, weights = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
     save_weights(start, net())
     # A rate this small changes no detection.
-    training = Refinement(steps=1, rate=1e-9, check_every=1)
+    training = TrainingSettings(steps=1, rate=1e-9, check_every=1)
     lines = []
     result = fine_tune(
         kind,

@@ -44,6 +44,11 @@ def labelled(tmp_path_factory):
     return LabelledPicture(path, box, keypoints, visible, np.array([False]))
 
 
+def test_an_image_without_augmentation_stays(labelled):
+    picture = PictureCache()[labelled.path]
+    np.testing.assert_array_equal(AS_IS.augment(picture, np.random.default_rng(0)), picture)
+
+
 def test_labels_lie_on_what_they_name_in_turned_mirrored_and_distant_crops(labelled):
     settings = KeypointCrops(
         crops=24, hidden=0, smaller=0.5, astray=0, elsewhere=0, turned=1, looks=AS_IS

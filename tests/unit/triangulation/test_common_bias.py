@@ -44,10 +44,6 @@ def people(rng, bias=0.0, persons=12, frames=40):
 NAMES = ("upper arm", "forearm", "thigh", "shank", "shoulders", "hips", "trunk")
 
 
-def test_a_detector_without_common_bias_stays_without():
-    assert learn_common_bias(*people(np.random.default_rng(4)), 0.0) == 0.0
-
-
 def test_nobody_leaves_what_is_usual():
     nothing = np.full((6, 2, 17, 3), np.nan)
     learned = learn_common_bias(nothing, np.full((6, 2, 17, 3, 3), np.nan), USUAL)

@@ -13,6 +13,8 @@ from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import Solution
 
+as_detections = KeypointDetections.from_keypoints
+
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
 FACE, ARMS, LEGS = range(len(EXCHANGED_PARTS))
 
@@ -33,9 +35,7 @@ def clip(ring):
 
 def test_exchanged_sides_are_found_named_and_put_right(clip):
     camera, (keypoints, confidence, index) = clip
-    expected = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    expected = triangulate_joints(camera, as_detections(keypoints, confidence, index), SETTINGS)
     assert not expected.exchanged.any()
     wrong, truth = keypoints.copy(), np.zeros_like(expected.exchanged)
     wrong[3:7, 1, 0] = exchanged(keypoints[3:7, 1, 0])
@@ -43,9 +43,7 @@ def test_exchanged_sides_are_found_named_and_put_right(clip):
     legs = [joint for joint, name in enumerate(COCO17) if name[-4:] in ("_hip", "knee", "nkle")]
     wrong[5:9, 3, 1] = exchanged(keypoints[5:9, 3, 1], legs)
     truth[5:9, 3, 1, LEGS] = True
-    found = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(wrong, confidence, index), SETTINGS
-    )
+    found = triangulate_joints(camera, as_detections(wrong, confidence, index), SETTINGS)
     np.testing.assert_array_equal(found.exchanged, truth)
     # The same observations: the same joints to the last step of the iteration.
     np.testing.assert_allclose(found.joints, expected.joints, atol=1e-6)
@@ -56,7 +54,7 @@ def test_exchanged_sides_are_found_named_and_put_right(clip):
 def test_noise_is_not_taken_for_an_exchange(ring):
     # 6 px are twice the stated noise here; odds of fifty to one leave a few in a thousand.
     arrays = detections(ring(5), runner(40), 6.0)
-    found = triangulate_joints(ring(5), KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    found = triangulate_joints(ring(5), as_detections(*arrays), SETTINGS)
     assert found.exchanged.any(axis=-1).mean() < 0.01
 
 

@@ -12,6 +12,8 @@ from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 from worldpose.triangulation.solving import solve_joints
 
+as_detections = KeypointDetections.from_keypoints
+
 # Noise as stated: exact views do not make the least disagreement count.
 SETTINGS = TriangulationSettings(learn_noise=False, offsets="none")
 AS_THEY_AGREE = SETTINGS.model_copy(update={"repair_limb_lengths": False})
@@ -53,9 +55,9 @@ def test_of_pairs_that_agree_as_well_the_one_that_keeps_the_limb_decides(ring, s
     arrays, wrong = misled(camera, seen(camera, joints), joints, ANKLE, 0, 1)
     # The true pair agrees to 3 px, the wrong one exactly: looked at alone, that is the better one.
     arrays[0][BAD, 2, 0, ANKLE] += [0.0, 3.0]
-    alone = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), AS_THEY_AGREE)
+    alone = triangulate_joints(camera, as_detections(*arrays), AS_THEY_AGREE)
     assert np.linalg.norm(alone.joints[BAD, 0, ANKLE] - wrong) < 0.01
-    mended = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    mended = triangulate_joints(camera, as_detections(*arrays), SETTINGS)
     # 3 px are 6 cm at 30 m.
     assert np.linalg.norm(mended.joints[BAD, 0, ANKLE] - joints[BAD, 0, ANKLE]) < 0.06
     assert mended.inliers[BAD, :, 0, ANKLE].tolist() == [False, True, True]
@@ -67,9 +69,9 @@ def test_of_pairs_that_agree_as_well_the_one_that_keeps_the_limb_decides(ring, s
 def test_end_that_two_views_alone_place_far_from_its_limb_is_missing(ring, seen):
     camera, joints = ring(4)[np.array([0, 1])], walker()
     arrays, wrong = misled(camera, seen(camera, joints), joints, WRIST, 0, 1)
-    alone = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), AS_THEY_AGREE)
+    alone = triangulate_joints(camera, as_detections(*arrays), AS_THEY_AGREE)
     assert np.linalg.norm(alone.joints[BAD, 0, WRIST] - wrong) < 0.01
-    mended = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    mended = triangulate_joints(camera, as_detections(*arrays), SETTINGS)
     for name in ("joints", "covariance", "reprojection_error", "spread"):
         assert np.isnan(getattr(mended, name)[BAD, 0, WRIST]).all()
     assert mended.views[BAD, 0, WRIST] == 0
@@ -81,12 +83,10 @@ def test_what_three_views_agree_on_stays_however_long_the_limb(ring, seen):
     camera, joints = ring(4), walker()
     joints[BAD, 0, ANKLE] += [0.0, 0.0, 1.0]
     arrays = seen(camera, joints)
-    result = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
+    result = triangulate_joints(camera, as_detections(*arrays), SETTINGS)
     np.testing.assert_array_equal(
         result.joints,
-        triangulate_joints(
-            camera, KeypointDetections.from_keypoints(*arrays), AS_THEY_AGREE
-        ).joints,
+        triangulate_joints(camera, as_detections(*arrays), AS_THEY_AGREE).joints,
     )
 
 

@@ -9,6 +9,8 @@ from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.person_offsets import stated_errors
 from worldpose.triangulation.settings import TriangulationSettings
 
+as_detections = KeypointDetections.from_keypoints
+
 SETTINGS = TriangulationSettings(common_bias_m=0.0)
 PLAIN = SETTINGS.model_copy(update={"offsets": "none"})
 
@@ -18,9 +20,7 @@ def test_noise_is_learned_by_joint(ring):
     keypoints, confidence, index = detections(camera, joints, 1.0)
     more = np.random.default_rng(2).normal(size=keypoints[..., 3, :].shape)
     keypoints[..., 3, :] += np.sqrt(8.0) * more
-    result = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), PLAIN
-    )
+    result = triangulate_joints(camera, as_detections(keypoints, confidence, index), PLAIN)
     factor = result.noise.joint
     # 1 px and 3 px; 1900 residuals a joint: 2 % each. Doubtful views of the worse are cut at 3.5
     # deviations.
@@ -34,15 +34,13 @@ def test_noise_is_learned_by_confidence(ring):
     doubtful = rng.random(confidence.shape) < 0.3
     confidence[doubtful] = 0.5
     keypoints += np.where(doubtful, 3.0, 0.0)[..., None] * rng.normal(size=keypoints.shape)
-    result = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), PLAIN
-    )
+    result = triangulate_joints(camera, as_detections(keypoints, confidence, index), PLAIN)
     sure, doubt = result.noise.precision(np.ones(17)), result.noise.precision(np.full(17, 0.5))
     # sqrt(10) times the noise; knots average over classes of confidence.
     assert np.sqrt(np.median(sure / doubt)) == pytest.approx(np.sqrt(10), rel=0.15)
     worse = triangulate_joints(
         camera,
-        KeypointDetections.from_keypoints(keypoints, confidence, index),
+        as_detections(keypoints, confidence, index),
         PLAIN.model_copy(update={"learn_noise": False}),
     )
     error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (result, worse)]
@@ -97,25 +95,12 @@ def test_offsets_keep_calibration_errors_from_the_pose(ring, known):
     for offsets in ("none", "midhip", "body"):
         # 2 mrad are 6 cm at 30 m.
         settings = SETTINGS.model_copy(update={"offsets": offsets})
-        result = triangulate_joints(
-            given, KeypointDetections.from_keypoints(*arrays), settings, covariance
-        )
+        result = triangulate_joints(given, as_detections(*arrays), settings, covariance)
         errors[offsets] = shape_error(result.joints, joints)
     exact = shape_error(
-        triangulate_joints(truth, KeypointDetections.from_keypoints(*arrays), SETTINGS).joints,
+        triangulate_joints(truth, as_detections(*arrays), SETTINGS).joints,
         joints,
     )
     assert errors["body"] < 1.15 * exact
     assert errors["body"] < errors["midhip"]
     assert errors["body"] < 0.9 * errors["none"]
-
-
-def test_nobody_seen_gives_empty_results(ring):
-    keypoints, confidence, index = detections(ring(4), runner(5), 0.0)
-    index[:] = -1
-    result = triangulate_joints(
-        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    assert np.isnan(result.joints).all()
-    assert np.isnan(result.shared_covariance).all()
-    assert result.report.misplacement_m == (None,) * 4

@@ -7,6 +7,8 @@ from worldpose.geometry.cameras import Camera
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
 
+as_detections = KeypointDetections.from_keypoints
+
 SETTINGS = TriangulationSettings()
 # Noise as stated, cameras as given: one joint is then a textbook least-squares problem.
 STATED = TriangulationSettings(learn_noise=False, offsets="none", common_bias_m=0.0)
@@ -19,21 +21,10 @@ def some_joints(persons=2, count=17, frames=1):
     return rng.uniform([-4, -4, 0], [4, 4, 2], (frames, persons, count, 3))
 
 
-def test_no_detection_and_no_person_give_empty_arrays(ring):
-    index = np.empty((2, 3, 0), np.int16)
-    keypoints = np.empty((2, 3, 0, 17, 2))
-    result = triangulate_joints(
-        ring(3), KeypointDetections.from_keypoints(keypoints, keypoints[..., 0], index), SETTINGS
-    )
-    assert result.inliers.shape == (2, 3, 0, 17)
-
-
 def test_one_view_determines_nothing(ring, seen):
     keypoints, confidence, index = seen(ring(3), some_joints())
     index[:, 1:] = -1
-    result = triangulate_joints(
-        ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(3), as_detections(keypoints, confidence, index), SETTINGS)
     assert np.isnan(result.joints).all()
     assert np.isnan(result.covariance).all()
     assert np.isnan(result.reprojection_error).all()
@@ -45,15 +36,11 @@ def test_one_view_determines_nothing(ring, seen):
 def test_two_nearly_parallel_rays_determine_nothing(ring, seen):
     # Two cameras 0.06 rad apart on the ring, less than the 0.1 rad asked for.
     narrow = ring(2, arc=0.12)
-    result = triangulate_joints(
-        narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), SETTINGS
-    )
+    result = triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), SETTINGS)
     assert np.isnan(result.joints).all()
     wide = SETTINGS.model_copy(update={"min_angle_rad": 0.03})
     assert np.isfinite(
-        triangulate_joints(
-            narrow, KeypointDetections.from_keypoints(*seen(narrow, some_joints())), wide
-        ).joints
+        triangulate_joints(narrow, as_detections(*seen(narrow, some_joints())), wide).joints
     ).all()
 
 
@@ -64,22 +51,18 @@ def test_nan_keypoints_and_confidence_that_is_not_positive_are_left_out(ring, se
     confidence[:, 1] = 0.0
     confidence[:, 2] = np.nan
     confidence[:, 2, 0] = -0.5
-    result = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), SETTINGS)
     np.testing.assert_array_equal(result.views, 2)
     np.testing.assert_array_equal(result.inliers.any(axis=(0, 2, 3)), [0, 0, 0, 1, 1])
     np.testing.assert_allclose(result.joints, some_joints(), atol=1e-8)
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 8, 16])
+@pytest.mark.parametrize("count", [2, 4, 16])
 def test_noise_free_views_give_the_joint(ring, seen, count):
     # Two cameras of four, so that they do not face each other.
     cameras = ring(4)[np.array([0, 1])] if count == 2 else ring(count)
     joints = some_joints(frames=3)
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joints)), SETTINGS
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joints)), SETTINGS)
     # Undistortion is exact to 1e-13 of the focal length; seen 2e-13 m.
     np.testing.assert_allclose(result.joints, joints, atol=1e-10)
     np.testing.assert_array_equal(result.views, count)
@@ -91,14 +74,12 @@ def test_noise_free_views_give_the_joint(ring, seen, count):
     assert result.report.rejected_share == (0.0,) * count
 
 
-@pytest.mark.parametrize("count", [3, 4, 5, 8])
-@pytest.mark.parametrize("offset", [20.0, 60.0, 500.0])
+@pytest.mark.parametrize("count", [3, 8])
+@pytest.mark.parametrize("offset", [20.0, 500.0])
 def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
     keypoints, confidence, index = seen(ring(count), some_joints())
     keypoints[:, 1] += offset / np.sqrt(2)
-    result = triangulate_joints(
-        ring(count), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
+    result = triangulate_joints(ring(count), as_detections(keypoints, confidence, index), SETTINGS)
     expected = np.arange(count) != 1
     np.testing.assert_array_equal(
         result.inliers, np.broadcast_to(expected[:, None, None], result.inliers.shape)
@@ -111,9 +92,7 @@ def test_outlier_view_is_rejected_and_named(ring, seen, count, offset):
 def test_reprojection_error_is_the_root_mean_square_length_in_pixels(ring, seen):
     keypoints, confidence, index = seen(ring(6), some_joints(1, 17))
     keypoints += np.random.default_rng(3).normal(0, 1.0, keypoints.shape)
-    result = triangulate_joints(
-        ring(6), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
-    )
+    result = triangulate_joints(ring(6), as_detections(keypoints, confidence, index), STATED)
     image = ring(6).project(result.joints[0, 0])
     lengths = np.linalg.norm(image - keypoints[0, :, 0], axis=-1)
     inliers = result.inliers[0, :, 0]
@@ -127,9 +106,7 @@ def test_result_is_the_least_squares_point_of_the_weighted_pixels(ring, seen):
     rng = np.random.default_rng(4)
     keypoints += rng.normal(0, 1.0, keypoints.shape)
     confidence[...] = rng.uniform(0.3, 1.0, confidence.shape)
-    result = triangulate_joints(
-        ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), WHITE
-    )
+    result = triangulate_joints(ring(4), as_detections(keypoints, confidence, index), WHITE)
     assert result.inliers.all()
 
     def cost(points):
@@ -155,9 +132,7 @@ def monte_carlo(cameras: Camera, seen, scale):
         keypoints + scale * rng.normal(size=keypoints.shape) / np.sqrt(confidence)[..., None]
     )
     loose = WHITE.model_copy(update={"pixel_noise_px": scale, "max_deviation": 6.0})
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(keypoints, confidence, index), loose
-    )
+    result = triangulate_joints(cameras, as_detections(keypoints, confidence, index), loose)
     return result.joints[:, 0, 0] - joint, result.covariance[:, 0, 0]
 
 
@@ -179,9 +154,7 @@ def test_joint_noise_is_in_metres(ring, seen):
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
     metric = STATED.model_copy(update={"pixel_noise_px": 1e-6, "joint_noise_m": 0.05})
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), metric
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), metric)
     # x and y by one ray each, z by both. The point is 13 degrees off axis, where the image is
     # stretched along the radius by 1 / cos: 2.7 %, in variance 5.4 %.
     np.testing.assert_allclose(
@@ -189,55 +162,37 @@ def test_joint_noise_is_in_metres(ring, seen):
     )
 
 
-def test_arrays_of_different_clips_are_refused(ring, seen):
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"cameras": 3}, "expected keypoints"),
+        ({"frames": 0}, "same clip"),
+        ({"detection": 2}, "one of 2 detections"),
+        ({"covariances": 3}, "camera_covariance"),
+    ],
+)
+def test_arrays_of_different_clips_are_refused(ring, seen, changed, expected):
     keypoints, confidence, index = seen(ring(4), some_joints())
-    with pytest.raises(InputError, match="expected keypoints"):
-        triangulate_joints(
-            ring(3), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-        )
-    with pytest.raises(InputError, match="same clip"):
-        triangulate_joints(
-            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index[:0]), SETTINGS
-        )
-
-
-def test_index_of_a_detection_that_does_not_exist_is_refused(ring, seen):
-    keypoints, confidence, index = seen(ring(4), some_joints())
-    index[0, 2, 1] = 2
-    with pytest.raises(InputError, match="one of 2 detections"):
-        triangulate_joints(
-            ring(4), KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-        )
+    index = index[: changed.get("frames", 1)]
+    index[:, 2, 1] = changed.get("detection", 1)
+    detections = as_detections(keypoints, confidence, index)
+    covariance = np.zeros((changed.get("covariances", 4), 12, 12))
+    with pytest.raises(InputError, match=expected):
+        triangulate_joints(ring(changed.get("cameras", 4)), detections, SETTINGS, covariance)
 
 
 def test_spread_is_the_widest_angle_between_rays(ring, seen):
     # Two cameras a quarter turn apart and 8 m up: rays to a point 8 m up cross at a right angle.
     cameras = ring(4)[np.array([0, 1])]
     joint = np.array([0.0, 0.0, 8.0]).reshape(1, 1, 1, 3)
-    result = triangulate_joints(
-        cameras, KeypointDetections.from_keypoints(*seen(cameras, joint)), STATED
-    )
+    result = triangulate_joints(cameras, as_detections(*seen(cameras, joint)), STATED)
     np.testing.assert_allclose(result.spread, np.pi / 2, rtol=1e-6)
 
 
 def test_shared_bias_is_in_the_covariance(ring, seen):
     keypoints, confidence, index = seen(ring(5), some_joints())
-    without = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), STATED
-    )
+    without = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), STATED)
     biased = STATED.model_copy(update={"common_bias_m": 0.03})
-    result = triangulate_joints(
-        ring(5), KeypointDetections.from_keypoints(keypoints, confidence, index), biased
-    )
+    result = triangulate_joints(ring(5), as_detections(keypoints, confidence, index), biased)
     added = result.covariance - without.covariance
     np.testing.assert_allclose(added, np.broadcast_to(9e-4 * np.eye(3), added.shape), atol=1e-15)
-
-
-def test_camera_covariance_of_another_rig_is_refused(ring, seen):
-    with pytest.raises(InputError, match="camera_covariance"):
-        triangulate_joints(
-            ring(4),
-            KeypointDetections.from_keypoints(*seen(ring(4), some_joints())),
-            SETTINGS,
-            np.zeros((3, 12, 12)),
-        )

@@ -7,13 +7,10 @@ from worldpose.triangulation.chunking import reconstruct_joints
 from worldpose.triangulation.clocks import estimate_clocks, shift_in_time
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.settings import TriangulationSettings
-from worldpose.triangulation.smoothing import (
-    _factorize,
-    _invert,
-    _substitute,
-    segments,
-    smooth_joints,
-)
+from worldpose.triangulation.smoothing import segments, smooth_joints
+from worldpose.triangulation.track_solver import _factorize, _invert, _substitute
+
+as_detections = KeypointDetections.from_keypoints
 
 SETTINGS = TriangulationSettings(common_bias_m=0.0, offsets="none")
 
@@ -45,8 +42,8 @@ def test_segments_break_at_long_gaps_only():
 def test_smoothing_is_nearer_and_steadier_than_single_frames(ring):
     camera, joints = ring(4), runner(100)
     arrays = detections(camera, joints, 2.0)
-    raw = triangulate_joints(camera, KeypointDetections.from_keypoints(*arrays), SETTINGS)
-    smooth = smooth_joints(camera, KeypointDetections.from_keypoints(*arrays), raw, FPS, SETTINGS)
+    raw = triangulate_joints(camera, as_detections(*arrays), SETTINGS)
+    smooth = smooth_joints(camera, as_detections(*arrays), raw, FPS, SETTINGS)
     error = [np.linalg.norm(r.joints - joints, axis=-1).mean() for r in (raw, smooth)]
     jerk = [np.abs(np.diff(r.joints - joints, 2, axis=0)).mean() for r in (raw, smooth)]
     # White noise at 50 frames/s and swings of 2 Hz: several frames count as one.
@@ -69,12 +66,8 @@ def test_short_gaps_are_filled_and_marked_and_long_ones_left(ring):
     keypoints, confidence, index = detections(camera, joints, 1.0)
     index[20:30, 1:] = -1  # one view
     index[50:90] = -1  # 0.8 s without any
-    raw = triangulate_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), SETTINGS
-    )
-    smooth = smooth_joints(
-        camera, KeypointDetections.from_keypoints(keypoints, confidence, index), raw, FPS, SETTINGS
-    )
+    raw = triangulate_joints(camera, as_detections(keypoints, confidence, index), SETTINGS)
+    smooth = smooth_joints(camera, as_detections(keypoints, confidence, index), raw, FPS, SETTINGS)
     assert np.isnan(raw.joints[20:30]).all()
     assert smooth.filled[20:30].all()
     assert smooth.filled.sum() == 10 * 17
@@ -107,12 +100,12 @@ def test_late_clocks_are_found(ring):
     late = np.array([0.0, 3.0, -3.0, 0.5, -0.5, 1.0])
     camera = ring(6)
     arrays = late_detections(camera, 100, late)
-    clocks = estimate_clocks(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    clocks = estimate_clocks(camera, as_detections(*arrays), FPS, SETTINGS)
     assert clocks.determined.all()
     np.testing.assert_allclose(clocks.late, late - late.mean(), atol=0.1)
     corrected = SETTINGS.model_copy(update={"correct_clocks": True})
-    result = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, corrected)
-    plain = reconstruct_joints(camera, KeypointDetections.from_keypoints(*arrays), FPS, SETTINGS)
+    result = reconstruct_joints(camera, as_detections(*arrays), FPS, corrected)
+    plain = reconstruct_joints(camera, as_detections(*arrays), FPS, SETTINGS)
     assert (
         result.triangulation.report.reprojection_error_px
         < 0.7 * plain.triangulation.report.reprojection_error_px
@@ -122,9 +115,7 @@ def test_late_clocks_are_found(ring):
 def test_clocks_of_cameras_before_people_who_stand_are_unknown(ring):
     camera = ring(4)
     still = np.broadcast_to(runner(1), (60, 2, 17, 3))
-    clocks = estimate_clocks(
-        camera, KeypointDetections.from_keypoints(*detections(camera, still, 1.0)), FPS, SETTINGS
-    )
+    clocks = estimate_clocks(camera, as_detections(*detections(camera, still, 1.0)), FPS, SETTINGS)
     assert not clocks.determined.any()
     assert np.isnan(clocks.late).all()
     assert clocks.report.clock_late_frames == (None,) * 4
@@ -134,7 +125,7 @@ def test_whole_frames_are_moved_exactly_and_half_frames_lie_between(ring):
     keypoints, confidence, index = detections(ring(3), runner(10), 0.0)
     index[4, 1, 0] = -1
     late = np.array([0.0, 2.0, -0.5])
-    shifted = shift_in_time(KeypointDetections.from_keypoints(keypoints, confidence, index), late)
+    shifted = shift_in_time(as_detections(keypoints, confidence, index), late)
     pixels, moved = shifted.keypoints, shifted.detection_index
     np.testing.assert_array_equal(pixels[:, 0], keypoints[:, 0])
     np.testing.assert_array_equal(pixels[2:, 1, 1], keypoints[:-2, 1, 1])

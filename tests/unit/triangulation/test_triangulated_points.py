@@ -62,16 +62,6 @@ def replace_settings(**changes):
     return TriangulationSettings().model_copy(update=changes)
 
 
-def test_points_that_one_camera_sees_are_missing(clip):
-    cameras, plain, with_feet, _ = clip
-    sure = with_feet.extra_confidence.copy()
-    sure[:, 1:, :, 0] = np.nan
-    pixels = np.where(np.isfinite(sure)[..., None], with_feet.extra_keypoints, np.nan)
-    found = triangulate_joints(cameras, plain.add_points(FEET, pixels, sure)).extra
-    assert np.isnan(found.joints[:, :, 0]).all() and not found.views[:, :, 0].any()
-    assert np.isfinite(found.joints[:, :, 1:]).mean() > 0.99
-
-
 def test_landmarks_are_swapped_with_their_part_and_the_trunk_with_all_limbs(clip):
     _, plain, _, _ = clip
     names = ("left_thigh_1", "right_thigh_1", "left_trunk_1", "right_trunk_1", "left_forearm_1")
