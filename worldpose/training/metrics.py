@@ -20,8 +20,6 @@ MIN_TRUE_IOU: Final = 0.5
 """Least intersection over union of a true positive [1]."""
 MAX_ERROR_SHARE: Final = 0.05
 """A keypoint is correct within this share of the box's longer side [1], a fifth of a torso."""
-TORSO_SHARE: Final = 0.2
-"""Share of the torso within which a keypoint is correct [1]."""
 
 
 @dataclass(frozen=True)
@@ -182,27 +180,19 @@ def judge_boxes(people: People, picture: LabelledPicture) -> tuple[Floats, Flags
     return people.scores[order][counted], verdict[counted] == 1
 
 
-def torso_sizes(keypoints: Floats) -> Floats:
-    """Return the longer diagonal from a shoulder to the other side's hip (people,) [px].
-
-    Args:
-        keypoints: (people, 17, 2) COCO-17 [px].
-    """
-    diagonals = keypoints[:, (5, 6)] - keypoints[:, (12, 11)]
-    return np.asarray(np.linalg.norm(diagonals, axis=-1).max(axis=-1))
-
-
 def correct_keypoints(found: AnyFloats, true: Floats) -> Floats:
-    """Return 1 for keypoints within `TORSO_SHARE`, else 0 (people, 17); NaN without truth.
+    """Return 1 for keypoints within a fifth of the torso, else 0 (people, 17); NaN without truth.
+
+    A torso is as long as the longer diagonal from a shoulder to the other side's hip.
 
     Args:
         found: (people, 17, 2) [px]; a missing one is not correct.
         true: (people, 17, 2) [px]; NaN where unknown.
     """
     error = np.linalg.norm(found - true, axis=-1)
-    torso = torso_sizes(true)
+    torso = np.linalg.norm(true[:, (5, 6)] - true[:, (12, 11)], axis=-1).max(axis=-1)
     known = np.isfinite(true).all(axis=-1) & np.isfinite(torso)[:, None]
-    return np.where(known, error <= TORSO_SHARE * torso[:, None], np.nan)
+    return np.where(known, error <= 0.2 * torso[:, None], np.nan)
 
 
 def calibration_error(confidence: Floats, right: Flags, classes: int = 10) -> float:
