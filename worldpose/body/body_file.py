@@ -27,10 +27,6 @@ OPEN_BODY: Final = "open-neutral/2"
 """The body that ships with worldpose: SMPL's layout, not SMPL (docs/reference/body_model.md)."""
 NARROW_OPEN_BODY: Final = "open-neutral/3"
 """The open body with hip joints as far apart as people's; its surface is the same."""
-HIP_WIDTH: Final = 0.175
-"""Distance between the hip joints of the mean narrow body [m], 0.230 in the other. Hip centres lie
-14 % of the distance between the anterior superior iliac spines medial of these (Bell, Brand and
-Pedersen, Human Movement Science 8, 1989), which leaves 0.72 of some 0.24 m."""
 
 KEYS: Final = (
     "v_template",
@@ -50,9 +46,6 @@ BODY_FOLDER_VARIABLE: Final = "WORLDPOSE_BODY_FOLDER"
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
 
-_SHAPES: Final = 10
-"""Number of betas that are read, as in the released poses (X3)."""
-
 
 def load_open_body(name: str = OPEN_BODY) -> BodyModel:
     """Return the open body: 6890 vertices, 24 joints, 10 betas, free for any use (CC0).
@@ -66,7 +59,8 @@ def load_open_body(name: str = OPEN_BODY) -> BodyModel:
 def _move_hips(wide: BodyModel) -> BodyModel:
     """Return the open body with the hip joints moved towards each other, for every shape alike."""
     left, right = wide.joint_template[1:3]
-    share = 0.5 * (1.0 - HIP_WIDTH / float(np.linalg.norm(left - right)))
+    # Distance between the hip joints of the mean narrow body [m], 0.230 in the other.
+    share = 0.5 * (1.0 - 0.175 / float(np.linalg.norm(left - right)))
     regressor = wide.joint_regressor.copy()
     moved = (1.0 - share) * regressor[1:3] + share * regressor[2:0:-1]
     regressor[1:3] = moved.astype(np.float32)  # as in a body's file
@@ -179,7 +173,8 @@ def _build_model(arrays: Mapping[str, NDArray[np.generic]], name: str, path: Pat
         return BodyModel(
             name=name,
             template=arrays["v_template"].astype(np.float64),
-            shape_directions=arrays["shapedirs"][:, :, :_SHAPES].astype(np.float64),
+            # Number of betas that are read, as in the released poses (X3).
+            shape_directions=arrays["shapedirs"][:, :, :10].astype(np.float64),
             pose_directions=arrays["posedirs"].astype(np.float64),
             joint_regressor=arrays["J_regressor"].astype(np.float64),
             weights=arrays["weights"].astype(np.float64),
@@ -208,12 +203,10 @@ def install_body(file: Path, folder: Path | None = None, name: str | None = None
     """Return a model read from SMPL's own file, after saving it as a safe npz file.
 
     Args:
-        file: SMPL's .pkl or .npz, as downloaded. Only its first 10 shape directions are used. The
-            pickle's content is read, never run (`read_pickled_arrays`).
+        file: SMPL's .pkl or .npz, as downloaded.
         folder: where `<name>.npz` is written, `body_folder()` by default; one of the same name is
             replaced.
-        name: name of the model in results; from the file's name by default, so that
-            SMPL_NEUTRAL.pkl becomes smpl-neutral.
+        name: name of the model in results.
 
     Raises:
         InputError: the file is not a body model in SMPL's layout, or names code to run.

@@ -4,7 +4,6 @@ import copyreg
 import functools
 import operator
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -57,7 +56,7 @@ def warm(tmp_path):
         read_pickled_arrays(tmp_path / "warm.pkl", ("a",))
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", [0, 2, 5])
 @pytest.mark.parametrize(
     "array",
     [
@@ -77,13 +76,13 @@ def test_arrays_come_as_they_were(tmp_path, array, protocol):
     assert back.dtype == array.dtype
 
 
-@pytest.mark.parametrize("protocol", [1, 2, 4])
 @pytest.mark.parametrize("kind", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix])
-def test_sparse_matrices_become_dense(tmp_path, kind, protocol):
+def test_sparse_matrices_become_dense(tmp_path, kind):
+    protocol = 2
     np.testing.assert_array_equal(read(tmp_path, pickled({"a": kind(NUMBERS)}, protocol)), NUMBERS)
 
 
-@pytest.mark.parametrize("protocol", [0, 1, 2, 4])
+@pytest.mark.parametrize("protocol", [0, 2])
 def test_chumpy_is_read_without_chumpy(tmp_path, protocol):
     assert "chumpy" not in sys.modules
     np.testing.assert_array_equal(read(tmp_path, pickled({"a": Ch(NUMBERS)}, protocol)), NUMBERS)
@@ -137,7 +136,7 @@ def payloads(canary):
 
 
 @pytest.mark.parametrize("name", list(payloads("")))
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", [0, 2, 5])
 def test_a_pickle_that_calls_something_is_refused_and_calls_nothing(tmp_path, name, protocol):
     canary = tmp_path / "canary"
     payload = payloads(canary)[name]
