@@ -26,7 +26,7 @@ from flows.review.metric_words import all_reasons
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from flows.stages import body_fitting, broadcast_tracking, tracking, triangulation
+from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
@@ -437,7 +437,7 @@ class RunLog:
         wanted = (
             (tracking.STAGE, "people"),
             (triangulation.STAGE, "joints"),
-            (broadcast_tracking.STAGE, "people"),
+            (broadcast_calibration.TRACKING, "people"),
         )
         for stage, figure in wanted:
             clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]

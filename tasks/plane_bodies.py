@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,33 +11,28 @@ import xarray as xr
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.refitting import REFITTING
-from data_contracts.work import Work
 from tasks.body_fitting import find_same_body
-from tasks.broadcast_tracking import BroadcastInputs, open_broadcast
-from tasks.unit import figures_of, open_input, require_registered
+from tasks.broadcast_calibration import BroadcastInputs, open_broadcast
+from tasks.unit import UnitInputs, figures_of
 from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.fit_quality import report_fit
 from worldpose.body_fitting.monocular import read_monocular
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
-from worldpose.broadcast_calibration.calibration import moving_from_arrays
 from worldpose.broadcast_calibration.uncertainty import static_covariance
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion
-from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
 
 
-def publish_plane_bodies(store: Store, work: Work, result: ResultWriter) -> None:
+def write_plane_bodies(inputs: UnitInputs, result: ResultWriter) -> None:
     """Fit and write the bodies of the clip's people that the broadcast camera alone films."""
-    sources: dict[str, Any] = work.recipe.sources
-    path = Path(work.folder) / sources["estimates"]
-    estimates = read_monocular(path)
-    require_registered(path, sources["estimates_sha256"])
-    model = find_same_body(work)
-    filmed = open_broadcast(store, work)
-    tracked = open_input(store, work, f"broadcast_tracking/{work.recipe.unit}")
-    evidence = _observe_people(filmed, tracked, work)
+    estimates = read_monocular(inputs.file("estimates"))
+    inputs.require_registered("estimates")
+    model = find_same_body(inputs)
+    filmed = open_broadcast(inputs)
+    tracked = inputs.open(f"broadcast_tracking/{inputs.unit}")
+    evidence = _observe_people(filmed, tracked, inputs.sources)
     bodies = fit_bodies_on_plane(model, evidence, estimates, filmed.pitch.height)
     persons = tracked["person"].values
     kept = np.array([reason is None for reason in bodies.missing], dtype=np.bool_)
@@ -72,16 +67,17 @@ def publish_plane_bodies(store: Store, work: Work, result: ResultWriter) -> None
     if without:
         told = "; ".join(f"person {person}: {reason}" for person, reason in without.items())
         result.warnings.append(
-            f"{work.recipe.name}: {len(without)} of {len(persons)} people have a place on the "
-            f"pitch and no body. {told}. Check {sources['estimates']} there: its frame numbers "
-            "count the images of the clip's own video, and boxes are pixels of its images."
+            f"{inputs.recipe.name}: {len(without)} of {len(persons)} people have a place on the "
+            f"pitch and no body. {told}. Check {inputs.sources['estimates']} there: its frame "
+            "numbers count the images of the clip's own video, and boxes are pixels of its images."
         )
 
 
-def _observe_people(filmed: BroadcastInputs, tracked: xr.Dataset, work: Work) -> PlaneEvidence:
+def _observe_people(
+    filmed: BroadcastInputs, tracked: xr.Dataset, sources: Mapping[str, Any]
+) -> PlaneEvidence:
     """Return the keypoints of tracked people, and their places with covariance."""
-    sources: dict[str, Any] = work.recipe.sources
-    seen = KeypointDetections.from_arrays(filmed.detections)
+    seen = filmed.detections
     index = tracked["detection_index"].values
     rows = np.arange(len(index))[:, None]
     found = index >= 0
@@ -91,9 +87,7 @@ def _observe_people(filmed: BroadcastInputs, tracked: xr.Dataset, work: Work) ->
     else:
         keypoints = np.full((*index.shape, 17, 2), np.nan)
         confidence = np.full((*index.shape, 17), np.nan)
-    moving, uncertainty = moving_from_arrays(
-        {str(name): array.values for name, array in filmed.camera.data_vars.items()}
-    )
+    moving, uncertainty = filmed.camera
     place = tracked["ground"].values.astype(np.float64)
     return PlaneEvidence(
         camera=moving.camera,

@@ -46,7 +46,6 @@ ORDER_IN_WORLDPOSE = (
     "body_fitting",
     "broadcast_calibration",
     "filtering",
-    "redetection",
     "evaluation",
     "dataset",
     "reports",

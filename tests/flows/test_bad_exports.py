@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import TINY, worldpose
-from test_release_formats import bodies, match_folder, origin, tracked
+from test_release_formats import match_folder, origin, tracked
 
 from flows.results import export as export_module
 from flows.results.export import EXPORTS, export
@@ -61,9 +61,8 @@ def without_joints():
 
 
 CASES = {
-    "gaps": whole,
+    "nothing": dict,
     "nobody": lambda: few(people=[]),
-    "one person": lambda: few(people=[1]),
     "one frame": lambda: few(frames=[0]),
     "no joint": without_joints,
 }
@@ -79,6 +78,7 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert "expected" in str(error)
         assert not out.exists(), "an error leaves nothing"
     else:
+        assert case != "nothing"
         assert all(path.is_file() for path in written)
         # MOTChallenge's file of nobody is empty.
         assert form == "tracks" or all(path.stat().st_size for path in written)
@@ -86,13 +86,6 @@ def test_strange_results_are_written_or_refused(match_folder, tmp_path, form, ca
         assert all(path.is_relative_to(out) for path in written)
         there = {path for path in out.rglob("*") if path.is_file()}
         assert there == {*written, out / OWNERS}, "no draft is left"
-
-
-@pytest.mark.parametrize("form", EXPORTS)
-def test_a_run_without_results_is_refused(match_folder, tmp_path, form):
-    with pytest.raises(WorldposeError, match="expected"):
-        export(origin(match_folder), [form], tmp_path / "new" / "out")
-    assert not (tmp_path / "new").exists()
 
 
 def test_a_later_format_that_fails_leaves_the_earlier_ones_out(match_folder, tmp_path):
@@ -153,7 +146,7 @@ def _foreign(path):
     return path
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
 def test_a_disk_that_refuses_is_named_and_nothing_is_left(
     match_folder, tmp_path, monkeypatch, code
 ):
@@ -168,16 +161,6 @@ def test_a_disk_that_refuses_is_named_and_nothing_is_left(
         export(run, ["joints", "csv"], tmp_path / "new" / "out")
     assert str(tmp_path / "new" / "out") in told.value.where
     assert not (tmp_path / "new").exists()
-
-
-def test_a_fault_elsewhere_is_not_blamed_on_the_folder(match_folder, tmp_path, monkeypatch):
-    def fail(origin, out):
-        raise FileNotFoundError(errno.ENOENT, "gone", "/somewhere/else")
-
-    monkeypatch.setitem(export_module.EXPORTS, "csv", fail)
-    with pytest.raises(FileNotFoundError, match="gone"):
-        export(origin(match_folder, **tracked()), ["csv"], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_target_of_another_kind_is_refused(match_folder, tmp_path):
@@ -206,17 +189,6 @@ def test_a_missing_package_is_named(match_folder, tmp_path, monkeypatch, form):
     with pytest.raises(UsageError, match=NEEDS_PACKAGE[form]):
         export(origin(match_folder, **whole()), [form], tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_broken_body_of_one_person_does_not_spoil_the_other(match_folder, tmp_path):
-    results = tracked()
-    fits = bodies()
-    fits["transl"][:, 0] = np.nan
-    for name in ("joints", "covariance"):
-        fits[name] = results["body_fitting__A_1"][name]
-    results["body_fitting__A_1"] = fits
-    for form in ("gltf", "bvh", "mot", "worldpose"):
-        assert export(origin(match_folder, **results), [form], tmp_path / form)
 
 
 @pytest.mark.parametrize(
@@ -250,13 +222,3 @@ def test_the_command_says_one_thing_and_writes_nothing(
     assert re.search(message, answer.err)
     assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
     assert {path.name for path in tmp_path.iterdir()} == {"binary.txt", "empty.txt"}
-
-
-@pytest.mark.parametrize("form", ["joints", "gltf", "viewer", "csv"])
-def test_a_run_that_did_not_finish_is_refused(ingested, tmp_path, form):
-    answer = worldpose(
-        *("export", TINY, "--format", form, "--out", tmp_path / "out", "--project", ingested)
-    )
-    assert answer.code in (1, 2), answer.err
-    assert answer.err.count("error:") == 1 and "Traceback" not in answer.err
-    assert not (tmp_path / "out").exists()

@@ -52,18 +52,6 @@ def test_later_stages_are_planned_without_a_camera_that_is_left_out(calibrated):
         assert not [name for name in recipe.inputs if name.endswith("/cam01")]
 
 
-def test_a_corrected_camera_takes_part_again(calibrated, tiny, tmp_path):
-    store, match = calibrated
-    before = {unit.name: unit.key for unit in plan_run(store, match, {})}
-    annotations = "annotations/static_calibration/cam01.json"
-    shutil.copy(tiny / annotations, tmp_path / "match" / annotations)
-    match, _ = register(store, tmp_path / "match")
-    after = {unit.name: unit for unit in plan_run(store, match, {})}
-    assert "static_calibration/cam01" in after["tracking/clip"].recipe.inputs
-    assert after["tracking/clip"].key != before["tracking/clip"]
-    assert after["static_calibration/cam00"].key == before["static_calibration/cam00"]
-
-
 def test_people_are_not_tracked_with_fewer_than_two_cameras(calibrated):
     store, match = calibrated
     results = {unit.name: unit.key for unit in plan_run(store, match, {})}

@@ -2,7 +2,6 @@
 
 import cProfile
 import pstats
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +11,7 @@ from data_contracts.match import CameraSpec, ClipSpec, MatchSpec, Registration, 
 from data_contracts.static_calibration import ClickedMarkings
 from flows.method import METHOD
 from flows.run_plan import RunPlan
-from flows.stage import Match, once_a_match
+from flows.stage import Match
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.journal import Journal
 
@@ -85,20 +84,6 @@ def test_planning_takes_as_much_a_unit_of_a_long_match_as_of_a_short_one(filmed)
     long, many = calls(filmed(40))
     assert many > 3.5 * few
     assert long / many < 1.2 * short / few
-
-
-def test_a_table_is_worked_out_once_a_match_and_anew_for_another(filmed):
-    seen = []
-
-    @once_a_match
-    def table(match):
-        seen.append(match)
-        return len(seen)
-
-    match = filmed(1)
-    edited = replace(match, corrections=())
-    assert [table(match), table(match), table(edited), table(match)] == [1, 1, 2, 1]
-    assert match == edited
 
 
 def test_a_folders_digest_is_of_the_names_and_contents_below_it():

@@ -57,15 +57,6 @@ def test_of_very_many_units_some_are_told_of_and_the_last_is(units, told):
     assert heard.left == 0
 
 
-def test_every_failure_is_told_of_and_counts(caplog):
-    heard = Heard()
-    heard.stage_started("ingest", "take in", units=1000, missing=1000)
-    for number in range(1000):
-        heard.unit_failed(f"ingest/c{number}", "why")
-    assert heard.left == 0
-    assert len([each for each in caplog.records if each.levelname == "ERROR"]) == 1000
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """The monotonic clock, which a test sets."""

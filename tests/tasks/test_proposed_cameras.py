@@ -147,9 +147,3 @@ def test_one_side_has_to_be_stated(folder, tmp_path):
     state_side(folder, "cam03", "left")
     match, _ = register(store, folder)
     assert match.folder.to_click == ()
-
-
-def test_a_camera_without_clicks_and_image_has_to_be_clicked(folder, tmp_path):
-    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
-    with pytest.raises(InputError, match=r"missing camera cam00.*give one camera a side"):
-        register(Store.create(tmp_path / "project"), folder)

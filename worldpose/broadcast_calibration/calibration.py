@@ -486,7 +486,7 @@ def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
     return camera_from_arrays({**stored, "image_size": arrays["image_size"]})
 
 
-def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
+def moving_from_arrays(arrays: Mapping[Any, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
     """Return the moving camera of stored arrays, and its covariance."""
     names = ("covariance", "shared_covariance", "clip_covariance")
     own, across, shared = (np.asarray(arrays[name]) for name in names)
