@@ -15,7 +15,6 @@ from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
 from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
-from tasks.spool import open_spool
 from tasks.triangulation import camera_errors
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body.body_file import digest_of_body, find_body
@@ -251,7 +250,7 @@ def write_fit(
     model, settings, ground = _fitting_basis(people, fitting)
     metrics = FitMetrics(people.fps, people.stride)
     windows = fit_in_windows(model, people, settings, ground, further.known_shapes)
-    with open_spool(inputs.store) as spool:
+    with inputs.open_spool() as spool:
         for part, bodies in windows:
             spool.add(_part_arrays(bodies))
             evidence = people.read(part)

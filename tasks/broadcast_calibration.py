@@ -51,6 +51,13 @@ from worldpose.tracking.ground_tracks import GroundTracks, track_on_plane
 from worldpose.tracking.shirts import measure_shirts
 from worldpose.video.folder import open_video
 
+SIZE_METRICS: Final = {
+    "length": ("length_m", "length_std_m"),
+    "width": ("width_m", "width_std_m"),
+    "crown": ("crown_m", "crown_std_m"),
+    "end_fall": ("end_fall_m", "end_fall_std_m"),
+}
+"""Metrics of a size of the pitch, if it is estimated: its value and standard deviation [m]."""
 PROPOSED_FRAMES: Final = 8
 """Frames of a clip without clicks to propose key frames in, evenly spaced [1]."""
 
@@ -173,7 +180,7 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
         figures["feed_offset_frames"] = offset.frames
     for name, value, std in zip(SIZES, report.pitch.size, report.pitch.size_std, strict=True):
         if std > 0.0:
-            figures |= {f"{name}_m": float(value), f"{name}_std_m": float(std)}
+            figures |= dict(zip(SIZE_METRICS[name], (float(value), float(std)), strict=True))
     return figures | {"weak": float(bool(report.reasons))}
 
 

@@ -14,8 +14,7 @@ from pydantic import TypeAdapter
 from data_contracts.arrays import Image
 from data_contracts.detection import DETECTION
 from data_contracts.keypoints import KeypointDetections
-from tasks.spool import Spool, open_spool
-from tasks.unit import UnitInputs, unit_task
+from tasks.unit import Spool, UnitInputs, unit_task
 from worldpose.detection.interfaces import People
 from worldpose.detection.models import (
     load_detectors,
@@ -40,7 +39,7 @@ from worldpose.video.folder import open_video
 def detection(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write boxes and keypoints, with people's corrections."""
     edits = TypeAdapter(list[DetectionEdit]).validate_python(inputs.sources.get("edits") or [])
-    with open_spool(inputs.store) as spool:
+    with inputs.open_spool() as spool:
         found = _open_uncorrected(inputs) if edits else None
         found = found or _detect_people(inputs, spool)
         result.figures |= found.figures

@@ -27,7 +27,6 @@ from tasks.clip_inputs import (
     read_rows,
 )
 from tasks.detection import footage_index, require_weights
-from tasks.spool import open_spool
 from tasks.unit import UnitInputs, unit_task
 from worldpose.body_fitting.objective import perceived_joints
 from worldpose.compiled import map_in_threads
@@ -84,7 +83,8 @@ def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
     """Write the keypoints and boxes that the bodies reject."""
     settings, case = inputs.settings(FilteringSettings), _open_case(inputs)
     frame, camera_ids = case.clip.detections.frame, case.clip.camera_ids
-    chosen = _evenly(len(frame), settings.max_held_out_frames)
+    most = min(len(frame), settings.max_held_out_frames)
+    chosen = np.unique(np.linspace(0, len(frame) - 1, most).astype(np.int64))
     views, motion, suspects = case.at(chosen)
     fps = case.clip.fps * len(chosen) / len(frame)
     joints, _, _ = case.bodies.read(chosen)
@@ -106,7 +106,7 @@ def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
         judged = judge_detections(views, placed.subtract(shift), spread, settings)
         return _part_arrays(judged, suspects, shift), *_counts(judged, suspects)
 
-    with open_spool(inputs.store) as spool:
+    with inputs.open_spool() as spool:
         # Read here: two threads would both read the page in which their parts meet.
         for arrays, some, by_camera in map_in_threads(judge, case.parts()):
             spool.add(arrays)
@@ -304,11 +304,6 @@ def _held_out(
     if found is None:
         return {}
     return {"held_out_error": found.error, "held_out_keypoints": float(found.keypoints)}
-
-
-def _evenly(frames: int, most: int) -> NDArray[np.int64]:
-    """Return at most `most` evenly spaced frames."""
-    return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
 
 
 @unit_task

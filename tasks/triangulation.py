@@ -13,7 +13,6 @@ from data_contracts.arrays import GroupLayout
 from data_contracts.retriangulation import RETRIANGULATION
 from data_contracts.triangulation import TRIANGULATION
 from tasks.clip_inputs import ClipInputs, open_clip
-from tasks.spool import open_spool
 from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.review.identities import select_triangulated
 from worldpose.store.writer import ResultWriter
@@ -52,7 +51,7 @@ def _write_joints(
     detections, covariance = clip.detections, camera_errors(inputs, clip)
     model = learn_clip(clip.cameras, detections, clip.fps, settings, covariance)
     agreements, changes = [], []
-    with open_spool(inputs.store) as spool:
+    with inputs.open_spool() as spool:
         chunks = reconstruct_chunks(
             clip.cameras, detections, model, clip.fps, settings, covariance, stride=stride
         )

@@ -6,9 +6,11 @@ import ctypes
 import functools
 import logging
 import platform
+import shutil
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -64,6 +66,31 @@ _TRIM_THRESHOLD: Final = -1
 
 _senders: OrderedDict[str, tuple[APILogWorker, EventsWorker]] = OrderedDict()
 """Senders of this process's log lines and events, by server, the least recently used first."""
+
+
+class Spool:
+    """Arrays by name in a scratch folder, extended by every added chunk."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._form: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+
+    def add(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Append a chunk; frames are the first dimension."""
+        for name, values in arrays.items():
+            frames = self._form[name][1][0] if name in self._form else 0
+            with (self._folder / name).open("ab") as file:
+                np.ascontiguousarray(values).tofile(file)
+            self._form[name] = (values.dtype, (frames + len(values), *values.shape[1:]))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all added data, read from disk on access."""
+        return {
+            name: np.memmap(self._folder / name, dtype, "r", shape=shape)
+            if np.prod(shape)
+            else np.empty(shape, dtype)
+            for name, (dtype, shape) in self._form.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -148,6 +175,15 @@ class UnitInputs:
         if not self.store.has(*place):
             return None
         return self.store.open_result(*place), self.store.manifest(*place)
+
+    @contextmanager
+    def open_spool(self) -> Iterator[Spool]:
+        """Yield a temporary spool next to the results in progress, where there is disk space."""
+        folder = self.store.blobs.create_staging()
+        try:
+            yield Spool(folder)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def file(self, name: str) -> Path:
         """Return the file or folder of the match folder that a source names."""

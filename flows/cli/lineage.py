@@ -15,6 +15,7 @@ from flows.cli.console import (
     print_json,
     print_table,
 )
+from flows.cli.options import MoreSettingsOption
 from flows.lineage import explain_unit, find_run, run_difference
 from flows.results.comparison import (
     KINDS,
@@ -105,14 +106,7 @@ def _print_compared(compared: list[SubjectChange]) -> None:
 
 def why(
     unit: Annotated[str, typer.Argument(metavar="UNIT", help="A unit, as MATCH/STAGE/UNIT.")],
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="STAGE.NAME=VALUE",
-            help="A setting beyond those of the latest run; repeatable.",
-        ),
-    ] = None,
+    assignments: MoreSettingsOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:

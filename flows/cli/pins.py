@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from data_contracts.pin import Pin
-from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, line, print_json
+from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, answer
 from flows.lineage import find_run
 from worldpose.errors import UsageError
 from worldpose.store.paths import checked_name
@@ -67,7 +67,5 @@ def unpin(
 
 
 def _say(kept: Pin, verb: str, as_json: bool) -> None:
-    if as_json:
-        print_json(kept.model_dump(mode="json"))
-    else:
-        line(f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}")
+    told = f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}"
+    answer(as_json, kept.model_dump(mode="json"), told)

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from data_contracts.run import WaitingUnit
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    answer,
     errors,
     line,
     print_json,
@@ -40,10 +40,7 @@ def init(
     Example: worldpose init worldpose-data
     """
     store = Store.create(folder)
-    if as_json:
-        print_json({"project": store.url})
-    else:
-        line(f"created project {store.url}")
+    answer(as_json, {"project": store.url}, f"created project {store.url}")
 
 
 def status(
@@ -108,52 +105,49 @@ STATES = tuple(state.value for state in UnitState)
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return one match's status; unreadable parts are reported, and do not affect other matches."""
-    try:
-        return _readable_status(store, match_id)
-    except (OSError, WorldposeError) as failure:  # a damaged record, an unresponsive disk
-        return {
-            "match": match_id,
-            "run": None,
-            "state": "unreadable",
-            "units": {state: [] for state in STATES},
-            "failed": [],
-            "left_out": {},
-            "warnings": [],
-            "waiting": [],
-            "settings": {},
-            "unfinished_runs": [],
-            "pins": {},
-            "problem": str(failure),
-        }
-
-
-def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
-    latest = latest_run(store, match_id)
-    units: dict[str, list[str]] = {state: [] for state in STATES}
-    problem = None
-    waiting: list[WaitingUnit] = []
-    asked, _ = resolve_settings(store, match_id, latest, {})
-    try:
-        match = open_match(store, match_id)
-        found = list_unit_states(store, match, latest)
-    except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
-        problem = str(failure)
-    else:
-        waiting = still_waiting(store, match, latest)
-        units = {state.value: names for state, names in found.items()}
-    return {
+    status: dict[str, Any] = {
         "match": match_id,
-        "run": None if latest is None else latest.run_id,
-        "state": "not run" if latest is None else latest.state,
-        "units": units,
-        "failed": [] if latest is None else [failure.unit for failure in latest.failed],
-        "left_out": {} if latest is None else latest.left_out,
-        "warnings": [] if latest is None else list(latest.warnings),
-        "waiting": [unit.unit for unit in waiting],
-        "settings": asked,
+        "run": None,
+        "state": "unreadable",
+        "units": {state: [] for state in STATES},
+        "failed": [],
+        "left_out": {},
+        "warnings": [],
+        "waiting": [],
+        "settings": {},
+        "unfinished_runs": [],
+        "pins": {},
+        "problem": None,
+    }
+    try:
+        status |= _recorded_status(store, match_id)
+        latest, match = latest_run(store, match_id), open_match(store, match_id)
+        found = list_unit_states(store, match, latest)
+        status["units"] = {state.value: names for state, names in found.items()}
+        status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
+    except (OSError, WorldposeError) as failure:  # a damaged record, a setting names a lost file
+        status["problem"] = str(failure)
+    return status
+
+
+def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
+    """Return what the records of a match's runs tell, without its folder."""
+    latest = latest_run(store, match_id)
+    settings, _ = resolve_settings(store, match_id, latest, {})
+    told: dict[str, Any] = {"state": "not run"}
+    if latest is not None:
+        told = {
+            "run": latest.run_id,
+            "state": latest.state,
+            "failed": [failure.unit for failure in latest.failed],
+            "left_out": latest.left_out,
+            "warnings": list(latest.warnings),
+        }
+    return {
+        **told,
+        "settings": settings,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
-        "problem": problem,
     }
 
 
@@ -227,13 +221,12 @@ def gc(
         store, keep_last=keep_last, forget=forget or [], older_than=timedelta(hours=older_than)
     )
     freed = collect(store, plan) if delete else 0
-    if as_json:
-        rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
-        print_json({"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed})
-        return
-    for garbage in plan.garbage:
-        line(f"{garbage.path}  {garbage.reason}")
-    for reason in plan.held:
-        line(reason)
+    rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
     verb = "removed" if delete else "no run reaches"
-    line(f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB")
+    answer(
+        as_json,
+        {"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed},
+        *(f"{garbage.path}  {garbage.reason}" for garbage in plan.garbage),
+        *plan.held,
+        f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB",
+    )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from data_contracts.evaluation import Evaluation, MethodScore
 from flows.results.evaluation import cameras_of, reference_side
 from worldpose.body.body_file import OPEN_BODY, find_body
-from worldpose.errors import UsageError
+from worldpose.errors import UsageError, unknown_name
 from worldpose.evaluation.matching import EvaluationSettings
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.baselines import Method, find_method
@@ -130,12 +130,7 @@ def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None
     names = [item.partition("=")[0] for item in named]
     for name in seen_fps:
         if name not in names:
-            raise UsageError(
-                f"--method-fps {name}",
-                expected=f"one of {', '.join(names)}",
-                found=repr(name),
-                todo="Use the name from --method.",
-            )
+            raise unknown_name(f"--method-fps {name}", name, names, "Use the name from --method.")
 
 
 def _clip_fps(fps: float | None, name: str) -> float:

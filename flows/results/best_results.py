@@ -25,6 +25,7 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.ingest.match_folder import read_match
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
@@ -310,6 +311,16 @@ class Origin:
     def clips(self) -> tuple[str, ...]:
         """Return the clips that have joints."""
         return clips_of(self.run.record)
+
+    @property
+    def static_cameras(self) -> dict[str, Camera]:
+        """Return the static cameras of the exported joints, by id."""
+        return static_cameras(self.run, self.spec, self.stage)
+
+    @property
+    def pitch(self) -> PitchSpec | None:
+        """Return the pitch of the match folder; None without one."""
+        return read_match(Path(self.registration.folder)).pitch
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""

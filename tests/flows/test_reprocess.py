@@ -117,9 +117,7 @@ def test_a_run_that_ended_earlier_is_made_current_as_far_as_it_went(store):
 @pytest.mark.parametrize(
     ("error", "again"),
     [
-        ("ValueError", False),
         ("CorruptionError", False),
-        ("StoreError", True),
         ("ConnectionResetError", True),
     ],
 )

@@ -220,29 +220,3 @@ def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, m
     np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
     manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
     assert manifest.figures["empty_share"] == 0.5
-
-
-def test_boxes_belong_to_a_video_without_2d_poses(filmed, tmp_path):
-    boxes = tmp_path / "boxes"
-    boxes.mkdir()
-    with pytest.raises(InputError, match=r"without 2D poses: left, right, found no .txt file"):
-        import_boxes(boxes, filmed)
-    (boxes / "middle.txt").write_text("1,1,5,5,5,5,1\n")
-    with pytest.raises(InputError, match=r"left, right, found middle.txt"):
-        import_boxes(boxes, filmed)
-    (boxes / "middle.txt").rename(boxes / "right.txt")
-    (boxes / "left.txt").write_text("41,1,5,5,5,5,1\n")
-    with pytest.raises(InputError, match=r"left.txt: line 1: frame: .* from 1 to 40"):
-        import_boxes(boxes, filmed)
-    assert not (filmed / "boxes").exists()
-    (boxes / "left.txt").unlink()
-    import_boxes(boxes, filmed)
-    with pytest.raises(InputError, match=r"right.txt: expected no boxes of right yet"):
-        import_boxes(boxes, filmed)
-    # A file that was edited afterwards is refused when the match is registered.
-    (filmed / "boxes" / "right.txt").write_text("1,1,5,5,5,-5,1\n")
-    with pytest.raises(InputError, match="more than 0 px"):
-        register(Store.create(tmp_path / "project"), filmed)
-    (filmed / "boxes" / "right.txt").rename(filmed / "boxes" / "main.txt")
-    with pytest.raises(InputError, match=r"main.txt: expected a camera or clip with a video"):
-        register(Store.create(tmp_path / "other"), filmed)

@@ -85,15 +85,6 @@ def test_a_camera_with_a_side_is_calibrated_from_its_image(folder, tmp_path):
     assert np.linalg.norm(off) < 0.5
 
 
-def test_shared_people_decide_the_side_of_a_camera(folder, tmp_path):
-    take_clicks(folder, {TURNED: None})
-    state_side(folder, "cam00", "near")
-    found, reasons = calibrate(folder, tmp_path, TURNED)
-    assert not reasons
-    off = camera_from_arrays(found[TURNED].data_vars).center - true_camera(folder, TURNED).center
-    assert np.linalg.norm(off) < 0.5
-
-
 def test_people_contradict_a_wrong_side(folder, tmp_path):
     take_clicks(folder, {TURNED: "near", "cam04": None})
     found, reasons = calibrate(folder, tmp_path, TURNED, "cam04")
