@@ -206,6 +206,16 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
     The task takes the work order, and returns the key of the result.
     """
 
+    def publish(work: Work) -> str:
+        store = Store.open(work.project)
+        with store.publish(work) as result:
+            compute(UnitInputs(store, work), result)
+        return work.key
+
+    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
+        setattr(publish, name, getattr(compute, name))
+
+    @functools.wraps(publish)
     def run_checked(work: Work) -> str:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
@@ -214,10 +224,7 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
         require_same_code(work, compute.__module__)
         with kill_on_timeout(work):
             try:
-                store = Store.open(work.project)
-                with store.publish(work) as result:
-                    compute(UnitInputs(store, work), result)
-                return work.key
+                return publish(work)
             except WorldposeError:
                 raise
             except Exception as error:
@@ -227,9 +234,6 @@ def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work
                 # A bug must not look like a fault of the match.
                 raise InternalError.wrap(work.recipe.name, error) from error
 
-    # Its parameters are not those of the function: `functools.wraps` would tell Prefect so.
-    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
-        setattr(run_checked, name, getattr(compute, name))
     return task(
         task_run_name="{work.recipe.stage} {work.recipe.unit}",
         retries=RETRIES,

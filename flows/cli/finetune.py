@@ -70,7 +70,7 @@ def finetune(
         Path | None, typer.Option(help="Folder of the images; that of LABELS by default.")
     ] = None,
     nets: Annotated[
-        list[NetKind] | None, typer.Option("--net", help="people or keypoints; both by default.")
+        list[str] | None, typer.Option("--net", help="people or keypoints; both by default.")
     ] = None,
     starts: Annotated[
         list[str] | None,
@@ -98,11 +98,10 @@ def finetune(
             found="a URL",
             todo="Train in a local project: settings name weights by file.",
         )
-    kinds = tuple(nets or NETS)
-    given = dict(map(_split_assignment, starts or []))
-    for name in given.keys() - set(NETS):
-        raise unknown_name(f"--start {name}", name, NETS)
-    begin = {kind: Path(given[kind]) for kind in NETS if kind in given}
+    kinds = tuple(_kind(name, "--net") for name in nets or NETS)
+    begin = {
+        _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
+    }
     settings = _settings(assignments or [])
     logger = logging.getLogger("worldpose.finetune")
     logger.setLevel(logging.INFO)
@@ -147,6 +146,13 @@ def _print(versions: list[NetVersion], folder: Path) -> None:
     chosen = [f"--set {SETTING[v.net]}=embedded:{folder / v.file}" for v in versions if v.adopted]
     if chosen:
         line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
+
+
+def _kind(name: str, where: str) -> NetKind:
+    for kind in NETS:
+        if name == kind:
+            return kind
+    raise unknown_name(f"{where} {name}", name, NETS)
 
 
 def _split_assignment(assignment: str) -> tuple[str, str]:
