@@ -33,7 +33,6 @@ def score_methods(
     first_frame: int | None = None,
     fps: float | None = None,
     seen_fps: Mapping[str, float] | None = None,
-    settings: EvaluationSettings | None = None,
 ) -> tuple[MethodScore, ...]:
     """Score results of baseline methods; return each score with its settings.
 
@@ -46,13 +45,12 @@ def score_methods(
         fps: frames per second; None = the match's, if there is one.
         seen_fps: name of a method to the frames per second of its input video, if not the clip's;
             the result is resampled to the clip's frames.
-        settings: the defaults if None.
 
     Raises:
         UsageError: an unknown method, an unknown camera, or a method that needs `match_in`.
         InputError: a file is not in the method's format.
     """
-    settings = settings or EvaluationSettings()
+    settings = EvaluationSettings()
     truth = reference_side(reference)
     spec = None if truth.match is None else truth.match.spec
     cameras = cameras_of(reference, truth, spec)

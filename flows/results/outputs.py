@@ -77,14 +77,14 @@ def record_owner(folder: Path, names: Mapping[str, Path | None], owner: str) -> 
         draft.write_text(json.dumps(owners, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def claim_file(file: Path | None, owner: str, *, overwrite: bool = False) -> None:
+def claim_file(file: Path | None, owner: str) -> None:
     """Record the owner of a file that a command writes next; without a file do nothing.
 
     Raises:
         InputError: the file exists and has another owner.
     """
     if file is not None:
-        require_own(file.parent, {file.name: None}, (owner,), overwrite=overwrite)
+        require_own(file.parent, {file.name: None}, (owner,), overwrite=False)
         record_owner(file.parent, {file.name: None}, owner)
 
 
