@@ -74,9 +74,3 @@ def test_a_misspelt_command_names_the_one_that_may_be_meant():
     answer = CliRunner().invoke(app, ["simualte"])
     assert answer.exit_code == 2
     assert "No such command 'simualte'. Did you mean simulate?" in answer.output
-
-
-def test_a_group_lists_its_commands():
-    answer = CliRunner().invoke(app, ["body", "--help"])
-    assert answer.exit_code == 0
-    assert "install" in answer.output.partition("Commands:")[2]

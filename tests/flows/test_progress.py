@@ -18,7 +18,7 @@ from rich.console import Console
 from data_contracts.match import MatchSpec
 from flows import progress
 from flows.cli import console
-from flows.progress import MOST_TOLD, Reporter, format_duration
+from flows.progress import MOST_TOLD, Reporter
 from flows.registering import open_match
 from flows.run_plan import plan_run
 from flows.run_record import (
@@ -89,21 +89,6 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     assert str(heard.run_progress) == "62 % 14 s"
     heard.unit_done("tracking/b", 5.0, {})
     assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0, "0 s"),
-        (99.4, "99 s"),
-        (99.6, "2 min"),
-        (5900.0, "98 min"),
-        (6000.0, "1.7 h"),
-        (4e5, "5 d"),
-    ],
-)
-def test_a_duration_is_short(seconds, text):
-    assert format_duration(seconds) == text
 
 
 @pytest.mark.parametrize("verbose", [False, True])
