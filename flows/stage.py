@@ -103,14 +103,6 @@ def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     return once
 
 
-def _no_external_inputs(settings: Record) -> dict[str, JsonValue]:
-    return {}
-
-
-def _no_results(match: Match, unit: str) -> tuple[str, ...]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Stage:
     """One stage of the method.
@@ -139,10 +131,10 @@ class Stage:
     units: Callable[[Match], tuple[str, ...]]
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
-    previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
-    late_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
+    previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
+    late_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     first_pass: Literal[1, 2] = 1
-    external_inputs: Callable[[Any], dict[str, JsonValue]] = _no_external_inputs
+    external_inputs: Callable[[Any], dict[str, JsonValue]] = lambda settings: {}
     worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0

@@ -19,7 +19,6 @@ from flows.cli.console import (
     print_table,
 )
 from flows.cli.options import MoreSettingsOption
-from flows.lineage import explain_unit, find_run, run_difference
 from flows.registering import find_registration
 from flows.results.comparison import (
     KINDS,
@@ -29,6 +28,7 @@ from flows.results.comparison import (
     largest_pose_changes,
 )
 from flows.results.timings import run_time
+from flows.run_status import explain_unit, find_run, run_difference
 from flows.settings import parse_overrides
 from worldpose.store.store import Store
 

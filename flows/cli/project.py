@@ -19,11 +19,10 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.lineage import find_run
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
 from flows.run_record import latest_run, resolve_settings
-from flows.run_status import UnitState, list_unit_states
+from flows.run_status import UnitState, find_run, list_unit_states
 from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair

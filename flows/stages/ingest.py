@@ -36,11 +36,6 @@ def units(match: Match) -> tuple[str, ...]:
     )
 
 
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return nothing: `ingest` is the first stage."""
-    return ()
-
-
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the unit's detections or else its video, and its frame mapping to match time.
 
@@ -92,6 +87,6 @@ STAGE = Stage(
     about="take in 2D poses and videos",
     settings=IngestSettings,
     units=units,
-    inputs=inputs,
+    inputs=lambda match, unit: (),
     sources=sources,
 )

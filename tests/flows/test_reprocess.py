@@ -14,13 +14,12 @@ from data_contracts.run import UnitFailure
 from flows import reprocess, run_plan
 from flows.cli.app import app
 from flows.cli.reprocess import exit_code
-from flows.lineage import explain_unit
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.reprocess import Reprocessed, reprocess_matches
 from flows.review.edit_conflicts import edits_since
 from flows.review.verdicts import correct
-from flows.run_status import run_status
+from flows.run_status import explain_unit, run_status
 from flows.running import RunRequest
 from flows.service import deployed
 from flows.stages.tracking import STAGE
