@@ -46,6 +46,7 @@ ORDER_IN_WORLDPOSE = (
     "body_fitting",
     "broadcast_calibration",
     "filtering",
+    "pipeline",
     "evaluation",
     "dataset",
     "reports",
