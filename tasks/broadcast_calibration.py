@@ -29,8 +29,6 @@ from worldpose.broadcast_calibration.calibration import (
     broadcast_arrays,
     broadcast_attributes,
     calibrate_broadcast,
-    moving_arrays,
-    moving_from_arrays,
 )
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
@@ -41,6 +39,8 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.uncertainty import (
     Uncertainty,
     drawn_to,
+    moving_arrays,
+    moving_from_arrays,
     pool_centers,
     static_covariance,
 )

@@ -31,8 +31,8 @@ from worldpose.ingest.footage import stretches
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store.writer import ResultWriter
-from worldpose.video.files import FrameIndex
 from worldpose.video.folder import open_video
+from worldpose.video.pictures import FrameIndex
 
 
 @unit_task
