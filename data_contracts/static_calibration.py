@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from data_contracts.arrays import GroupLayout, array_layout
 from data_contracts.cameras import CAMERA_ARRAYS, CAMERA_LABELS
@@ -37,6 +37,13 @@ class ClickedMarkings(Record):
     contract: Literal[1] = CONTRACT_VERSION
     points: tuple[ClickedPoint, ...] = ()
     drawn: tuple[DrawnMarking, ...] = ()
+
+    def by_name(self) -> dict[str, JsonValue]:
+        """Return points and drawn markings by name, as recipes list them [px]."""
+        return {
+            "points": {point.name: list(point.xy) for point in self.points},
+            "drawn": {marking.name: [list(xy) for xy in marking.xy] for marking in self.drawn},
+        }
 
 
 CAMERA_STEP = (

@@ -210,7 +210,7 @@ def _of_people(figures: Figures) -> Figures:
 
 
 def _of_adjustment(figures: Figures) -> Figures:
-    after, before = (figures.get(f"held_out_error_{side}_px") for side in ("after", "before"))
+    before, after = figures.get("held_out_error_before_px"), figures.get("held_out_error_after_px")
     if after is None or not before:
         return figures
     return {**figures, "held_out_growth": after / before}

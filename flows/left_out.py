@@ -1,27 +1,11 @@
 """Static cameras that a run leaves out, and the warnings of a run.
 
-One bad camera must not end a run. A stage that finds a camera unusable reports this with its
-result, and every later stage is planned as if the match did not have this camera: it is in none of
-their camera lists, recipes and arrays. A stage does this in three steps:
+One bad camera must not end a run: every later stage is planned as if the match did not have it. A
+stage that may leave cameras out has `Stage.leaves_out`, stands before `tracking` in `METHOD`, and
+fills `ResultWriter.left_out` with the reasons. The arrays of its result must tell the same, because
+two computations of one key are compared by them. With gates, a person is asked first.
 
-1. Its `Stage` record has `leaves_out=True`, and the stage stands before `tracking` in `METHOD`.
-2. Its task fills the result's `left_out` before it leaves `Store.publish`::
-
-       with store.publish(work) as result:
-           result.write(...)
-           result.left_out["cam03"] = "its people stand 40 m from those of cam01, cam02 and cam05"
-           result.warnings.append("camera cam04 shows 2.7 frames earlier than the others")
-
-   The same information must be in the arrays that `write` stores, because two computations of one
-   key are compared by them.
-3. Nothing else. `worldpose run` prints `warning: camera cam03 is left out: ...` at its end, and
-   `run --json`, `status`, the report and the pages list it. With gates, a person is asked before
-   the run continues without the camera.
-
-`warnings` are for all stages: sentences that the user must read although the run continued.
-
-The exit code stays 0 while two cameras are left. With fewer, `tracking` and all later stages have
-no results, and the run is partial (exit code 4).
+With fewer than two cameras, `tracking` and all later stages have no results: the run is partial.
 """
 
 from __future__ import annotations

@@ -196,7 +196,8 @@ def _in_batches(
     for first in range(0, len(units), size):
         some, theirs = units[first : first + size], work[first : first + size]
         name = f"{some[0].name} and {len(some) - 1} more"
-        submitted[batch.submit(name, [each.model_dump_json() for each in theirs])] = some, theirs
+        asked = batch.submit(name, stage.task_module, [each.model_dump_json() for each in theirs])
+        submitted[asked] = some, theirs
     for future in as_completed(list(submitted)):
         some, theirs = submitted[future]
         failures: list[Exception | None]
@@ -213,8 +214,8 @@ def _in_batches(
 
 
 def task_of(stage: Stage) -> Task[..., Any]:
-    """Return the task that computes one unit of a stage: the function of its name in `tasks`."""
-    task: Task[..., Any] = getattr(importlib.import_module(f"tasks.{stage.name}"), stage.name)
+    """Return the task that computes one unit of a stage: the function of its name."""
+    task: Task[..., Any] = getattr(importlib.import_module(stage.task_module), stage.name)
     return task
 
 

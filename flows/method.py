@@ -6,21 +6,18 @@ places of planned ones, with their units and checklist ids.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from flows.stage import Stage
 from flows.stages import (
     body_fitting,
     broadcast_calibration,
-    broadcast_pooling,
-    broadcast_tracking,
     bundle_adjustment,
     camera_consistency,
     detection,
     filtering,
     ingest,
     proposal,
-    redetection,
-    refitting,
-    retriangulation,
     static_calibration,
     tracking,
     triangulation,
@@ -31,17 +28,23 @@ METHOD: tuple[Stage, ...] = (
     proposal.STAGE,  # [camera], without clicks  C2
     static_calibration.STAGE,  # [camera]  C1-C5; then gate CAMERAS, C7
     detection.STAGE,  # [camera, clip]  D1-D5; then gate PEOPLE, D6
-    redetection.STAGE,  # [camera, clip]  R2, from the second iteration on
+    filtering.REDETECTION,  # [camera, clip]  R2, from the second iteration on
     camera_consistency.STAGE,  # [clip]  then gate CONSISTENCY
     tracking.STAGE,  # [clip]           T1, T2; then gate IDENTITIES
     triangulation.STAGE,  # [clip]      T3, T4; then gate JOINTS
     bundle_adjustment.STAGE,  #         B1-B3; then gate ADJUSTMENT
-    retriangulation.STAGE,  # [clip]    B2
+    triangulation.RETRIANGULATION,  # [clip]  B2
     body_fitting.STAGE,  # [clip]       S1-S3; then gate ACCEPTANCE of the clip
     broadcast_calibration.STAGE,  # [clip]  M1-M6; then gate BROADCAST
-    broadcast_pooling.STAGE,  # [clip]  M1
-    broadcast_tracking.STAGE,  # [clip], without static cameras
-    refitting.STAGE,  # [clip]          S1, S4
+    broadcast_calibration.POOLING,  # [clip]  M1
+    broadcast_calibration.TRACKING,  # [clip]  without static cameras
+    body_fitting.REFITTING,  # [clip]   S1, S4
     filtering.STAGE,  # [clip]          R2; then again from tracking, R1 (flows/iterate.py)
     # release, evaluation               X1-X3, E1-E6
 )
+
+
+def task_modules(stages: Iterable[str]) -> list[str]:
+    """Return the modules with the tasks of some stages, sorted."""
+    names = set(stages)
+    return sorted({stage.task_module for stage in METHOD if stage.name in names})

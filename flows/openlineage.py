@@ -7,7 +7,6 @@ with its key as version. Specification: https://openlineage.io/spec/2-0-2/OpenLi
 from __future__ import annotations
 
 import functools
-import http.client
 import json
 import logging
 import os
@@ -18,6 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
+
+import httpx
 
 from data_contracts.run import RunRecord
 from worldpose.store.store import Store
@@ -41,7 +42,7 @@ def tell_lineage(store: Store, record: RunRecord) -> None:
         return
     try:
         _send(address, [json.dumps(each) for each in lineage_events(store, record)])
-    except (OSError, ValueError, http.client.HTTPException) as error:
+    except (OSError, httpx.HTTPError, httpx.InvalidURL) as error:
         LOG.warning("%s took not all lineage of %s: %s", URL, record.match_id, error)
 
 
@@ -125,22 +126,12 @@ def _send(address: str, events: list[str]) -> None:
         with Path(unquote(parts.path)).open("a", encoding="utf-8") as file:
             file.write("".join(f"{event}\n" for event in events))
         return
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise ValueError("expected https://HOST, http://HOST or file:///PATH")
-    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     endpoint = os.environ.get("OPENLINEAGE_ENDPOINT", "api/v1/lineage")
-    path = f"{parts.path.rstrip('/')}/{endpoint.lstrip('/')}"
     headers = {"content-type": "application/json"}
     key = os.environ.get("OPENLINEAGE_API_KEY")
     if key:
         headers["authorization"] = f"Bearer {key}"
-    connection = kind(parts.hostname, parts.port, timeout=ANSWER_SECONDS)
-    try:
-        for event in events:  # over one connection
-            connection.request("POST", path, event.encode(), headers)
-            answer = connection.getresponse()
-            answer.read()
-            if answer.status >= 300:
-                raise ValueError(f"it answers {answer.status}")
-    finally:
-        connection.close()
+    with httpx.Client(headers=headers, timeout=ANSWER_SECONDS) as client:  # one connection
+        for event in events:
+            answer = client.post(f"{address.rstrip('/')}/{endpoint.lstrip('/')}", content=event)
+            answer.raise_for_status()

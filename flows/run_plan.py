@@ -208,7 +208,7 @@ class RunPlan:
                 sources=stage.sources(match, unit) | outside,
                 inputs=known,
                 settings=settings.model_dump(mode="json"),
-                code=code_version(f"tasks.{stage.name}"),
+                code=code_version(stage.task_module),
                 libraries=libraries(),
             )
             key = recipe_key(recipe)

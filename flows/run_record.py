@@ -16,7 +16,14 @@ import psutil
 from pydantic import JsonValue
 
 from data_contracts.match import CameraSpec, ClipSpec
-from data_contracts.run import GatePolicy, Reservation, RunRecord, RunState, UnitFailure
+from data_contracts.run import (
+    GatePolicy,
+    Reservation,
+    ResultManifest,
+    RunRecord,
+    RunState,
+    UnitFailure,
+)
 from flows.gates import GATES, Gatekeeper
 from flows.left_out import left_out_cameras, left_out_warnings
 from flows.method import METHOD
@@ -26,7 +33,7 @@ from flows.review.metric_words import all_reasons
 from flows.run_plan import PlannedUnit, RunPlan, without_waiting
 from flows.settings import Overrides, settings_of
 from flows.stage import Match, Stage
-from flows.stages import body_fitting, broadcast_tracking, tracking, triangulation
+from flows.stages import body_fitting, broadcast_calibration, tracking, triangulation
 from tasks.tracing import add_unit_span, stage_span
 from worldpose.body.body_file import given_body_folder
 from worldpose.errors import InputError
@@ -326,10 +333,7 @@ class RunLog:
         if failure is None:
             self.plan.add_results([unit])
             self.executed.append(unit.name)
-            recipe = unit.recipe
-            manifest = self.store.manifest(recipe.match_id, recipe.stage, recipe.unit, unit.key)
-            self.figures[unit.name] = manifest.figures
-            self.warnings[unit.name] = manifest.warnings
+            manifest = self._read_manifest(unit.name)
             at, seconds = manifest.created_at, manifest.seconds
             add_unit_span(unit.name, unit.key, at, seconds, manifest.figures)
             reporter().unit_done(unit.name, seconds, manifest.figures)
@@ -342,15 +346,20 @@ class RunLog:
             )
             reporter().unit_failed(unit.name, message)
 
+    def _read_manifest(self, name: str) -> ResultManifest:
+        """Keep metrics and warnings of a result, and return its manifest."""
+        stage, _, unit = name.partition("/")
+        manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
+        self.figures[name] = manifest.figures
+        self.warnings[name] = manifest.warnings
+        return manifest
+
     def close(self) -> RunRecord:
         """Store the record: the run is then finished, and its review requests are created."""
         blocked = tuple(sorted(self.plan.blocked))  # without those of stages not asked for
         self._carry_over()
         for name in self.results.keys() - self.figures.keys():
-            stage, _, unit = name.partition("/")
-            manifest = self.store.manifest(self.match.match_id, stage, unit, self.results[name])
-            self.figures[name] = manifest.figures
-            self.warnings[name] = manifest.warnings
+            self._read_manifest(name)
         left_out = left_out_cameras(self.store, self.match, METHOD, self.plan.usable_results)
         settings, overrides = self._settings()
         record = RunRecord(
@@ -437,7 +446,7 @@ class RunLog:
         wanted = (
             (tracking.STAGE, "people"),
             (triangulation.STAGE, "joints"),
-            (broadcast_tracking.STAGE, "people"),
+            (broadcast_calibration.TRACKING, "people"),
         )
         for stage, figure in wanted:
             clips = [f"{stage.name}/{unit}" for unit in stage.units(self.match)]

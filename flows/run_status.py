@@ -1,4 +1,4 @@
-"""Run status: which units of a match are stale, and why.
+"""Run status: which units of a match are stale, and why; and what differs between two runs.
 
 An edit is a correction or a verdict, a changed file of the match folder, a setting, a detector's
 weights, the code. All of them are in the units' recipes, so edits need no notification: the run
@@ -22,8 +22,9 @@ from flows.run_plan import PlannedUnit, RunPlan, plan_ahead, plan_run
 from flows.run_record import latest_run, resolve_settings
 from flows.settings import Overrides, selected_stages
 from flows.stage import Match
-from worldpose.errors import StoreError
+from worldpose.errors import InputError, StoreError
 from worldpose.store.recipes import RecipeDifference, recipe_differences
+from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
 
 TEMPORARY_ERRORS: Final = frozenset(
@@ -142,12 +143,18 @@ def list_unit_states(
     Raises:
         InputError: a setting of that run names a missing file.
     """
-    asked, _ = resolve_settings(store, match.match_id, latest, {})
-    iteration = 1 if latest is None else latest.iteration
     units: dict[UnitState, list[str]] = {state: [] for state in UnitState}
-    for unit in plan_run(store, match, asked, iteration=iteration):
+    for unit in _plan_as_latest(store, match, latest, {}):
         units[unit_state(unit, latest)].append(unit.name)
     return units
+
+
+def _plan_as_latest(
+    store: Store, match: Match, latest: RunRecord | None, overrides: Overrides
+) -> list[PlannedUnit]:
+    """Plan the whole method with the settings and the iteration of the latest run."""
+    asked, _ = resolve_settings(store, match.match_id, latest, overrides)
+    return plan_run(store, match, asked, iteration=1 if latest is None else latest.iteration)
 
 
 def recorded_differences(
@@ -276,3 +283,112 @@ def _run_of_iteration(store: Store, latest: RunRecord, number: int) -> RunRecord
 def _is_temporary(failure: UnitFailure) -> bool:
     """Return whether a recorded failure was a disk's or a network's."""
     return failure.error in TEMPORARY_ERRORS
+
+
+@dataclass(frozen=True)
+class UnitChange:
+    """Change of one unit between two runs.
+
+    Attributes:
+        unit: name as `stage/unit`.
+        state: same, changed, only in A, only in B.
+        reasons: differences between the recipes.
+        figures: name, value in A, value in B of the metrics that differ.
+    """
+
+    unit: str
+    state: str
+    reasons: tuple[str, ...]
+    figures: tuple[tuple[str, float, float], ...]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """State of a unit (`UnitState`), its current key, and the reasons as lines for people."""
+
+    unit: str
+    state: str
+    key: str
+    reasons: tuple[str, ...]
+
+
+def find_run(store: Store, name: str) -> RunRecord:
+    """Return the run named by `match/number` or `match/name`, or `match` for its latest.
+
+    Raises:
+        InputError: no such run.
+    """
+    match_id, _, number = name.partition("/")
+    runs = store.runs(match_id) if match_id in store.matches() else []
+    names = {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)} if runs else {}
+    run_id = names.get(number, number) or (runs[-1] if runs else "")
+    if run_id not in runs:
+        raise InputError(
+            name,
+            expected=f"MATCH/NUMBER or MATCH/NAME, of {', '.join(store.matches()) or '(none)'}",
+            found=f"runs {', '.join((*runs, *names))}" if runs else "no run of that match",
+            todo="List the runs: worldpose status.",
+        )
+    return store.run(match_id, run_id)
+
+
+def run_difference(store: Store, a: RunRecord, b: RunRecord) -> list[UnitChange]:
+    """Compare each unit between two runs, in the order of the method."""
+    changes = []
+    for unit in sorted(a.results.keys() | b.results.keys(), key=_method_order):
+        if unit not in b.results:
+            changes.append(UnitChange(unit, "only in A", (), ()))
+        elif unit not in a.results:
+            changes.append(UnitChange(unit, "only in B", (), ()))
+        elif a.results[unit] == b.results[unit]:
+            changes.append(UnitChange(unit, "same", (), ()))
+        else:
+            differences = recorded_differences(store, a, unit, recorded_recipe(store, b, unit))
+            reasons = tuple(str(each) for each in differences)
+            old, new = (run.figures.get(unit, {}) for run in (a, b))
+            figures = tuple(
+                (name, old[name], new[name])
+                for name in old
+                if name in new and old[name] != new[name]
+            )
+            changes.append(UnitChange(unit, "changed", reasons, figures))
+    return changes
+
+
+def explain_unit(store: Store, name: str, overrides: Overrides) -> Explanation:
+    """Return a unit's state and the reasons for it.
+
+    Args:
+        store: the store.
+        name: unit as `match/stage/unit`.
+        overrides: requested settings beyond those of the latest run.
+
+    Raises:
+        InputError: no such unit.
+    """
+    match_id, _, unit_name = name.partition("/")
+    match = open_match(store, match_id)
+    latest = latest_run(store, match_id)
+    planned = {unit.name: unit for unit in _plan_as_latest(store, match, latest, overrides)}
+    if unit_name not in planned:
+        raise InputError(
+            name,
+            expected=f"a unit of {match_id}: {', '.join(planned)}",
+            found=repr(unit_name),
+            todo="Write it as MATCH/STAGE/UNIT.",
+        )
+    status = unit_status(store, planned[unit_name], latest)
+    failed = () if latest is None else latest.failed
+    failures = tuple(
+        f"run {match_id}/{latest.run_id} failed with the same input and settings: {each.message}"
+        for each in failed
+        if latest is not None and each.unit == unit_name and each.key == status.planned.key
+    )
+    reasons = failures or status.describe()
+    return Explanation(name, status.state.value, status.planned.key, reasons)
+
+
+def _method_order(unit: str) -> tuple[int, str]:
+    stage = unit.partition("/")[0]
+    names = [each.name for each in METHOD]
+    return (names.index(stage) if stage in names else len(names), unit)

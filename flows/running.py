@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from data_contracts.run import GatePolicy, RunRecord
 from flows.gates import Gatekeeper
+from flows.method import task_modules
 from flows.orchestration.cluster_errors import require_room, require_workers
 from flows.orchestration.local_cluster import (
     keep_workers,
@@ -256,9 +257,8 @@ def _machines(
 
 def _import_tasks(missing: Iterable[PlannedUnit]) -> None:
     """Import what the flow would import when it starts and with each stage's first unit."""
-    stages = sorted({unit.recipe.stage for unit in missing})
-    tasks = ("batch", *stages)
-    for name in ("prefect.flow_engine", "prefect_dask", *(f"tasks.{task}" for task in tasks)):
+    tasks = task_modules(unit.recipe.stage for unit in missing)
+    for name in ("prefect.flow_engine", "prefect_dask", "tasks.batch", *tasks):
         importlib.import_module(name)
 
 

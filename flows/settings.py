@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from difflib import get_close_matches
 
 from pydantic import JsonValue, ValidationError
 
 from data_contracts.records import Record
 from flows.method import METHOD
 from flows.stage import Stage
-from worldpose.errors import UsageError
+from worldpose.errors import UsageError, unknown_name
 
 Overrides = Mapping[str, Mapping[str, JsonValue]]
 """Stage to the settings that differ from their defaults."""
@@ -59,15 +58,21 @@ def parse_overrides(assignments: list[str], stages: tuple[Stage, ...] = METHOD) 
                 todo="Write it as in: --set triangulation.min_views=3.",
             )
         _place(f"--set {assignment}", stage_name, list(by_name))
-        try:
-            value = json.loads(text)
-        except (ValueError, RecursionError):  # not JSON, or unclosed brackets
-            value = text
+        value = parse_value(text)
         _place(f"--set {assignment}", field, list(by_name[stage_name].settings.model_fields))
         overrides.setdefault(stage_name, {})[field] = value
     for stage_name in overrides:
         settings_of(by_name[stage_name], overrides)
     return overrides
+
+
+def parse_value(text: str) -> JsonValue:
+    """Return the value of a setting, given as JSON or else as text."""
+    try:
+        value: JsonValue = json.loads(text)
+    except (ValueError, RecursionError):  # not JSON, or unclosed brackets
+        return text
+    return value
 
 
 def settings_of(stage: Stage, overrides: Overrides) -> Record:
@@ -89,12 +94,6 @@ def settings_of(stage: Stage, overrides: Overrides) -> Record:
 
 
 def _place(where: str, name: str, names: list[str]) -> int:
-    if name in names:
-        return names.index(name)
-    close = get_close_matches(name, names, n=1)
-    raise UsageError(
-        where,
-        expected=f"one of {', '.join(names) or '(this stage has no settings)'}",
-        found=repr(name),
-        todo=f"Did you mean {close[0]!r}?" if close else "Choose one of these.",
-    )
+    if name not in names:
+        raise unknown_name(where, name, names)
+    return names.index(name)

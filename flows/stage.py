@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Hashable
 from dataclasses import dataclass, field, replace
 from functools import wraps
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 from pydantic import JsonValue
@@ -12,6 +13,7 @@ from pydantic import JsonValue
 from data_contracts.match import Registration
 from data_contracts.records import Record
 from data_contracts.review import Correction
+from worldpose.ingest.footage import unit_frames
 from worldpose.ingest.match_folder import MatchFolder
 from worldpose.review.journal import Journal
 
@@ -48,6 +50,27 @@ class Match:
         """Whether match.yaml has static cameras, left out or not."""
         return bool(self.registration.spec.static_cameras)
 
+    @property
+    def pitch_source(self) -> JsonValue:
+        """The pitch, as recipes list it; None without one."""
+        pitch = self.folder.pitch
+        return None if pitch is None else pitch.model_dump(mode="json")
+
+    def file_sources(self, name: str, file: Path | None) -> dict[str, JsonValue]:
+        """Return path and digest of a file of the match folder, as recipes list them."""
+        path = None if file is None else file.relative_to(self.folder.folder).as_posix()
+        digest = None if path is None else self.registration.digest_of(path)
+        return {name: path, f"{name}_sha256": digest}
+
+    def frame_sources(self, unit: str) -> dict[str, JsonValue]:
+        """Return how the frames of a camera's or clip's video map to match time."""
+        frames = unit_frames(self.folder.spec, unit)
+        return {
+            "first_frame": frames.first,
+            "frame_count": frames.count,
+            "offset_frames": frames.offset,
+        }
+
     def without(self, cameras: Container[str]) -> Match:
         """Return the match without these static cameras; see `flows.left_out`."""
         spec = self.folder.spec
@@ -80,20 +103,12 @@ def once_a_match(table: Callable[[Match], T]) -> Callable[[Match], T]:
     return once
 
 
-def _no_external_inputs(settings: Record) -> dict[str, JsonValue]:
-    return {}
-
-
-def _no_results(match: Match, unit: str) -> tuple[str, ...]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the method; its task is the function of the same name in `tasks`.
+    """One stage of the method.
 
     Attributes:
-        name: the one name of this stage in flows/, tasks/, worldpose/ and data_contracts/.
+        name: the one name of this stage, and of its task.
         about: text of progress lines.
         settings: the record of its settings.
         units: names of the pieces that are computed, retried and stored separately.
@@ -107,6 +122,7 @@ class Stage:
         leaves_out: whether its results can leave static cameras out of all later stages.
         min_cameras: static cameras that it needs after some are left out.
         needs_static_cameras: whether it has no units in a match of broadcast cameras alone.
+        task_file: the stage in whose file of `tasks` its task is, if it has no file of its own.
     """
 
     name: str
@@ -115,11 +131,17 @@ class Stage:
     units: Callable[[Match], tuple[str, ...]]
     inputs: Callable[[Match, str], tuple[str, ...]]
     sources: Callable[[Match, str], dict[str, JsonValue]]
-    previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
-    late_inputs: Callable[[Match, str], tuple[str, ...]] = _no_results
+    previous_pass_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
+    late_inputs: Callable[[Match, str], tuple[str, ...]] = lambda match, unit: ()
     first_pass: Literal[1, 2] = 1
-    external_inputs: Callable[[Any], dict[str, JsonValue]] = _no_external_inputs
+    external_inputs: Callable[[Any], dict[str, JsonValue]] = lambda settings: {}
     worker_tag: str | None = None
     leaves_out: bool = False
     min_cameras: int = 0
     needs_static_cameras: bool = False
+    task_file: str | None = None
+
+    @property
+    def task_module(self) -> str:
+        """Module with its task; the key of a result depends on the code that this imports."""
+        return f"tasks.{self.task_file or self.name}"

@@ -16,7 +16,7 @@ from worldpose.store.store import Store
 
 
 @task(task_run_name="{name}", persist_result=False)
-def batch(name: str, work: list[str]) -> list[Exception | None]:
+def batch(name: str, module: str, work: list[str]) -> list[Exception | None]:
     """Compute and publish each unit like its own task; return the exception of each, or None.
 
     Two are computed at the same time. After its worker was killed, a retry resumes with the units
@@ -24,11 +24,11 @@ def batch(name: str, work: list[str]) -> list[Exception | None]:
 
     Args:
         name: name in the dashboard.
+        module: module with the task of the stage.
         work: units of one stage, as JSON: Prefect inspects parameters of any other type.
     """
     units = [Work.model_validate_json(each) for each in work]
-    stage = units[0].recipe.stage
-    compute = getattr(importlib.import_module(f"tasks.{stage}"), stage).fn
+    compute = getattr(importlib.import_module(module), units[0].recipe.stage).fn
     if any(was_interrupted(each) for each in units):
         return [_failure(compute, each) for each in units]
     return list(map_in_threads(lambda each: _failure(compute, each), units))
@@ -38,17 +38,14 @@ def _failure(compute: Callable[[Work], str], work: Work) -> Exception | None:
     recipe = work.recipe
     if Store.open(work.project).has(recipe.match_id, recipe.stage, recipe.unit, work.key):
         return None
-    for _ in range(RETRIES):
+    failures = 0
+    while True:
         try:
             compute(work)
         except Exception as failure:
-            if not may_pass(failure):
+            failures += 1
+            if failures > RETRIES or not may_pass(failure):
                 return failure
             time.sleep(RETRY_SECONDS)
         else:
             return None
-    try:
-        compute(work)
-    except Exception as failure:
-        return failure
-    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Floats, GroupLayout, Integers
 from data_contracts.body_fitting import BODY_FITTING
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.pitch import PitchSpec
-from data_contracts.work import Work
 from tasks.clip_inputs import ChunkedRows, ClipInputs, open_clip, read_rows
-from tasks.spool import open_spool
-from tasks.triangulation import camera_errors, load_triangulation_settings
-from tasks.unit import figures_of, open_input, unit_task
+from tasks.triangulation import camera_errors
+from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body.body_file import digest_of_body, find_body
 from worldpose.body.model import BodyModel
 from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_in_windows
@@ -30,49 +27,27 @@ from worldpose.body_fitting.objective import Ground
 from worldpose.body_fitting.ray_constraints import RayConstraints, find_ray_constraints
 from worldpose.body_fitting.settings import BodyFittingSettings
 from worldpose.errors import InputError
-from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
-from worldpose.store.store import Store
 from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.limb_lengths import undo_swaps
 from worldpose.triangulation.passes import ExtraJoints
+from worldpose.triangulation.settings import TriangulationSettings
 
 MEASURED_FRAMES: Final = 1000
 """Frames of a clip from which medians of metrics are computed."""
 
 
 @unit_task
-def body_fitting(work: Work) -> str:
-    """Publish bodies and their keypoints; return the key."""
-    store = Store.open(work.project)
-    with store.publish(work) as result:
-        people = open_people(store, work)
-        fit = publish_fit(store, result, BODY_FITTING, people, work)
-        result.figures.update(_compare_with_joints(store, work, people, fit))
-    return work.key
-
-
-def _compare_with_joints(
-    store: Store, work: Work, people: ClipPeople, fit: BodyFit
-) -> dict[str, float]:
-    """Return the metrics of fitted against triangulated joints in held-out cameras."""
-    recipe, unit = work.recipe, work.recipe.unit
-    placed = store.manifest(
-        recipe.match_id, "retriangulation", unit, recipe.inputs[f"retriangulation/{unit}"]
-    )
-    clip = people.clip
-    held_out = compare_held_out(
-        *_fitting_basis(people, work),
-        SeenClip(
-            clip.cameras,
-            camera_errors(work, clip),
-            people,
-            load_triangulation_settings(store, placed.recipe, unit),
-            clip.fps,
-        ),
-        fit,
-    )
-    return {} if held_out is None else held_out.figures()
+def body_fitting(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write bodies and their keypoints, and compare them with joints in held-out cameras."""
+    people = open_people(inputs)
+    fit = write_fit(inputs, result, BODY_FITTING, people, inputs)
+    clip, placed = people.clip, inputs.made_from(f"retriangulation/{inputs.unit}")
+    settings = placed.made_from(f"triangulation/{inputs.unit}").settings(TriangulationSettings)
+    seen = SeenClip(clip.cameras, camera_errors(inputs, clip), people, settings, clip.fps)
+    held_out = compare_held_out(*_fitting_basis(people, inputs), seen, fit)
+    if held_out is not None:
+        result.figures.update(held_out.figures())
 
 
 Views = Callable[[slice], tuple[RayConstraints, MonocularPoses | None]]
@@ -201,11 +176,11 @@ class _Frames:
         return self.people[self.frames.start + frames]
 
 
-def open_people(store: Store, work: Work, views: Views | None = None) -> ClipPeople:
-    """Open the tracked and triangulated people of the clip of `work`."""
-    placed = open_input(store, work, f"retriangulation/{work.recipe.unit}")
-    tracks = select_triangulated(open_input(store, work, f"tracking/{work.recipe.unit}"))
-    clip = open_clip(store, work).assign_people(tracks["detection_index"].values)
+def open_people(inputs: UnitInputs, views: Views | None = None) -> ClipPeople:
+    """Open the tracked and triangulated people of the unit's clip."""
+    placed = inputs.open(f"retriangulation/{inputs.unit}")
+    tracks = select_triangulated(inputs.open(f"tracking/{inputs.unit}"))
+    clip = open_clip(inputs).assign_people(tracks["detection_index"].values)
     return ClipPeople(clip, placed, views)
 
 
@@ -223,17 +198,12 @@ def extra_joints(placed: xr.Dataset) -> ExtraJoints | None:
 
 
 def _fitting_basis(
-    people: ClipPeople, work: Work
+    people: ClipPeople, inputs: UnitInputs
 ) -> tuple[BodyModel, BodyFittingSettings, Ground | None]:
     """Return the body model, the settings and the ground of a fit."""
-    sources: dict[str, Any] = work.recipe.sources
-    pitch = sources["pitch"]
-    ground = None
-    if pitch is not None:
-        template = PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
-        ground = people.clip.raise_pitch(template).height
-    settings = BodyFittingSettings.model_validate(work.recipe.settings)
-    return find_same_body(work), settings, ground
+    pitch = people.clip.raise_pitch(inputs.pitch)
+    ground = None if pitch is None else pitch.height
+    return find_same_body(inputs), inputs.settings(BodyFittingSettings), ground
 
 
 @dataclass
@@ -248,43 +218,43 @@ class FurtherArrays:
         known_shapes: shapes from other clips, by person index.
     """
 
-    of_part: Callable[[slice, BodyFit, ClipEvidence], Mapping[str, NDArray[Any]]]
-    arrays: Mapping[str, NDArray[Any]]
-    attributes: Mapping[str, Any]
-    known_shapes: Mapping[int, Shape]
+    of_part: Callable[[slice, BodyFit, ClipEvidence], Mapping[str, NDArray[Any]]] = (
+        lambda part, fit, evidence: {}
+    )
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    known_shapes: Mapping[int, Shape] = field(default_factory=dict)
 
 
-def publish_fit(
-    store: Store,
+def write_fit(
+    inputs: UnitInputs,
     result: ResultWriter,
     layout: GroupLayout,
     people: ClipPeople,
-    work: Work,
-    further: FurtherArrays | None = None,
+    fitting: UnitInputs,
+    further: FurtherArrays = FurtherArrays(),  # noqa: B008
 ) -> BodyFit:
     """Fit the bodies of a clip in windows, and write them with their metrics.
 
     Args:
-        store: the store.
+        inputs: the unit.
         result: writer of the result.
         layout: its layout.
         people: people of the clip.
-        work: work order with a recipe of `body_fitting`: its settings, body model and pitch.
+        fitting: the unit of `body_fitting`, with settings, body model and pitch.
         further: what a result has besides bodies.
 
     Returns:
         Shapes and offsets of the clip, without bodies of any frame.
     """
-    model, settings, ground = _fitting_basis(people, work)
-    known = {} if further is None else further.known_shapes
+    model, settings, ground = _fitting_basis(people, fitting)
     metrics = FitMetrics(people.fps, people.stride)
-    windows = fit_in_windows(model, people, settings, ground, known)
-    with open_spool(store) as spool:
+    windows = fit_in_windows(model, people, settings, ground, further.known_shapes)
+    with inputs.open_spool() as spool:
         for part, bodies in windows:
             spool.add(_part_arrays(bodies))
             evidence = people.read(part)
-            if further is not None:
-                spool.add(further.of_part(part, bodies, evidence))
+            spool.add(further.of_part(part, bodies, evidence))
             metrics.add(bodies, evidence.joints, (people.clip.cameras, _Frames(people, part)))
             fit = bodies[:0]
             del bodies, evidence  # while the next window is fitted
@@ -299,13 +269,9 @@ def publish_fit(
             points = {"point": list(fit.extra.points)}
         result.write(
             layout,
-            arrays=spool.arrays() | whole | dict({} if further is None else further.arrays),
+            arrays={**spool.arrays(), **whole, **further.arrays},
             coordinates={"frame": people.clip.detections.frame, "person": people.person},
-            attributes={
-                "body_model": model.name,
-                **points,
-                **({} if further is None else further.attributes),
-            },
+            attributes={"body_model": model.name, **points, **further.attributes},
         )
     far = far_offsets(fit.offsets, people.common_bias)
     if far:
@@ -339,15 +305,15 @@ def _part_arrays(fit: BodyFit) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def find_same_body(work: Work) -> BodyModel:
-    """Return the body model of a work order.
+def find_same_body(inputs: UnitInputs) -> BodyModel:
+    """Return the body model of a unit.
 
     Raises:
         InputError: this worker has another file of that name.
         UsageError: this worker has none.
     """
-    name, sha256 = str(work.recipe.settings["body_model"]), work.recipe.sources["body_model_sha256"]
-    folder = None if work.body_folder is None else Path(work.body_folder)
+    name, sha256 = str(inputs.recipe.settings["body_model"]), inputs.sources["body_model_sha256"]
+    folder = None if inputs.work.body_folder is None else Path(inputs.work.body_folder)
     if sha256 is not None and digest_of_body(name, folder) != sha256:
         raise InputError(
             f"body model {name}",

@@ -1,21 +1,29 @@
-"""Task of stage `broadcast_calibration`: the moving camera of one clip in every frame."""
+"""Tasks of stages `broadcast_calibration`, `broadcast_pooling` and `broadcast_tracking`.
+
+The moving camera of one clip in every frame, its position pooled over clips, and the people on the
+pitch by feet and shirts in a match without static cameras.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from data_contracts.broadcast_calibration import BROADCAST_CALIBRATION, KeyFrame
+from data_contracts.broadcast_pooling import BROADCAST_POOLING
+from data_contracts.broadcast_tracking import BROADCAST_TRACKING
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.pitch import PitchSpec
-from data_contracts.work import Work
+from data_contracts.tracking import Track
 from tasks.clip_inputs import ADJUSTED, select_frames
 from tasks.static_calibration import clicked_markings
-from tasks.unit import open_input, require_registered, unit_task
+from tasks.unit import UnitInputs, unit_task
 from worldpose.broadcast_calibration.calibration import (
     BroadcastClip,
     broadcast_arrays,
@@ -23,78 +31,94 @@ from worldpose.broadcast_calibration.calibration import (
     calibrate_broadcast,
 )
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES
 from worldpose.broadcast_calibration.players import People
 from worldpose.broadcast_calibration.report import BroadcastReport
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
+from worldpose.broadcast_calibration.uncertainty import (
+    Uncertainty,
+    drawn_to,
+    moving_arrays,
+    moving_from_arrays,
+    pool_centers,
+    static_covariance,
+)
 from worldpose.pitch.template import PitchTemplate
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
+from worldpose.tracking.plane.feet import GroundPositions, locate_feet
+from worldpose.tracking.plane.shirts import measure_shirts
+from worldpose.tracking.plane.tracker import GroundTracks, track_on_plane
 from worldpose.video.folder import open_video
 
+SIZE_METRICS: Final = {
+    "length": ("length_m", "length_std_m"),
+    "width": ("width_m", "width_std_m"),
+    "crown": ("crown_m", "crown_std_m"),
+    "end_fall": ("end_fall_m", "end_fall_std_m"),
+}
+"""Metrics of a size of the pitch, if it is estimated: its value and standard deviation [m]."""
 PROPOSED_FRAMES: Final = 8
 """Frames of a clip without clicks to propose key frames in, evenly spaced [1]."""
 
 
 @unit_task
-def broadcast_calibration(work: Work) -> str:
-    """Publish a camera per frame, and its uncertainty; return the key."""
-    store = Store.open(work.project)
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    start = first + sources["offset_frames"]
-    path = Path(work.folder) / sources["video"]
+def broadcast_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write a camera per frame, and its uncertainty."""
+    sources = inputs.sources
+    start, count = sources["first_frame"] + sources["offset_frames"], sources["frame_count"]
     ((file, clicked),) = sources["key_frames"].items()
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        with open_video(path) as video:
+        with open_video(inputs.file("video")) as video:
             yield from (picture for _, picture in video.frames(start, start + count, grey=True))
 
-    people, seen, boxes = _people(store, work)
-    pitch = _open_pitch(store, work)
+    people, seen, boxes = _people(inputs)
+    pitch = _open_pitch(inputs)
     key_frames = [
         KeyFrame(frame=int(frame), markings=clicked_markings(markings))
         for frame, markings in clicked.items()
         if start <= int(frame) < start + count
     ]
-    with store.publish(work) as result:
-        if "side" in sources:
-            key_frames = _propose(work, pitch, people, seen)
-        calibration = calibrate_broadcast(
-            pitch,
-            BroadcastClip(
-                key_frames,
-                pictures,
-                float(sources["fps"]),
-                people=people,
-                boxes=boxes,
-                where=file,
-                first=start,
-                proposed="side" in sources,
-            ),
-            BroadcastCalibrationSettings.model_validate(work.recipe.settings),
-        )
-        require_registered(path, sources["video_sha256"])
-        result.write(
-            BROADCAST_CALIBRATION,
-            arrays=broadcast_arrays(calibration),
-            coordinates={"frame": np.arange(first, first + count)},
-            attributes=broadcast_attributes(work.recipe.unit, calibration, start),
-        )
-        result.figures.update(_figures(calibration.report))
-    return work.key
+    if "side" in sources:
+        key_frames = _propose(inputs, pitch, people, seen)
+    calibration = calibrate_broadcast(
+        pitch,
+        BroadcastClip(
+            key_frames,
+            pictures,
+            float(sources["fps"]),
+            people=people,
+            boxes=boxes,
+            where=file,
+            first=start,
+            proposed="side" in sources,
+        ),
+        inputs.settings(BroadcastCalibrationSettings),
+    )
+    inputs.require_registered("video")
+    result.write(
+        BROADCAST_CALIBRATION,
+        arrays=broadcast_arrays(calibration),
+        coordinates={"frame": inputs.frames},
+        attributes=broadcast_attributes(inputs.unit, calibration, start),
+    )
+    result.figures.update(_figures(calibration.report))
 
 
 def _propose(
-    work: Work, pitch: PitchTemplate, people: People | None, seen: KeypointDetections | None
+    inputs: UnitInputs,
+    pitch: PitchTemplate,
+    people: People | None,
+    seen: KeypointDetections | None,
 ) -> list[KeyFrame]:
     """Return key frames that are proposed from images spread over the clip."""
-    sources: dict[str, Any] = work.recipe.sources
-    path, count = Path(work.folder) / sources["video"], sources["frame_count"]
+    sources, count = inputs.sources, inputs.sources["frame_count"]
     start = sources["first_frame"] + sources["offset_frames"]
     numbers = np.linspace(start, start + count - 1, min(count, PROPOSED_FRAMES)).astype(int)
 
     def spread_out() -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        with open_video(path) as video:
+        with open_video(inputs.file("video")) as video:
             for number in np.unique(numbers).tolist():
                 yield from video.frames(number, number + 1)
 
@@ -102,39 +126,41 @@ def _propose(
     if people is not None and seen is not None:
         feet = np.mean(people.joints[:, :, 15:17, :2], axis=2)
         known = KnownPeople(seen, feet, float(sources["fps"]), start)
-    return propose_key_frames(
-        spread_out(), pitch, side=sources["side"], where=str(path), people=known
-    )
+    where = str(inputs.file("video"))
+    return propose_key_frames(spread_out(), pitch, side=sources["side"], where=where, people=known)
 
 
-def _open_pitch(store: Store, work: Work) -> PitchTemplate:
+def _open_pitch(inputs: UnitInputs) -> PitchTemplate:
     """Return the pitch, on the surface that static cameras show, if any."""
-    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(work.recipe.sources["pitch"]))
-    if ADJUSTED not in work.recipe.inputs:
-        return pitch
-    surface = open_input(store, work, ADJUSTED).attrs["surface"]
+    pitch = inputs.pitch
+    assert pitch is not None  # else the clip is not calibrated
+    surface = inputs.open(ADJUSTED).attrs["surface"] if ADJUSTED in inputs else None
     return pitch if surface is None else pitch.with_surface(surface)
 
 
 def _people(
-    store: Store, work: Work
+    inputs: UnitInputs,
 ) -> tuple[People | None, KeypointDetections | None, NDArray[np.float64] | None]:
     """Return people fitted to static cameras at the time of each image, detections and boxes."""
-    sources: dict[str, Any] = work.recipe.sources
-    unit = work.recipe.unit
-    seen_names = [f"{stage}/{unit}" for stage in ("ingest", "detection")]
-    names = [name for name in seen_names if name in work.recipe.inputs]
-    if not names:
+    sources, unit = inputs.sources, inputs.unit
+    stored = _open_seen(inputs)
+    if stored is None:
         return None, None, None
-    first, count, fps = (sources[name] for name in ("first_frame", "frame_count", "fps"))
-    offset = float(sources["broadcast_offset_frames"])
-    stored = select_frames(open_input(store, work, names[0]), np.arange(first, first + count))
     seen = KeypointDetections.from_arrays(stored)
-    if f"body_fitting/{unit}" not in work.recipe.inputs:
+    if f"body_fitting/{unit}" not in inputs:
         return None, seen, seen.boxes.astype(np.float64)
-    joints = open_input(store, work, f"body_fitting/{unit}")["joints"].values
-    people = People(joints, seen.keypoints.astype(np.float64), float(fps))
+    joints = inputs.open(f"body_fitting/{unit}")["joints"].values
+    people = People(joints, seen.keypoints.astype(np.float64), float(sources["fps"]))
+    offset = float(sources["broadcast_offset_frames"])
     return people.later(round(offset) - offset), seen, None
+
+
+def _open_seen(inputs: UnitInputs) -> xr.Dataset | None:
+    """Return the broadcast camera's detections in the clip, given or computed, if any."""
+    for name in (f"ingest/{inputs.unit}", f"detection/{inputs.unit}"):
+        if name in inputs:
+            return select_frames(inputs.open(name), inputs.frames)
+    return None
 
 
 def _figures(report: BroadcastReport) -> dict[str, float]:
@@ -154,5 +180,150 @@ def _figures(report: BroadcastReport) -> dict[str, float]:
         figures["feed_offset_frames"] = offset.frames
     for name, value, std in zip(SIZES, report.pitch.size, report.pitch.size_std, strict=True):
         if std > 0.0:
-            figures |= {f"{name}_m": float(value), f"{name}_std_m": float(std)}
+            figures |= dict(zip(SIZE_METRICS[name], (float(value), float(std)), strict=True))
     return figures | {"weak": float(bool(report.reasons))}
+
+
+@unit_task
+def broadcast_pooling(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the clip's camera at the pooled position, unchanged if the clips disagree."""
+    clips: list[str] = inputs.sources["clips"]
+    results = {clip: inputs.open(f"broadcast_calibration/{clip}") for clip in clips}
+    places = [
+        (each["center"].values, each["clip_covariance"].values[:3, :3]) for each in results.values()
+    ]
+    everybody = pool_centers(*zip(*places, strict=True))
+    own = results[inputs.unit]
+    camera, uncertainty = moving_from_arrays(own.data_vars)
+    if everybody.agree:
+        camera, uncertainty = drawn_to(camera, uncertainty, everybody)
+    result.write(
+        BROADCAST_POOLING,
+        arrays=moving_arrays(camera, uncertainty),
+        coordinates={"frame": own["frame"].values},
+        attributes={
+            "clip_id": inputs.unit,
+            "clips": clips,
+            "distance": [float(distance) for distance in everybody.distance],
+            "agree": everybody.agree,
+        },
+    )
+    result.figures["agree"] = float(everybody.agree)
+
+
+@unit_task
+def broadcast_tracking(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the tracks of the clip's people and their places on the pitch."""
+    sources, filmed = inputs.sources, open_broadcast(inputs)
+    start = sources["first_frame"] + sources["offset_frames"]
+    with open_video(inputs.file("video")) as video:
+        images = (image for _, image in video.frames(start, start + sources["frame_count"]))
+        positions = _locate_people(filmed, images)
+    inputs.require_registered("video")
+    size = (filmed.pitch.length, filmed.pitch.width)
+    tracks = track_on_plane(positions, float(sources["fps"]), pitch_size=size)
+    index = tracks.detection_index[:, 0]
+    result.write(
+        BROADCAST_TRACKING,
+        arrays={
+            "detection_index": index,
+            "ground": tracks.xy.astype(np.float32),
+            "ground_velocity": tracks.velocity.astype(np.float32),
+            "ground_covariance": tracks.covariance.astype(np.float32),
+            "ground_height": tracks.height.astype(np.float32),
+        },
+        coordinates={
+            "frame": inputs.frames,
+            "person": np.arange(index.shape[1], dtype=np.int32),
+        },
+        attributes={
+            "clip_id": inputs.unit,
+            "tracks": [
+                _track(number, seen, sources["first_frame"]) for number, seen in enumerate(index.T)
+            ],
+        },
+    )
+    _report_tracks(inputs, result, tracks, int(np.isfinite(positions.xy[..., 0]).sum()))
+
+
+def _report_tracks(
+    inputs: UnitInputs, result: ResultWriter, tracks: GroundTracks, found: int
+) -> None:
+    """Write the metrics and warnings of tracks, made from this number of located detections."""
+    index, name = tracks.detection_index[:, 0], inputs.recipe.name
+    result.figures["people"] = float(index.shape[1])
+    if found:
+        result.figures["unmatched_share"] = 1.0 - np.count_nonzero(index >= 0) / found
+    if not index.shape[1]:
+        result.warnings.append(
+            f"{name} found no person on the pitch: {found} detections have feet there. Check the "
+            "camera in the report, and the detections."
+        )
+        return
+    variance = np.trace(tracks.covariance, axis1=-2, axis2=-1)
+    result.figures["plane_std_m"] = float(np.sqrt(np.nanmedian(variance)))
+    if not inputs.sources["has_estimates"]:
+        result.warnings.append(
+            f"{name}: people have places on the pitch and no bodies. To get bodies from one "
+            f"camera, save a monocular method's poses as estimates/{inputs.unit}.npz in the match "
+            "folder, and run again."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BroadcastInputs:
+    """The broadcast camera of a clip, and what it sees.
+
+    Attributes:
+        detections: stored detections of the clip's frames.
+        camera: the moving camera, at the pooled position if there is one, and its covariance.
+        pitch: surface under the feet, as the calibration found it.
+    """
+
+    detections: KeypointDetections
+    camera: tuple[MovingCamera, Uncertainty]
+    pitch: PitchTemplate
+
+
+def open_broadcast(inputs: UnitInputs) -> BroadcastInputs:
+    """Read the broadcast camera and its detections in the unit's clip."""
+    name = f"broadcast_calibration/{inputs.unit}"
+    calibrated = inputs.open(name)
+    moving = inputs.open_first(f"broadcast_pooling/{inputs.unit}", name)
+    # The surface that the calibration found: people stand on it as the markings lie on it.
+    surface = {name: (calibrated.attrs["pitch"] or {}).get(name) for name in SIZES}
+    known = {name: value for name, value in surface.items() if value is not None}
+    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(inputs.sources["pitch"] | known))
+    detections = _open_seen(inputs)
+    assert detections is not None  # else the clip has no unit
+    seen = KeypointDetections.from_arrays(detections)
+    return BroadcastInputs(seen, moving_from_arrays(moving.data_vars), pitch)
+
+
+def _locate_people(filmed: BroadcastInputs, images: Iterator[Image]) -> GroundPositions:
+    """Return places and shirts of a moving camera's detections, as those of one camera."""
+    (moving, uncertainty), seen = filmed.camera, filmed.detections
+    covariance, cameras = static_covariance(moving, uncertainty), moving.camera
+    parts = []
+    for frame, image in zip(range(len(moving)), images, strict=True):
+        now = slice(frame, frame + 1)
+        people = KeypointDetections.stack([seen[now]])
+        found = locate_feet(cameras[now], people, filmed.pitch, camera_covariance=covariance[now])
+        shirts = measure_shirts(
+            image, seen.keypoints[frame], seen.confidence[frame], seen.boxes[frame]
+        )
+        # Parts start tracks, too: in a duel one player is often a part of the other's box.
+        parts.append(replace(found, is_whole=None, boxes=None, shirts=shirts[None, None]))
+    return GroundPositions.concatenate(parts)
+
+
+def _track(person: int, index: NDArray[np.int16], first: int) -> dict[str, Any]:
+    seen = np.flatnonzero(index >= 0)
+    return Track(
+        person=person,
+        first_frame=first + int(seen[0]),
+        last_frame=first + int(seen[-1]),
+        frames_seen=len(seen),
+        views=1.0,
+        kind="plane",
+    ).model_dump(mode="json")

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from data_contracts.bundle_adjustment import BUNDLE_ADJUSTMENT
-from data_contracts.pitch import PitchSpec
-from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_frames, open_venue, select_frames
-from tasks.triangulation import load_triangulation_settings
-from tasks.unit import open_input, unit_task
+from tasks.unit import UnitInputs, unit_task
 from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks, Clip
 from worldpose.bundle_adjustment.report import adjustment_arrays
@@ -22,24 +18,22 @@ from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.errors import UsageError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import select_triangulated
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
+from worldpose.triangulation.settings import TriangulationSettings
 
 
 @unit_task
-def bundle_adjustment(work: Work) -> str:
-    """Publish the adjusted cameras and their outliers; return the key."""
-    store = Store.open(work.project)
-    settings = BundleAdjustmentSettings.model_validate(work.recipe.settings)
-    with store.publish(work) as result:
-        people = _open_people(store, work, settings)
-        clip = open_frames(store, work, people.clip_frames)
-        adjusted = adjust_cameras(_open_clip(store, work, people, clip), settings)
-        arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
-        attributes |= {"camera": work.recipe.sources["cameras"]}
-        attributes["surface"] = None if clip.surface is None else clip.surface.tolist()
-        result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
-        result.figures.update(_figures(adjusted, attributes["camera"]))
-    return work.key
+def bundle_adjustment(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the adjusted cameras and their outliers."""
+    settings = inputs.settings(BundleAdjustmentSettings)
+    people = _open_people(inputs, settings)
+    clip = open_frames(inputs, people.clip_frames)
+    adjusted = adjust_cameras(_open_clip(inputs, people, clip), settings)
+    arrays, attributes = adjustment_arrays(adjusted, settings, people.person)
+    attributes |= {"camera": inputs.sources["cameras"]}
+    attributes["surface"] = None if clip.surface is None else clip.surface.tolist()
+    result.write(BUNDLE_ADJUSTMENT, arrays=arrays, attributes=attributes)
+    result.figures.update(_figures(adjusted, attributes["camera"]))
 
 
 @dataclass(frozen=True)
@@ -64,18 +58,18 @@ class _People:
     views: NDArray[np.int64]
 
 
-def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -> _People:
+def _open_people(inputs: UnitInputs, settings: BundleAdjustmentSettings) -> _People:
     """Read tracks and joints in the frames that the first triangulation computed.
 
     Raises:
         UsageError: a chosen frame of a clip is not one of them.
     """
-    sources: dict[str, Any] = work.recipe.sources
+    sources = inputs.sources
     clips = sorted(sources["clips"], key=lambda clip: sources["clips"][clip][0])
-    placed = {clip: open_input(store, work, f"triangulation/{clip}") for clip in clips}
+    placed = {clip: inputs.open(f"triangulation/{clip}") for clip in clips}
     frames = {clip: placed[clip]["frame"].values for clip in clips}
     total = sum(count for _, count in sources["clips"].values())
-    stride = load_triangulation_settings(store, work.recipe, clips[0]).stride(total)
+    stride = _triangulation_settings(inputs).stride(total)
     for clip in clips:
         start, count = sources["clips"][clip]
         inside = [frame for frame in settings.chosen_frames if 0 <= frame - start < count]
@@ -89,7 +83,7 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
                 todo=f"Choose from these, or set triangulation.max_frames={total}.",
             )
     tracked = [
-        select_triangulated(select_frames(open_input(store, work, f"tracking/{clip}"), frame))
+        select_triangulated(select_frames(inputs.open(f"tracking/{clip}"), frame))
         for clip, frame in frames.items()
     ]
     person = np.unique(np.concatenate([tracks["person"].values for tracks in tracked]))
@@ -115,27 +109,27 @@ def _open_people(store: Store, work: Work, settings: BundleAdjustmentSettings) -
     return people
 
 
-def _open_clip(store: Store, work: Work, people: _People, opened: ClipInputs) -> Clip:
+def _triangulation_settings(inputs: UnitInputs) -> TriangulationSettings:
+    """Return the settings of the first triangulation, which all clips share."""
+    clip = next(iter(inputs.sources["clips"]))
+    return inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings)
+
+
+def _open_clip(inputs: UnitInputs, people: _People, opened: ClipInputs) -> Clip:
     """Return the calibrated cameras, their clicks, and their detections of `people`."""
-    sources: dict[str, Any] = work.recipe.sources
-    pitch = sources["pitch"]
-    template = None
-    if pitch is not None:
-        template = opened.raise_pitch(PitchTemplate.from_spec(PitchSpec.model_validate(pitch)))
-    covariance = open_venue(work, opened.camera_ids).covariance
-    known = [
-        open_input(store, work, f"static_calibration/{camera}") for camera in opened.camera_ids
-    ]
+    pitch = opened.raise_pitch(inputs.pitch)
+    covariance = open_venue(inputs, opened.camera_ids).covariance
+    known = [inputs.open(f"static_calibration/{camera}") for camera in opened.camera_ids]
     return Clip(
         cameras=opened.cameras,
         covariance=np.where(np.isfinite(covariance), covariance, 0.0),  # 0 = a given camera
-        clicks=tuple(_clicks(camera, template) for camera in known),
+        clicks=tuple(_clicks(camera, pitch) for camera in known),
         fps=people.fps,
         detections=opened.detections[:].assign_people(people.detection_index),
         joints=people.joints,
         views=people.views,
-        triangulation=load_triangulation_settings(store, work.recipe, next(iter(sources["clips"]))),
-        pitch=template,
+        triangulation=_triangulation_settings(inputs),
+        pitch=pitch,
         on_lines=np.array([camera.attrs["origin"] == "lines" for camera in known]),
         names=tuple(opened.camera_ids),
     )

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import ClipArray, Integers
 from data_contracts.keypoints import EXTRA_ARRAYS, KeypointDetections
 from data_contracts.redetection import redetection_name
-from data_contracts.work import Work
-from tasks.unit import open_input
+from tasks.unit import UnitInputs
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.venue import Venue, join_cameras
@@ -198,9 +197,9 @@ class ClipInputs:
     fps: float
     surface: NDArray[np.float64] | None = None
 
-    def raise_pitch(self, pitch: PitchTemplate) -> PitchTemplate:
-        """Return a pitch with the surface that the cameras show."""
-        return pitch if self.surface is None else pitch.with_surface(self.surface)
+    def raise_pitch(self, pitch: PitchTemplate | None) -> PitchTemplate | None:
+        """Return a pitch, if there is one, with the surface that the cameras show."""
+        return pitch if pitch is None or self.surface is None else pitch.with_surface(self.surface)
 
     def assign_people(self, detection_index: NDArray[np.integer]) -> ClipInputs:
         """Return the clip with tracked people (frames, cameras, persons)."""
@@ -218,31 +217,32 @@ ADJUSTED = "bundle_adjustment/cameras"
 
 
 def open_clip(
-    store: Store,
-    work: Work,
+    inputs: UnitInputs,
     *,
     filtered: bool = True,
     shifted: bool = True,
     redetected: bool = True,
 ) -> ClipInputs:
-    """Open the clip of `work`; its detections are read on access.
+    """Open the unit's clip; its detections are read on access.
 
     Args:
-        store: the store.
-        work: the current work order.
+        inputs: the unit.
         filtered: leave out keypoints that the previous iteration rejected.
         shifted: subtract the systematic errors of keypoints.
         redetected: include redetected people.
     """
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    where = slice(first, first + count - 1)
-    seen = _open_cameras(store, work, where)
-    filtered_before = _load_filtering_results(store, work, {work.recipe.unit: where})
-    rejected = filtered_before["rejected"] if filtered else None
-    shift = filtered_before["shift"] if shifted else None
-    frame = np.arange(first, first + count)
-    return _make_inputs(store, work, frame, seen, rejected, shift, redetected=redetected)
+    frame = inputs.frames
+    where = slice(int(frame[0]), int(frame[-1]))
+    seen = _open_cameras(inputs, where)
+    rejected, shift = _load_filtering_results(inputs, {inputs.unit: where})
+    return _make_inputs(
+        inputs,
+        frame,
+        seen,
+        rejected if filtered else None,
+        shift if shifted else None,
+        redetected=redetected,
+    )
 
 
 def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
@@ -258,50 +258,43 @@ def select_frames(stored: xr.Dataset, frame: NDArray[np.int64]) -> xr.Dataset:
     return stored.isel(frame=slice(int(places[0]), int(places[-1]) + 1, step))
 
 
-def load_dropped_boxes(store: Store, work: Work) -> NDArray[np.bool_] | None:
+def load_dropped_boxes(inputs: UnitInputs) -> NDArray[np.bool_] | None:
     """Return boxes dropped by the previous iteration (frames, cameras, detections), if any."""
-    before = f"filtering/{work.recipe.unit}"
-    if before not in work.recipe.inputs:
+    before = f"filtering/{inputs.unit}"
+    if before not in inputs:
         return None
-    dropped = open_input(store, work, before)["dropped"]
-    seen = _open_cameras(
-        store, work, slice(dropped["frame"].values[0], dropped["frame"].values[-1])
-    )
+    dropped = inputs.open(before)["dropped"]
+    frame = dropped["frame"].values
+    seen = _open_cameras(inputs, slice(frame[0], frame[-1]))
     detections = max(1, *(clip.sizes["detection"] for clip in seen))
     return _align_results(seen, dropped.values, (*dropped.shape[:2], detections), slice(None))
 
 
-def open_frames(store: Store, work: Work, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
+def open_frames(inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64]]) -> ClipInputs:
     """Open selected match frames of each clip, with every camera's detections in memory."""
-    sources: dict[str, Any] = work.recipe.sources
-    names = sources["seen"]
+    names = inputs.sources["seen"]
     seen = [
         _concatenate_clips(
             [
-                select_frames(_open_detections(store, work, names[clip][c]), frames[clip])
+                select_frames(_open_detections(inputs, names[clip][c]), frames[clip])
                 for clip in frames
             ]
         )
-        for c in range(len(sources["cameras"]))
+        for c in range(len(inputs.sources["cameras"]))
     ]
     frame = np.concatenate(list(frames.values()))
-    filtered_before = _load_filtering_results(store, work, frames)
-    some = _make_inputs(
-        store, work, frame, seen, filtered_before["rejected"], filtered_before["shift"]
-    )
+    some = _make_inputs(inputs, frame, seen, *_load_filtering_results(inputs, frames))
     return replace(some, detections=some.detections[: len(frame)])
 
 
-def _open_cameras(store: Store, work: Work, where: slice) -> list[xr.Dataset]:
-    """Return each camera's detections in the clip of `work`."""
-    sources: dict[str, Any] = work.recipe.sources
-    return [_open_detections(store, work, name).sel(frame=where) for name in sources["seen"]]
+def _open_cameras(inputs: UnitInputs, where: slice) -> list[xr.Dataset]:
+    """Return each camera's detections in the unit's clip."""
+    return [_open_detections(inputs, name).sel(frame=where) for name in inputs.sources["seen"]]
 
 
-def _open_detections(store: Store, work: Work, name: str) -> xr.Dataset:
-    """Return a camera's detections, with redetected people if `work` has them as input."""
-    redetected = redetection_name(name)
-    return open_input(store, work, redetected if redetected in work.recipe.inputs else name)
+def _open_detections(inputs: UnitInputs, name: str) -> xr.Dataset:
+    """Return a camera's detections, with redetected people if they are an input."""
+    return inputs.open_first(redetection_name(name) or name, name)
 
 
 def _concatenate_clips(clips: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -316,16 +309,16 @@ def _concatenate_clips(clips: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def _load_filtering_results(
-    store: Store, work: Work, frames: Mapping[str, NDArray[np.int64] | slice]
-) -> dict[str, xr.DataArray | None]:
-    """Return the previous filtering results of keypoints by frame; None in the first iteration."""
+    inputs: UnitInputs, frames: Mapping[str, NDArray[np.int64] | slice]
+) -> tuple[xr.DataArray | None, xr.DataArray | None]:
+    """Return rejections and shifts by the previous iteration by frame; None in the first one."""
     clips = [
-        open_input(store, work, name)[["rejected", "shift"]].sel(frame=where)
+        inputs.open(name)[["rejected", "shift"]].sel(frame=where)
         for clip, where in frames.items()
-        if (name := f"filtering/{clip}") in work.recipe.inputs
+        if (name := f"filtering/{clip}") in inputs
     ]
     if not clips:
-        return {"rejected": None, "shift": None}
+        return None, None
     merged = clips[0]
     if len(clips) > 1:
         most = max(clip.sizes["detection"] for clip in clips)
@@ -335,12 +328,11 @@ def _load_filtering_results(
             for clip in clips
         ]
         merged = xr.concat(padded, dim="frame")
-    return {"rejected": merged["rejected"], "shift": merged["shift"]}
+    return merged["rejected"], merged["shift"]
 
 
 def _make_inputs(
-    store: Store,
-    work: Work,
+    inputs: UnitInputs,
     frame: NDArray[np.int64],
     seen: Sequence[xr.Dataset],
     rejected: xr.DataArray | None,
@@ -350,11 +342,10 @@ def _make_inputs(
 ) -> ClipInputs:
     """Open match frames with each camera's detections.
 
-    The cameras are the adjusted ones if `work` has them as input.
+    The cameras are the adjusted ones if these are an input.
     """
-    sources: dict[str, Any] = work.recipe.sources
-    camera_ids = tuple(sources["cameras"])
-    cameras, covariance, surface = _load_cameras(store, work, camera_ids)
+    camera_ids = tuple(inputs.sources["cameras"])
+    cameras, covariance, surface = _load_cameras(inputs, camera_ids)
     seen, points = _align_points(seen)
     extra = [
         StoredArray(seen, array.name, redetected=redetected) if points else None
@@ -375,7 +366,7 @@ def _make_inputs(
             extra_confidence=extra[1],
         ),
         surface=surface,
-        fps=float(sources["fps"]),
+        fps=float(inputs.sources["fps"]),
     )
 
 
@@ -406,11 +397,11 @@ def _align_points(seen: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], tuple[s
     return aligned, points
 
 
-def open_venue(work: Work, camera_ids: Sequence[str]) -> Venue:
+def open_venue(inputs: UnitInputs, camera_ids: Sequence[str]) -> Venue:
     """Return calibrated or given static cameras on the pitch that they show together."""
-    recipe = work.recipe
+    recipe = inputs.recipe
     keys = tuple((camera, recipe.inputs[f"static_calibration/{camera}"]) for camera in camera_ids)
-    return _join_calibrated(work.project, recipe.match_id, keys)
+    return _join_calibrated(inputs.work.project, recipe.match_id, keys)
 
 
 @lru_cache(VENUES)
@@ -422,11 +413,11 @@ def _join_calibrated(project: str, match_id: str, keys: tuple[tuple[str, str], .
 
 
 def _load_cameras(
-    store: Store, work: Work, camera_ids: tuple[str, ...]
+    inputs: UnitInputs, camera_ids: tuple[str, ...]
 ) -> tuple[Camera, NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Return the cameras in order, their covariances if known for all, and the pitch's surface."""
-    if ADJUSTED in work.recipe.inputs:
-        adjusted = open_input(store, work, ADJUSTED)
+    if ADJUSTED in inputs:
+        adjusted = inputs.open(ADJUSTED)
         stated = adjusted["camera_covariance"].values
         known = bool(stated.any(axis=(1, 2)).all())  # an unchanged given camera has none
         surface = adjusted.attrs["surface"]
@@ -435,7 +426,7 @@ def _load_cameras(
             stated if known else None,
             None if surface is None else np.array(surface),
         )
-    venue = open_venue(work, camera_ids)
+    venue = open_venue(inputs, camera_ids)
     known = bool(np.isfinite(venue.covariance).all())  # a given camera has no covariance
     shape = None if venue.surface is None else venue.surface.shape
     return venue.cameras, venue.covariance if known else None, shape

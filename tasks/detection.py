@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -15,10 +14,7 @@ from pydantic import TypeAdapter
 from data_contracts.arrays import Image
 from data_contracts.detection import DETECTION
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.pitch import PitchSpec
-from data_contracts.work import Work
-from tasks.spool import Spool, open_spool
-from tasks.unit import open_input, open_uncorrected, require_registered, unit_task
+from tasks.unit import Spool, UnitInputs, unit_task
 from worldpose.detection.interfaces import People
 from worldpose.detection.models import (
     load_detectors,
@@ -32,25 +28,23 @@ from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
 from worldpose.formats.detection_files import read_boxes
 from worldpose.ingest.footage import stretches
-from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.static_calibration.venue import join_cameras
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 from worldpose.video.folder import open_video
 from worldpose.video.pictures import FrameIndex
 
 
 @unit_task
-def detection(work: Work) -> str:
-    """Publish boxes and keypoints; return the key."""
-    store = Store.open(work.project)
-    edits = TypeAdapter(list[DetectionEdit]).validate_python(work.recipe.sources.get("edits") or [])
-    with store.publish(work) as result, open_spool(store) as spool:
-        found = _open_uncorrected(store, work) if edits else None
-        found = found or _detect_people(store, work, spool)
+def detection(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write boxes and keypoints, with people's corrections."""
+    edits = TypeAdapter(list[DetectionEdit]).validate_python(inputs.sources.get("edits") or [])
+    with inputs.open_spool() as spool:
+        found = _open_uncorrected(inputs) if edits else None
+        found = found or _detect_people(inputs, spool)
         result.figures |= found.figures
         warnings = [*found.warnings, *_warn_of_gaps(found)]
-        result.warnings += [f"{work.recipe.name}: {each}." for each in warnings]
+        result.warnings += [f"{inputs.recipe.name}: {each}." for each in warnings]
         detections = found.detections
         if edits:
             replay = replay_detections(detections, edits)
@@ -61,12 +55,11 @@ def detection(work: Work) -> str:
             arrays=detections.arrays(),
             coordinates={"frame": detections.frame},
             attributes={
-                "camera_id": work.recipe.sources["camera"],
+                "camera_id": inputs.sources["camera"],
                 "unreadable": found.unreadable,
                 **detections.labels(),
             },
         )
-    return work.key
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +96,9 @@ def _warn_of_gaps(found: _Found) -> list[str]:
     ]
 
 
-def _open_uncorrected(store: Store, work: Work) -> _Found | None:
+def _open_uncorrected(inputs: UnitInputs) -> _Found | None:
     """Return the published detections without corrections; None if there are none."""
-    published = open_uncorrected(store, work, "edits")
+    published = inputs.open_uncorrected("edits")
     if published is None:
         return None
     stored, manifest = published
@@ -113,11 +106,10 @@ def _open_uncorrected(store: Store, work: Work) -> _Found | None:
     return _Found(detections, stored.attrs["unreadable"], dict(manifest.figures), ())
 
 
-def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
+def _detect_people(inputs: UnitInputs, spool: Spool) -> _Found:
     """Run the detection nets."""
-    sources: dict[str, Any] = work.recipe.sources
-    settings = DetectionSettings.model_validate(work.recipe.settings)
-    given = _given_people(store, work) if "boxes" in sources else None
+    settings = inputs.settings(DetectionSettings)
+    given = _given_people(inputs) if "boxes" in inputs.sources else None
     finder = PeopleFinder(
         load_detectors(settings) if given is None else (),
         load_pose(settings),
@@ -125,16 +117,16 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
         load_score_map(settings) if given is None else None,
         landmarks := load_landmarks(settings),
     )
-    require_weights(settings, sources["weights"])
+    require_weights(settings, inputs.sources["weights"])
     most = 0
-    for chunk in finder.find(_read_frames(store, work), _open_place(store, work), given):
+    for chunk in finder.find(_read_frames(inputs), _open_place(inputs), given):
         spool.add(chunk.arrays())
         most = max(most, int(np.isfinite(chunk.score).sum(axis=1).max()))
-    require_registered(Path(work.folder) / sources["video"], sources["video_sha256"])
+    inputs.require_registered("video")
     report = finder.report
     if len(report.unreadable) == report.frames:
         raise InputError(
-            str(Path(work.folder) / sources["video"]),
+            str(inputs.file("video")),
             expected="images that can be decoded",
             found=f"none in {report.frames} frames",
             todo="Convert the video with any video tool, and give that one.",
@@ -142,9 +134,7 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     return _Found(
         KeypointDetections.from_arrays(
             {
-                "frame": np.arange(
-                    sources["first_frame"], sources["first_frame"] + sources["frame_count"]
-                ),
+                "frame": inputs.frames,
                 **{name: values[:, :most] for name, values in spool.arrays().items()},
                 **({} if landmarks is None else {"point": landmarks.points}),
             }
@@ -165,48 +155,41 @@ def _detect_people(store: Store, work: Work, spool: Spool) -> _Found:
     )
 
 
-def _given_people(store: Store, work: Work) -> dict[int, People]:
+def _given_people(inputs: UnitInputs) -> dict[int, People]:
     """Return the given boxes of the clip's video by match frame.
 
     Raises:
         InputError: the file is invalid, or not the registered one.
     """
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    footage = open_input(store, work, f"ingest/{sources['camera']}")
+    footage = inputs.open(f"ingest/{inputs.sources['camera']}")
     index = footage_index(footage)
-    path = Path(work.folder) / sources["boxes"]
-    given = read_boxes(path, index.size, len(index))
-    require_registered(path, sources["boxes_sha256"])
-    shown = footage["picture_of_frame"].sel(frame=slice(first, first + count - 1))
-    pictures = shown.values
+    given = read_boxes(inputs.file("boxes"), index.size, len(index))
+    inputs.require_registered("boxes")
+    frames = inputs.frames
+    pictures = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
     begins = np.searchsorted(given.frame, pictures, side="left")
     ends = np.searchsorted(given.frame, pictures, side="right")
     return {
-        int(frame): People(given.box[begin:end], given.score[begin:end])
-        for frame, begin, end in zip(shown["frame"].values, begins, ends, strict=True)
+        frame: People(given.box[begin:end], given.score[begin:end])
+        for frame, begin, end in zip(frames.tolist(), begins, ends, strict=True)
         if end > begin
     }
 
 
-def _read_frames(store: Store, work: Work) -> Iterator[tuple[int, Image | None]]:
+def _read_frames(inputs: UnitInputs) -> Iterator[tuple[int, Image | None]]:
     """Yield every match frame of the clip with its image, decoded once and in order."""
-    sources: dict[str, Any] = work.recipe.sources
-    first, count = sources["first_frame"], sources["frame_count"]
-    footage = open_input(store, work, f"ingest/{sources['camera']}")
-    numbers = footage["picture_of_frame"].sel(frame=slice(first, first + count - 1)).values
+    footage, frames = inputs.open(f"ingest/{inputs.sources['camera']}"), inputs.frames
+    numbers = footage["picture_of_frame"].sel(frame=slice(frames[0], frames[-1])).values
     there = numbers[numbers >= 0]
-    frame = first
-    with open_video(Path(work.folder) / sources["video"], footage_index(footage)) as video:
+    with open_video(inputs.file("video"), footage_index(footage)) as video:
         shown = video.readable(int(there[0]), int(there[-1]) + 1) if len(there) else iter(())
-        for number in numbers:
+        for frame, number in zip(frames.tolist(), numbers, strict=True):
             picture = None
             while number >= 0:  # skip images that no match frame uses
                 at, picture = next(shown)
                 if at == number:
                     break
             yield frame, picture
-            frame += 1
 
 
 def footage_index(footage: xr.Dataset) -> FrameIndex:
@@ -224,13 +207,12 @@ def footage_index(footage: xr.Dataset) -> FrameIndex:
     )
 
 
-def _open_place(store: Store, work: Work) -> Place | None:
+def _open_place(inputs: UnitInputs) -> Place | None:
     """Return the camera on the pitch, if it is known and there is a pitch."""
-    sources: dict[str, Any] = work.recipe.sources
-    if sources["pitch"] is None:
+    pitch = inputs.pitch
+    if pitch is None:
         return None
-    known = open_input(store, work, f"static_calibration/{sources['camera']}")
-    pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
+    known = inputs.open(f"static_calibration/{inputs.sources['camera']}")
     venue = join_cameras([known.data_vars])
     if venue.surface is not None:
         pitch = pitch.with_surface(venue.surface.shape)

@@ -1,40 +1,75 @@
-"""Task of stage `filtering`: comparison of one clip's detections with its bodies."""
+"""Tasks of stages `filtering` and `redetection`: one clip's detections compared with its bodies.
+
+`redetection` searches for missed people in one clip of one video.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Image
+from data_contracts.conventions import COCO17
 from data_contracts.filtering import FILTERING
-from data_contracts.work import Work
-from tasks.clip_inputs import ChunkedRows, ClipInputs, load_dropped_boxes, open_clip, read_rows
-from tasks.spool import open_spool
-from tasks.triangulation import load_triangulation_settings
-from tasks.unit import open_input, unit_task
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.redetection import REDETECTION
+from tasks.clip_inputs import (
+    ADJUSTED,
+    ChunkedRows,
+    ClipInputs,
+    load_dropped_boxes,
+    open_clip,
+    read_rows,
+)
+from tasks.detection import footage_index, require_weights
+from tasks.unit import UnitInputs, unit_task
 from worldpose.body_fitting.objective import perceived_joints
 from worldpose.compiled import map_in_threads
+from worldpose.detection.models import load_pose, load_score_map
+from worldpose.detection.pipeline import Place
+from worldpose.detection.settings import DetectionSettings, RedetectionSettings
 from worldpose.filtering.held_out import measure_held_out
 from worldpose.filtering.judging import (
     BodyViews,
     Judgement,
+    Spread,
     TriangulatedDetections,
     judge_detections,
     learn_keypoint_spread,
     perceived_covariance,
     view_bodies,
 )
+from worldpose.filtering.redetection import (
+    Expected,
+    MissingPeople,
+    Verdicts,
+    find_detected_people,
+    judge_search_results,
+    search_missing_people,
+    select_missing_people,
+)
 from worldpose.filtering.settings import FilteringSettings
-from worldpose.filtering.systematic_errors import BodyMotion, learn_systematic_errors, watch_motion
+from worldpose.filtering.systematic_errors import (
+    BodyMotion,
+    SystematicErrors,
+    ViewBias,
+    learn_systematic_errors,
+    watch_motion,
+)
+from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.review.identities import select_triangulated
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.video.folder import open_video, some_pictures
 
+FEW: Final = 500
+"""Minimum number of keypoints to estimate a camera's spread; below it the stated one is used
+[1]."""
 PART = 64
 """Frames per part: 100 MB with 25 people and 16 cameras, for each of up to five at a time."""
 PLACED = ("offsets", "exchanged")
@@ -44,71 +79,53 @@ _Part = tuple[slice, TriangulatedDetections]
 
 
 @unit_task
-def filtering(work: Work) -> str:
-    """Publish the keypoints and boxes that the bodies reject; return the key."""
-    store = Store.open(work.project)
-    settings = FilteringSettings.model_validate(work.recipe.settings)
-    with store.publish(work) as result, open_spool(store) as spool:
-        case = _open(store, work)
-        chosen = _evenly(len(case.clip.detections.frame), settings.max_held_out_frames)
-        views, motion, suspects = case.at(chosen)
-        systematic = learn_systematic_errors(
-            case.clip.cameras,
-            case.bodies.read(chosen)[0],
-            views,
-            motion,
-            suspects,
-            settings,
-            case.clip.fps * len(chosen) / len(case.clip.detections.frame),
-        )
-        held = np.zeros(len(case.clip.camera_ids))
-        if case.first:
-            held = systematic.clock_offsets_in(suspects.offsets, motion)
+def filtering(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the keypoints and boxes that the bodies reject."""
+    settings, case = inputs.settings(FilteringSettings), _open_case(inputs)
+    frame, camera_ids = case.clip.detections.frame, case.clip.camera_ids
+    most = min(len(frame), settings.max_held_out_frames)
+    chosen = np.unique(np.linspace(0, len(frame) - 1, most).astype(np.int64))
+    views, motion, suspects = case.at(chosen)
+    fps = case.clip.fps * len(chosen) / len(frame)
+    joints, _, _ = case.bodies.read(chosen)
+    systematic = learn_systematic_errors(
+        case.clip.cameras, joints, views, motion, suspects, settings, fps
+    )
+    held = np.zeros(len(camera_ids))
+    if case.first:
+        held = systematic.clock_offsets_in(suspects.offsets, motion)
+    placed = suspects.subtract_clock_offsets(held, motion.image_motion)
+    spread = learn_keypoint_spread(views, placed.subtract(systematic.shift(motion, views)))
+    counts, rejected = np.zeros(5), np.zeros((2, len(camera_ids)))
+
+    def judge(part: _Part) -> tuple[dict[str, NDArray[Any]], list[float], list[Floats]]:
+        frames, suspects = part
+        views, motion = case.project(frames)
+        shift = systematic.shift(motion, views)
         placed = suspects.subtract_clock_offsets(held, motion.image_motion)
-        spread = learn_keypoint_spread(views, placed.subtract(systematic.shift(motion, views)))
-        counts = np.zeros(5)
-        rejected = np.zeros((2, len(case.clip.camera_ids)))
+        judged = judge_detections(views, placed.subtract(shift), spread, settings)
+        return _part_arrays(judged, suspects, shift), *_counts(judged, suspects)
 
-        def judge(part: _Part) -> tuple[dict[str, NDArray[Any]], list[float], list[Floats]]:
-            frames, suspects = part
-            views, motion = case.project(frames)
-            shift = systematic.shift(motion, views)
-            placed = suspects.subtract_clock_offsets(held, motion.image_motion)
-            judged = judge_detections(views, placed.subtract(shift), spread, settings)
-            arrays = {
-                "rejected": judged.rejected,
-                "surprise": judged.mahalanobis_distance,
-                "dropped": judged.dropped,
-                "fits": judged.fits,
-                "similarity": judged.similarity,
-                "shift": suspects.assign_to_detections(shift).astype(np.float32),
-            }
-            by_camera = [
-                judged.rejected.sum(axis=(0, 2, 3)),
-                np.isfinite(suspects.detections.confidence).sum(axis=(0, 2, 3)),
-            ]
-            return arrays, _counts(judged, suspects), by_camera
-
+    with inputs.open_spool() as spool:
         # Read here: two threads would both read the page in which their parts meet.
         for arrays, some, by_camera in map_in_threads(judge, case.parts()):
             spool.add(arrays)
             counts += some
             rejected += by_camera
+        bias = systematic.view_bias.coefficient
         result.write(
             FILTERING,
-            arrays=spool.arrays()
-            | {"view_bias": systematic.view_bias.coefficient, "clock_late": systematic.late},
-            coordinates={"frame": case.clip.detections.frame, "person": case.bodies.person},
-            attributes={"camera": list(case.clip.camera_ids)},
+            arrays=spool.arrays() | {"view_bias": bias, "clock_late": systematic.late},
+            coordinates={"frame": frame, "person": case.bodies.person},
+            attributes={"camera": list(camera_ids)},
         )
-        names = ("judged", "keypoints_rejected", "boxes_dropped", "boxes_of_others", "boxes_found")
-        figures = {name: float(count) for name, count in zip(names, counts, strict=True)}
-        for c, camera in enumerate(case.clip.camera_ids):
-            figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
-            figures[f"clock_late_frames.{camera}"] = float(systematic.late[c])
-        figures["view_bias_m"] = float(np.sqrt((systematic.view_bias.coefficient**2).mean()))
-        result.figures.update(figures | _held_out(store, work, case, chosen, suspects))
-    return work.key
+    names = ("judged", "keypoints_rejected", "boxes_dropped", "boxes_of_others", "boxes_found")
+    figures = {name: float(count) for name, count in zip(names, counts, strict=True)}
+    for c, camera in enumerate(camera_ids):
+        figures[f"rejected_share.{camera}"] = float(rejected[0, c] / max(rejected[1, c], 1.0))
+        figures[f"clock_late_frames.{camera}"] = float(systematic.late[c])
+    figures["view_bias_m"] = float(np.sqrt((bias**2).mean()))
+    result.figures.update(figures | _held_out(inputs, case, chosen, suspects))
 
 
 class _Bodies:
@@ -207,44 +224,60 @@ class _Case:
         )
 
 
-def _open(store: Store, work: Work) -> _Case:
-    unit = work.recipe.unit
-    tracks = select_triangulated(open_input(store, work, f"tracking/{unit}"))
-    (bodies,) = (
-        open_input(store, work, name)
-        for name in (f"refitting/{unit}", f"body_fitting/{unit}")
-        if name in work.recipe.inputs
-    )
-    placed = open_input(store, work, f"retriangulation/{unit}")
+def _open_case(inputs: UnitInputs) -> _Case:
+    unit = inputs.unit
+    tracks = select_triangulated(inputs.open(f"tracking/{unit}"))
+    bodies = inputs.open_first(f"refitting/{unit}", f"body_fitting/{unit}")
+    placed = inputs.open(f"retriangulation/{unit}")
+    clip = open_clip(inputs, filtered=False, shifted=False)
     return _Case(
-        clip=open_clip(store, work, filtered=False, shifted=False).assign_people(
-            tracks["detection_index"].values
-        ),
+        clip=clip.assign_people(tracks["detection_index"].values),
         bodies=_Bodies(bodies, placed["common_bias"].values),
         placed=placed,
-        dropped=load_dropped_boxes(store, work),
-        triangulation=load_triangulation_settings(store, work.recipe, unit),
+        dropped=load_dropped_boxes(inputs),
+        triangulation=inputs.made_from(f"triangulation/{unit}").settings(TriangulationSettings),
     )
 
 
-def _counts(judged: Judgement, suspects: TriangulatedDetections) -> list[float]:
-    """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned."""
+def _part_arrays(
+    judged: Judgement, suspects: TriangulatedDetections, shift: Floats
+) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays with a frame dimension."""
+    return {
+        "rejected": judged.rejected,
+        "surprise": judged.mahalanobis_distance,
+        "dropped": judged.dropped,
+        "fits": judged.fits,
+        "similarity": judged.similarity,
+        "shift": suspects.assign_to_detections(shift).astype(np.float32),
+    }
+
+
+def _counts(
+    judged: Judgement, suspects: TriangulatedDetections
+) -> tuple[list[float], list[Floats]]:
+    """Count keypoints tested and rejected; boxes dropped, reassigned, and newly assigned.
+
+    Returns:
+        These counts, and the keypoints rejected and given by camera.
+    """
     frame, camera, person = np.nonzero(suspects.detections.detection_index >= 0)
     taken = np.full(judged.fits.shape, -1)
     taken[frame, camera, suspects.detections.detection_index[frame, camera, person]] = person
     moved = (judged.fits >= 0) & (judged.fits != taken)
-    return [
+    counts = [
         float(np.isfinite(judged.mahalanobis_distance).sum()),
         float(judged.rejected.sum()),
         float(judged.dropped.sum()),
         float((moved & (taken >= 0)).sum()),
         float((moved & (taken < 0)).sum()),
     ]
+    given = np.isfinite(suspects.detections.confidence)
+    return counts, [judged.rejected.sum(axis=(0, 2, 3)), given.sum(axis=(0, 2, 3))]
 
 
 def _held_out(
-    store: Store,
-    work: Work,
+    inputs: UnitInputs,
     case: _Case,
     frames: NDArray[np.int64],
     suspects: TriangulatedDetections,
@@ -255,8 +288,7 @@ def _held_out(
     evaluated, so that iterations are comparable.
 
     Args:
-        store: the store.
-        work: the current work order.
+        inputs: the unit.
         case: the clip and its bodies.
         frames: the frames to measure in.
         suspects: their detections.
@@ -264,9 +296,9 @@ def _held_out(
     used = suspects.detections
     keypoints = used.keypoints
     if not case.first:
-        clip = open_clip(store, work).assign_people(case.clip.detections.detection_index)
+        clip = open_clip(inputs).assign_people(case.clip.detections.detection_index)
         used = clip.detections[frames]
-        whole = open_clip(store, work, filtered=False, redetected=False)
+        whole = open_clip(inputs, filtered=False, redetected=False)
         keypoints = whole.detections.keypoints[frames]
     found = measure_held_out(case.clip.cameras, used, keypoints, case.triangulation)
     if found is None:
@@ -274,6 +306,194 @@ def _held_out(
     return {"held_out_error": found.error, "held_out_keypoints": float(found.keypoints)}
 
 
-def _evenly(frames: int, most: int) -> NDArray[np.int64]:
-    """Return at most `most` evenly spaced frames."""
-    return np.unique(np.linspace(0, frames - 1, min(frames, most)).astype(np.int64))
+@unit_task
+def redetection(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the camera's people, including redetected ones."""
+    settings = inputs.settings(RedetectionSettings)
+    case = _open_view(inputs)
+    sought = case.select_missing_people(settings)
+    found = _search(inputs, case, sought)
+    verdicts = judge_search_results(
+        found, sought, case.expected, case.detected, case.spread, case.noise, settings
+    )
+    result.write(
+        REDETECTION,
+        arrays=_arrays(case, sought, found, verdicts),
+        coordinates={"frame": case.detected.frame},
+        attributes={"camera_id": inputs.sources["camera"], **case.detected.labels()},
+    )
+    for name in ("found", "unsure", "elsewhere", "another"):
+        result.figures[name] = float(np.count_nonzero(getattr(verdicts, name)))
+    result.figures |= {"sought": float(len(sought.frame)), "hidden": float(sought.hidden)}
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A clip in one camera, and the bodies of the previous iteration.
+
+    Attributes:
+        camera: after adjustment to people.
+        surface: crown and end fall of the pitch that the cameras show [m]; None = as in pitch.json.
+        detection: what the detections were computed from.
+        detected: the people of `detection` (frames, detections).
+        person: (persons,) ids.
+        expected: the bodies in the camera's images.
+        shift: (frames, persons, 17, 2) [px], systematic error of keypoints relative to joints.
+        seen: (frames, persons), detected people; all people in corrected frames.
+        spread: spread of the camera's keypoints around the bodies.
+        noise: stated keypoint noise, [px] and [m].
+    """
+
+    camera: Camera
+    surface: list[float] | None
+    detection: UnitInputs
+    detected: KeypointDetections
+    person: NDArray[np.integer]
+    expected: Expected
+    shift: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    spread: Spread
+    noise: tuple[float, float]
+
+    def select_missing_people(self, settings: RedetectionSettings) -> MissingPeople:
+        """Return visible people without a detection; none if disabled."""
+        pitch, place = self.detection.pitch, None
+        if pitch is not None:
+            raised = pitch if self.surface is None else pitch.with_surface(self.surface)
+            place = Place(self.camera, raised)
+        width, height = (int(side) for side in self.camera.image_size)
+        return select_missing_people(
+            self.expected,
+            self.seen | (not settings.enabled),
+            (width, height),
+            settings,
+            place,
+            self.detection.settings(DetectionSettings).pitch_margin_m,
+        )
+
+
+def _open_view(inputs: UnitInputs) -> _View:
+    name, clip = inputs.sources["camera"], inputs.sources["clip"]
+    detected = KeypointDetections.from_arrays(inputs.open(f"detection/{inputs.unit}"))
+    detection = inputs.made_from(f"detection/{inputs.unit}")
+    tracks = select_triangulated(inputs.open(f"tracking/{clip}"))
+    place = tracks["camera"].values.tolist().index(name)
+    adjusted = inputs.open(ADJUSTED)
+    camera = camera_from_arrays(adjusted.data_vars)[place]
+    one = Camera.stack([camera])
+    bodies = inputs.open_first(f"refitting/{clip}", f"body_fitting/{clip}")
+    placed = inputs.open(f"retriangulation/{clip}").isel(camera=slice(place, place + 1))
+    said = inputs.open(f"filtering/{clip}")
+    joints, step, covariance = _Bodies(bodies, placed["common_bias"].values).read(slice(None))
+    views = view_bodies(one, joints, covariance)
+    systematic = SystematicErrors(
+        ViewBias(said["view_bias"].values), said["clock_late"].values[[place]]
+    )
+    shift = systematic.shift(watch_motion(one, joints, step), views)
+    offsets = placed["offsets"].values.astype(np.float64)
+    beside = shift[:, 0] + offsets[:, 0, :, None]
+
+    count = detected.score.shape[1]  # indices from here on: earlier redetections
+    index = tracks["detection_index"].values[:, place]
+    fits, dropped = (said[name].values[:, place, :count] for name in ("fits", "dropped"))
+    seen = find_detected_people(index, fits, dropped)
+    edits = detection.sources.get("edits", [])
+    seen[np.isin(detected.frame, [edit["frame"] for edit in edits])] = True
+    noise = inputs.made_from(f"triangulation/{clip}").settings(TriangulationSettings).noise
+    suspects = TriangulatedDetections(
+        KeypointDetections.from_keypoints(
+            detected.keypoints[:, None].astype(np.float64),
+            detected.confidence[:, None].astype(np.float64),
+            np.where(index < count, index, -1)[:, None],
+        ),
+        offsets,
+        placed["exchanged"].values,
+        dropped[:, None],
+        noise,
+    )
+    return _View(
+        camera=camera,
+        surface=adjusted.attrs["surface"],
+        detection=detection,
+        detected=detected,
+        person=tracks["person"].values,
+        expected=Expected.of(views, beside, float(camera.focal.mean())),
+        shift=np.nan_to_num(shift[:, 0]),
+        seen=seen,
+        spread=_spread(views, suspects.subtract(shift)),
+        noise=noise,
+    )
+
+
+def _spread(views: BodyViews, suspects: TriangulatedDetections) -> Spread:
+    """Estimate the keypoint spread around bodies; the stated one if there are too few keypoints."""
+    if np.count_nonzero(suspects.detections.detection_index >= 0) * len(COCO17) < FEW:
+        return Spread(np.ones(len(COCO17)), np.empty(0), np.ones(1))
+    return learn_keypoint_spread(views, suspects)
+
+
+def _search(inputs: UnitInputs, case: _View, sought: MissingPeople) -> KeypointDetections:
+    """Run the pose net of `detection` where people are expected."""
+    settings = case.detection.settings(DetectionSettings)
+    if not len(sought.frame):
+        return KeypointDetections.empty()
+    require_weights(settings, case.detection.sources["weights"])
+    shown = _pictures(inputs, case, np.unique(sought.frame))
+    found = search_missing_people(
+        shown,
+        sought,
+        load_pose(settings),
+        settings.min_keypoint_confidence,
+        case.detected.boxes,
+    )
+    case.detection.require_registered("video")
+    score_map = load_score_map(settings)
+    return found if score_map is None else replace(found, score=score_map.probability(found.score))
+
+
+def _pictures(
+    inputs: UnitInputs, case: _View, places: NDArray[np.int64]
+) -> Iterator[tuple[int, Image | None]]:
+    """Yield the images of some frame indices in order, without those that the video lacks.
+
+    Decoding skips images without a search.
+    """
+    footage = inputs.open(f"ingest/{inputs.sources['camera']}")
+    numbers = footage["picture_of_frame"].sel(frame=case.detected.frame[places]).values
+    there = numbers >= 0
+    place_of = dict(zip(numbers[there].tolist(), places[there].tolist(), strict=True))
+    with open_video(case.detection.file("video"), footage_index(footage)) as video:
+        for number, picture in some_pictures(video, numbers[there]):
+            yield place_of[number], picture
+
+
+def _arrays(
+    case: _View, sought: MissingPeople, results: KeypointDetections, verdicts: Verdicts
+) -> dict[str, NDArray[Any]]:
+    """Return all detections at their indices, followed by the redetected people."""
+    before = case.detected.arrays()
+    frames, count = case.detected.score.shape
+    (found,) = np.nonzero(verdicts.found)
+    frame = sought.frame[found]
+    behind = np.arange(len(found)) - np.searchsorted(frame, frame)
+    more = int(behind.max(initial=-1)) + 1
+    arrays: dict[str, NDArray[Any]] = {
+        name: np.pad(
+            values,
+            [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2),
+            constant_values=np.nan,
+        )
+        for name, values in before.items()
+    }
+    shape = (frames, count + more)
+    arrays["found_again"] = np.full(shape, -1, dtype=np.int32)
+    arrays["shift"] = np.zeros((*shape, len(COCO17), 2), dtype=np.float32)
+    at = frame, count + behind
+    wrong = verdicts.rejected[found]
+    arrays["keypoints"][at] = np.where(wrong[..., None], np.nan, results.keypoints[found])
+    arrays["confidence"][at] = np.where(wrong, np.nan, results.confidence[found])
+    arrays["boxes"][at] = results.boxes[found]
+    arrays["score"][at] = results.score[found]
+    arrays["found_again"][at] = case.person[sought.person[found]]
+    arrays["shift"][at] = case.shift[frame, sought.person[found]]
+    return arrays

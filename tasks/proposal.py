@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration
 from data_contracts.keypoints import KeypointDetections
-from data_contracts.pitch import PitchSpec
 from data_contracts.proposal import PROPOSAL
-from data_contracts.work import Work
 from tasks.detection import footage_index, require_weights
 from tasks.static_calibration import clicked_markings, given_lens, open_still, require_picture
-from tasks.unit import open_input, unit_task
+from tasks.unit import UnitInputs, unit_task
 from worldpose.detection.models import load_detectors
 from worldpose.detection.settings import DetectionSettings
 from worldpose.errors import InputError
@@ -25,7 +23,7 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import ProposalSettings, StaticCalibrationSettings
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 from worldpose.tracking.plane.feet import locate_feet
 from worldpose.video.folder import open_video
 
@@ -37,56 +35,47 @@ _NOT_PROPOSED: Mapping[str, Any] = {
 
 
 @unit_task
-def proposal(work: Work) -> str:
-    """Publish the camera, proposed from its image unless it is known, and people's places."""
-    sources: dict[str, Any] = work.recipe.sources
-    settings = ProposalSettings.model_validate(work.recipe.settings)
-    store = Store.open(work.project)
-    with store.publish(work) as result:
-        attributes = {
-            "camera_id": work.recipe.unit,
-            "fps": sources["fps"],
-            "is_stated": True,
-            "is_clear": True,
-            "problem": None,
-            **_NOT_PROPOSED,
-        }
-        pitch = None
-        if sources.get("pitch") is not None:
-            pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
-        try:
-            camera, found = _find_camera(work, pitch, settings)
-        except InputError as error:  # one camera must not end the match
-            words = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
-            none = {"origin": "none", "is_clear": False, "problem": words}
-            result.write(PROPOSAL, arrays={}, attributes={**attributes, **none})
-            return work.key
-        arrays: dict[str, Any] = dict(camera_arrays(camera))
-        frames = {}
-        if sources["people"] is not None:
-            people = _find_people(store, work, settings.people_frames)
-            feet = locate_feet(Camera.stack([camera]), people, pitch or PitchTemplate.standard())
-            arrays |= {"place": feet.xy[:, 0], "place_covariance": feet.noise[:, 0]}
-            frames = {"frame": people.frame}
-        result.write(
-            PROPOSAL, arrays=arrays, coordinates=frames, attributes={**attributes, **found}
-        )
-        if found["origin"] == "image":
-            result.figures.update(
-                {name: float(found[name]) for name in ("margin", "found", "explained")}
-            )
-    return work.key
+def proposal(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the camera, proposed from its image unless it is known, and people's places."""
+    settings = inputs.settings(ProposalSettings)
+    attributes = {
+        "camera_id": inputs.unit,
+        "fps": inputs.sources["fps"],
+        "is_stated": True,
+        "is_clear": True,
+        "problem": None,
+        **_NOT_PROPOSED,
+    }
+    pitch = inputs.pitch if "pitch" in inputs.sources else None
+    try:
+        camera, found = _find_camera(inputs, pitch, settings)
+    except InputError as error:  # one camera must not end the match
+        words = {name: getattr(error, name) for name in ("where", "expected", "found", "todo")}
+        none = {"origin": "none", "is_clear": False, "problem": words}
+        result.write(PROPOSAL, arrays={}, attributes={**attributes, **none})
+        return
+    arrays: dict[str, Any] = dict(camera_arrays(camera))
+    frames = {}
+    if inputs.sources["people"] is not None:
+        people = _find_people(inputs, settings.people_frames)
+        feet = locate_feet(Camera.stack([camera]), people, pitch or PitchTemplate.standard())
+        arrays |= {"place": feet.xy[:, 0], "place_covariance": feet.noise[:, 0]}
+        frames = {"frame": people.frame}
+    result.write(PROPOSAL, arrays=arrays, coordinates=frames, attributes={**attributes, **found})
+    if found["origin"] == "image":
+        names = ("margin", "found", "explained")
+        result.figures.update({name: float(found[name]) for name in names})
 
 
 def _find_camera(
-    work: Work, pitch: PitchTemplate | None, settings: ProposalSettings
+    inputs: UnitInputs, pitch: PitchTemplate | None, settings: ProposalSettings
 ) -> tuple[Camera, Mapping[str, Any]]:
     """Return the camera, and the stored attributes that tell how it was found.
 
     Raises:
         InputError: clicks or image do not determine it.
     """
-    sources: dict[str, Any] = work.recipe.sources
+    sources = inputs.sources
     if sources["calibration"] is not None:
         given = CameraCalibration.model_validate(sources["calibration"])
         return Camera.from_calibration(given), {"origin": "given"}
@@ -105,12 +94,12 @@ def _find_camera(
         return calibration.estimate.camera, {"origin": "points"}
     side = sources["side"]
     proposed = propose_camera(
-        require_picture(work.recipe.unit, open_still(work)),
+        require_picture(inputs.unit, open_still(inputs)),
         pitch,
         side=side or "near",
         prior=settings.prior,
         lens=lens,
-        where=f"image of {work.recipe.unit}",
+        where=f"image of {inputs.unit}",
     )
     return proposed.camera, {
         "origin": "image",
@@ -120,22 +109,21 @@ def _find_camera(
     }
 
 
-def _find_people(store: Store, work: Work, count: int) -> KeypointDetections:
+def _find_people(inputs: UnitInputs, count: int) -> KeypointDetections:
     """Return the people (frames, 1 camera, people) of evenly spaced frames."""
-    sources: dict[str, Any] = work.recipe.sources
-    wanted = sources["people"]
+    wanted = inputs.sources["people"]
     every = np.concatenate([np.arange(first, first + size) for first, size in wanted["ranges"]])
     frames = every[np.linspace(0, len(every) - 1, min(count, len(every))).astype(np.int64)]
-    stored = open_input(store, work, f"ingest/{work.recipe.unit}")
+    stored = inputs.open(f"ingest/{inputs.unit}")
     if wanted["video"] is None:
         given = KeypointDetections.from_arrays(stored.sel(frame=frames))
         return KeypointDetections.stack([given])
     settings = DetectionSettings()
-    require_weights(settings, sources["weights"])
+    require_weights(settings, inputs.sources["weights"])
     (detector,) = load_detectors(settings)
     boxes: list[NDArray[np.float64]] = []
     numbers = stored["picture_of_frame"].sel(frame=frames).values
-    with open_video(Path(work.folder) / wanted["video"], footage_index(stored)) as video:
+    with open_video(Path(inputs.work.folder) / wanted["video"], footage_index(stored)) as video:
         for number in numbers.tolist():
             shown = video.readable(number, number + 1) if number >= 0 else ()
             picture = next((each for _, each in shown), None)

@@ -5,29 +5,31 @@ Without static cameras: bodies of the people that the broadcast camera alone fil
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.keypoints import KeypointDetections
 from data_contracts.refitting import REFITTING
-from data_contracts.work import Work
-from tasks.body_fitting import FurtherArrays, open_people, publish_fit
+from tasks.body_fitting import FurtherArrays, find_same_body, open_people, write_fit
+from tasks.broadcast_calibration import BroadcastInputs, open_broadcast
 from tasks.clip_inputs import select_frames
-from tasks.plane_bodies import publish_plane_bodies
-from tasks.unit import open_input, require_registered, unit_task
+from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence
 from worldpose.body_fitting.bones import Shape, pool_shapes
+from worldpose.body_fitting.fit_quality import report_fit
 from worldpose.body_fitting.monocular import (
     MonocularEstimates,
     MonocularPoses,
     place_monocular_poses,
     read_monocular,
 )
+from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
 from worldpose.body_fitting.ray_constraints import (
     RayConstraints,
     constrain_to_rays,
@@ -35,8 +37,11 @@ from worldpose.body_fitting.ray_constraints import (
     shift_frames,
 )
 from worldpose.body_fitting.settings import BodyFittingSettings
+from worldpose.broadcast_calibration.uncertainty import static_covariance
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.store.store import Store
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.ground_error import surface_motion
+from worldpose.store.writer import ResultWriter
 
 KNOWN: Final = 2.0
 """Frames with a larger expected reprojection error of players are left out [px]. Keypoint errors
@@ -44,52 +49,49 @@ are as large, but they differ between the keypoints of one person."""
 
 
 @unit_task
-def refitting(work: Work) -> str:
-    """Publish bodies and their keypoints; return the key."""
-    store = Store.open(work.project)
-    unit = work.recipe.unit
-    if f"broadcast_tracking/{unit}" in work.recipe.inputs:
-        with store.publish(work) as result:
-            publish_plane_bodies(store, work, result)
-        return work.key
-    before = store.manifest(
-        work.recipe.match_id, "body_fitting", unit, work.recipe.inputs[f"body_fitting/{unit}"]
-    ).recipe
-    fitted = open_input(store, work, f"body_fitting/{unit}")
-    with store.publish(work) as result:
-        views: _BroadcastViews | None = None
-        if f"broadcast_calibration/{unit}" in work.recipe.inputs:
-            views = _BroadcastViews.open(store, work, fitted)
-        people = open_people(store, work, views)
-        weight = BodyFittingSettings.model_validate(before.settings).shape_weight
-        known = _known_shapes(store, work, people.person, weight)
-        pooled = np.isin(np.arange(len(people.person)), list(known))
-        recognised = 0
-        moved: list[list[Floats]] = [[] for _ in people.person]
+def refitting(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write bodies and their keypoints."""
+    if f"broadcast_tracking/{inputs.unit}" in inputs:
+        _write_plane_bodies(inputs, result)
+    else:
+        _refit(inputs, result)
 
-        def further(part: slice, fit: BodyFit, evidence: ClipEvidence) -> dict[str, NDArray[Any]]:
-            nonlocal recognised
-            seen = np.zeros(fit.joints.shape[:2], dtype=np.bool_)
-            if views is not None:
-                seen = evidence.ray_constraints[-1].seen
-            recognised += int(seen.sum())
-            away = np.linalg.norm(fit.joints - fitted["joints"][part].values, axis=-1)
-            for place, own in enumerate(moved):
-                its = away[:: people.stride, place]
-                own.append(its[np.isfinite(its)])
-            return {"recognised": seen}
 
-        others = FurtherArrays(further, {"pooled": pooled}, {"without_body": {}}, known)
-        publish_fit(
-            store, result, REFITTING, people, work.model_copy(update={"recipe": before}), others
-        )
-        result.figures["recognised"] = float(recognised)
-        result.figures["pooled"] = float(pooled.sum())
-        for person, own in zip(people.person, moved, strict=True):
-            if any(map(len, own)):
-                figure = float(np.median(np.concatenate(own)))
-                result.figures[f"moved_m.person{person}"] = figure
-    return work.key
+def _refit(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Fit the bodies of triangulated people again, with all that is known of them."""
+    unit = inputs.unit
+    before = inputs.made_from(f"body_fitting/{unit}")
+    fitted = inputs.open(f"body_fitting/{unit}")
+    views: _BroadcastViews | None = None
+    if f"broadcast_calibration/{unit}" in inputs:
+        views = _BroadcastViews.open(inputs, fitted)
+    people = open_people(inputs, views)
+    weight = before.settings(BodyFittingSettings).shape_weight
+    known = _known_shapes(inputs, people.person, weight)
+    pooled = np.isin(np.arange(len(people.person)), list(known))
+    recognised = 0
+    moved: list[list[Floats]] = [[] for _ in people.person]
+
+    def further(part: slice, fit: BodyFit, evidence: ClipEvidence) -> dict[str, NDArray[Any]]:
+        nonlocal recognised
+        seen = np.zeros(fit.joints.shape[:2], dtype=np.bool_)
+        if views is not None:
+            seen = evidence.ray_constraints[-1].seen
+        recognised += int(seen.sum())
+        away = np.linalg.norm(fit.joints - fitted["joints"][part].values, axis=-1)
+        for place, own in enumerate(moved):
+            its = away[:: people.stride, place]
+            own.append(its[np.isfinite(its)])
+        return {"recognised": seen}
+
+    others = FurtherArrays(further, {"pooled": pooled}, {"without_body": {}}, known)
+    write_fit(inputs, result, REFITTING, people, before, others)
+    result.figures["recognised"] = float(recognised)
+    result.figures["pooled"] = float(pooled.sum())
+    for person, own in zip(people.person, moved, strict=True):
+        if any(map(len, own)):
+            figure = float(np.median(np.concatenate(own)))
+            result.figures[f"moved_m.person{person}"] = figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,31 +115,25 @@ class _BroadcastViews:
     estimates: MonocularEstimates | None
 
     @classmethod
-    def open(cls, store: Store, work: Work, fitted: xr.Dataset) -> _BroadcastViews:
-        """Open the images of the clip of `work`, whose bodies are `fitted`."""
-        sources: dict[str, Any] = work.recipe.sources
-        name = f"broadcast_calibration/{work.recipe.unit}"
-        found = open_input(store, work, name)
-        pooled = f"broadcast_pooling/{work.recipe.unit}"
-        best = open_input(store, work, pooled) if pooled in work.recipe.inputs else found
+    def open(cls, inputs: UnitInputs, fitted: xr.Dataset) -> _BroadcastViews:
+        """Open the images of the unit's clip, whose bodies are `fitted`."""
+        sources, name = inputs.sources, f"broadcast_calibration/{inputs.unit}"
+        found = inputs.open(name)
+        best = inputs.open_first(f"broadcast_pooling/{inputs.unit}", name)
         camera = camera_from_arrays(best.data_vars)
         known = found["reprojection_error"].values <= KNOWN
         offset = float(sources["broadcast_offset_frames"])
         late = round(offset) - offset
-        stage, unit = name.split("/")
-        key = work.recipe.inputs[name]
-        calibrated = store.manifest(work.recipe.match_id, stage, unit, key).recipe
         measured = (found.attrs["feed_offset"] or {}).get("frames")
-        if calibrated.settings["feed_offset"] == "correct" and measured is not None:
+        settings = inputs.made_from(name).recipe.settings
+        if settings["feed_offset"] == "correct" and measured is not None:
             late += measured
-        first, count = sources["first_frame"], sources["frame_count"]
-        frame = np.arange(first, first + count)
-        seen = select_frames(open_input(store, work, sources["seen_in_broadcast"]), frame)
+        frame = inputs.frames
+        seen = select_frames(inputs.open(sources["seen_in_broadcast"]), frame)
         estimates = None
         if sources["estimates"] is not None:
-            path = Path(work.folder) / sources["estimates"]
-            estimates = read_monocular(path)
-            require_registered(path, sources["estimates_sha256"])
+            estimates = read_monocular(inputs.file("estimates"))
+            inputs.require_registered("estimates")
         return cls(
             number=frame + sources["offset_frames"],
             camera=replace(camera, focal=np.where(known[:, None], camera.focal, np.nan)),
@@ -166,22 +162,20 @@ class _BroadcastViews:
 
 
 def _known_shapes(
-    store: Store, work: Work, persons: NDArray[np.integer], weight: float
+    inputs: UnitInputs, persons: NDArray[np.integer], weight: float
 ) -> dict[int, Shape]:
     """Return the body shapes from other clips, by person index.
 
     Args:
-        store: the store.
-        work: the current work order.
+        inputs: the unit.
         persons: ids of this clip's people.
         weight: weight of the betas' normal prior, common to the bodies of all clips [1].
     """
-    sources: dict[str, Any] = work.recipe.sources
-    named: dict[str, dict[str, str]] = dict(sources["people"])
-    here = named.pop(work.recipe.unit)
+    named: dict[str, dict[str, str]] = dict(inputs.sources["people"])
+    here = named.pop(inputs.unit)
     shapes: dict[str, list[Shape]] = {}
     for clip, people in named.items():
-        found = open_input(store, work, f"body_fitting/{clip}")
+        found = inputs.open(f"body_fitting/{clip}")
         for place, person in enumerate(found["person"].values):
             betas = found["betas"].values[place]
             if str(person) in people and np.isfinite(betas).all():
@@ -191,4 +185,127 @@ def _known_shapes(
         place: pool_shapes(shapes[here[str(person)]], weight)
         for place, person in enumerate(persons)
         if here.get(str(person)) in shapes
+    }
+
+
+def _write_plane_bodies(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Fit and write the bodies of the clip's people that the broadcast camera alone films."""
+    estimates = read_monocular(inputs.file("estimates"))
+    inputs.require_registered("estimates")
+    model = find_same_body(inputs)
+    filmed = open_broadcast(inputs)
+    tracked = inputs.open(f"broadcast_tracking/{inputs.unit}")
+    evidence = _observe_people(filmed, tracked, inputs.sources)
+    bodies = fit_bodies_on_plane(model, evidence, estimates, filmed.pitch.height)
+    persons = tracked["person"].values
+    kept = np.array([reason is None for reason in bodies.missing], dtype=np.bool_)
+    without = {
+        str(person): reason
+        for person, reason in zip(persons.tolist(), bodies.missing, strict=True)
+        if reason is not None
+    }
+    fit = bodies.fit
+    result.write(
+        REFITTING,
+        arrays={
+            "betas": fit.betas[kept],
+            "betas_covariance": fit.betas_covariance[kept],
+            "global_orient": fit.parameters.global_orient[:, kept],
+            "body_pose": fit.parameters.body_pose[:, kept],
+            "transl": fit.parameters.transl[:, kept],
+            "joints": fit.joints[:, kept],
+            "covariance": fit.covariance[:, kept],
+            "filled": fit.filled[:, kept],
+            "guided": fit.guided[:, kept],
+            "joint_offsets": fit.offsets,
+            "recognised": np.asarray(bodies.views[:, kept].any(axis=-1)),
+            "pooled": np.zeros(int(kept.sum()), dtype=np.bool_),
+            "views": bodies.views[:, kept].astype(np.int16),
+        },
+        coordinates={"frame": tracked["frame"].values, "person": persons[kept]},
+        attributes={"body_model": model.name, "without_body": without},
+    )
+    result.figures["without_body"] = float(len(without))
+    _report_plane_bodies(result, fit, evidence, kept, persons)
+    if without:
+        told = "; ".join(f"person {person}: {reason}" for person, reason in without.items())
+        result.warnings.append(
+            f"{inputs.recipe.name}: {len(without)} of {len(persons)} people have a place on the "
+            f"pitch and no body. {told}. Check {inputs.sources['estimates']} there: its frame "
+            "numbers count the images of the clip's own video, and boxes are pixels of its images."
+        )
+
+
+def _observe_people(
+    filmed: BroadcastInputs, tracked: xr.Dataset, sources: Mapping[str, Any]
+) -> PlaneEvidence:
+    """Return the keypoints of tracked people, and their places with covariance."""
+    seen = filmed.detections
+    index = tracked["detection_index"].values
+    rows = np.arange(len(index))[:, None]
+    found = index >= 0
+    if seen.score.shape[1]:
+        keypoints = np.where(found[..., None, None], seen.keypoints[rows, index], np.nan)
+        confidence = np.where(found[..., None], seen.confidence[rows, index], np.nan)
+    else:
+        keypoints = np.full((*index.shape, 17, 2), np.nan)
+        confidence = np.full((*index.shape, 17), np.nan)
+    moving, uncertainty = filmed.camera
+    place = tracked["ground"].values.astype(np.float64)
+    return PlaneEvidence(
+        camera=moving.camera,
+        number=tracked["frame"].values + sources["offset_frames"],
+        keypoints=keypoints.astype(np.float64),
+        confidence=confidence.astype(np.float64),
+        place=place,
+        place_covariance=tracked["ground_covariance"].values.astype(np.float64),
+        calibration=_calibration_covariance(
+            moving.camera, static_covariance(moving, uncertainty), filmed.pitch, place
+        ),
+        fps=float(sources["fps"]),
+    )
+
+
+def _calibration_covariance(
+    cameras: Camera, covariance: Floats, pitch: PitchTemplate, place: Floats
+) -> Floats:
+    """Return the covariance (frames, persons, 2, 2) [m^2] of places by the calibration alone.
+
+    Args:
+        cameras: batch (frames,).
+        covariance: (frames, 12, 12) of each frame's camera.
+        pitch: surface.
+        place: (frames, persons, 2) [m].
+    """
+    out = np.zeros((*place.shape, 2))
+    points = np.concatenate([place, pitch.height(place[..., 0], place[..., 1])[..., None]], axis=-1)
+    for frame in range(len(place)):
+        known = np.isfinite(place[frame, :, 0])
+        if known.any() and np.isfinite(cameras.focal[frame]).all():
+            motion = surface_motion(cameras[frame], pitch, points[frame, known])
+            out[frame, known] = np.nan_to_num(motion @ covariance[frame] @ motion.swapaxes(1, 2))
+    return out
+
+
+def _report_plane_bodies(
+    result: ResultWriter,
+    fit: BodyFit,
+    evidence: PlaneEvidence,
+    kept: Flags,
+    persons: Integers,
+) -> None:
+    """Write the metrics of the bodies, named as those of triangulated people."""
+    frames, count = evidence.place.shape[:2]
+    own = np.broadcast_to(np.arange(count), (frames, 1, count))
+    seen = KeypointDetections.from_keypoints(
+        evidence.keypoints[:, None], evidence.confidence[:, None], own
+    )
+    report = report_fit(
+        fit, np.full(fit.joints.shape, np.nan), evidence.fps, (evidence.camera[:, None], seen)
+    )
+    names = [f"person{person}" for person in persons]
+    figures = figures_of(report, names)
+    gone = {name for name, there in zip(names, kept, strict=True) if not there}
+    result.figures |= {
+        name: value for name, value in figures.items() if name.partition(".")[2] not in gone
     }

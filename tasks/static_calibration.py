@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.cameras import CameraCalibration, LensCalibration
-from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import (
     STATIC_CALIBRATION,
     ClickedMarkings,
     ClickedPoint,
     DrawnMarking,
 )
-from data_contracts.work import Work
-from tasks.unit import open_input, require_registered, unit_task
+from tasks.unit import UnitInputs, require_registered, unit_task
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.ingest.footage import read_still
@@ -28,6 +26,7 @@ from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.from_paint.proposal import Proposal, calibrate_proposal
 from worldpose.static_calibration.report import (
     CalibrationReport,
+    StaticCalibration,
     calibration_arrays,
     calibration_attributes,
     calibration_coordinates,
@@ -36,7 +35,7 @@ from worldpose.static_calibration.report import (
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.static_calibration.sides import SeenPeople, decide_sides
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 from worldpose.video.folder import index_video, median_picture, open_video, some_pictures
 
 STILL_FRAMES: Final = 25
@@ -44,74 +43,78 @@ STILL_FRAMES: Final = 25
 
 
 @unit_task
-def static_calibration(work: Work) -> str:
-    """Publish the camera, and its uncertainty if calibrated; return the key.
+def static_calibration(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the camera, and its uncertainty if calibrated.
 
-    A camera that its clicks do not determine is published as left out, with the reason.
+    A camera that its clicks do not determine is written as left out, with the reason.
     """
-    sources: dict[str, Any] = work.recipe.sources
-    store = Store.open(work.project)
-    with store.publish(work) as result:
-        if sources["calibration"] is not None:
-            given = CameraCalibration.model_validate(sources["calibration"])
-            result.write(
-                STATIC_CALIBRATION,
-                arrays=camera_arrays(Camera.from_calibration(given)),
-                attributes=given_attributes(work.recipe.unit),
-            )
-            return work.key
-        width, height = sources["image_size"]
-        pitch = PitchTemplate.from_spec(PitchSpec.model_validate(sources["pitch"]))
-        settings = StaticCalibrationSettings.model_validate(work.recipe.settings)
-        picture = open_still(work)
-        known = given_lens(sources)
-        try:
-            if sources["clicked"]:
-                ((file, clicked),) = sources["clicked"].items()
-                calibration = calibrate_camera(
-                    pitch,
-                    clicked_markings(clicked),
-                    (width, height),
-                    picture=picture,
-                    settings=settings,
-                    where=file,
-                    lens=known,
-                )
-            else:
-                where = f"image of {work.recipe.unit}"
-                calibration = calibrate_proposal(
-                    pitch,
-                    _open_proposal(store, work, pitch, where),
-                    require_picture(work.recipe.unit, picture),
-                    settings=settings,
-                    where=where,
-                    lens=known,
-                )
-        except InputError as error:  # a failed calibration of one camera must not end the match
-            reason = str(error)
-            attributes = left_out_attributes(work.recipe.unit, reason)
-            result.write(STATIC_CALIBRATION, arrays={}, attributes=attributes)
-            result.left_out[work.recipe.unit] = reason
-            return work.key
+    if inputs.sources["calibration"] is not None:
+        given = CameraCalibration.model_validate(inputs.sources["calibration"])
         result.write(
             STATIC_CALIBRATION,
-            arrays=calibration_arrays(calibration),
-            coordinates=calibration_coordinates(calibration),
-            attributes=calibration_attributes(work.recipe.unit, calibration),
+            arrays=camera_arrays(Camera.from_calibration(given)),
+            attributes=given_attributes(inputs.unit),
         )
-        result.figures.update(_figures(calibration.report))
-    return work.key
+        return
+    try:
+        calibration = _calibrate(inputs)
+    except InputError as error:  # a failed calibration of one camera must not end the match
+        reason = str(error)
+        attributes = left_out_attributes(inputs.unit, reason)
+        result.write(STATIC_CALIBRATION, arrays={}, attributes=attributes)
+        result.left_out[inputs.unit] = reason
+        return
+    result.write(
+        STATIC_CALIBRATION,
+        arrays=calibration_arrays(calibration),
+        coordinates=calibration_coordinates(calibration),
+        attributes=calibration_attributes(inputs.unit, calibration),
+    )
+    result.figures.update(_figures(calibration.report))
 
 
-def _open_proposal(store: Store, work: Work, pitch: PitchTemplate, where: str) -> Proposal:
+def _calibrate(inputs: UnitInputs) -> StaticCalibration:
+    """Calibrate a camera from its clicks, or else from its proposal.
+
+    Raises:
+        InputError: they do not determine it.
+    """
+    sources, pitch = inputs.sources, inputs.pitch
+    assert pitch is not None  # registration requires it
+    picture, lens = open_still(inputs), given_lens(sources)
+    settings = inputs.settings(StaticCalibrationSettings)
+    if sources["clicked"]:
+        ((file, clicked),) = sources["clicked"].items()
+        width, height = sources["image_size"]
+        return calibrate_camera(
+            pitch,
+            clicked_markings(clicked),
+            (width, height),
+            picture=picture,
+            settings=settings,
+            where=file,
+            lens=lens,
+        )
+    where = f"image of {inputs.unit}"
+    return calibrate_proposal(
+        pitch,
+        _open_proposal(inputs, pitch, where),
+        require_picture(inputs.unit, picture),
+        settings=settings,
+        where=where,
+        lens=lens,
+    )
+
+
+def _open_proposal(inputs: UnitInputs, pitch: PitchTemplate, where: str) -> Proposal:
     """Return the camera's proposal on its side of the pitch.
 
     Raises:
         InputError: there is none, it is not clear, or people do not tell the side, or contradict
             the stated one.
     """
-    found = {name.partition("/")[2]: open_input(store, work, name) for name in work.recipe.inputs}
-    own = found[work.recipe.unit]
+    found = {name.partition("/")[2]: inputs.open(name) for name in inputs.recipe.inputs}
+    own = found[inputs.unit]
     if own.attrs["origin"] == "none":
         raise InputError(**own.attrs["problem"])
     proposal = Proposal.from_attributes(camera_from_arrays(own.data_vars), own.attrs)
@@ -129,7 +132,7 @@ def _open_proposal(store: Store, work: Work, pitch: PitchTemplate, where: str) -
     }
     stated = [name for name in seen if found[name].attrs["is_stated"]]
     seconds = own["frame"].values / own.attrs["fps"]
-    decision = decide_sides(seen, stated, pitch, seconds)[work.recipe.unit]
+    decision = decide_sides(seen, stated, pitch, seconds)[inputs.unit]
     return proposal.turn() if decision.require_side(where) else proposal
 
 
@@ -164,29 +167,29 @@ def clicked_markings(listed: Mapping[str, Any]) -> ClickedMarkings:
     )
 
 
-def open_still(work: Work) -> NDArray[np.uint8] | None:
+def open_still(inputs: UnitInputs) -> NDArray[np.uint8] | None:
     """Return the unit's still, or one without people from its video, from the files of its key.
 
     Raises:
         InputError: the file differs from the registered one, or is not an image.
     """
-    sources: dict[str, Any] = work.recipe.sources
+    sources = inputs.sources
     if sources["still"] is None:
-        return None if sources["filmed"] is None else _filmed_still(work, sources["filmed"])
-    path = Path(work.folder) / sources["still"]
+        filmed = sources["filmed"]
+        return None if filmed is None else _filmed_still(Path(inputs.work.folder), filmed)
     width, height = sources["image_size"]
-    picture = read_still(path, (width, height))
-    require_registered(path, sources["still_sha256"])
+    picture = read_still(inputs.file("still"), (width, height))
+    inputs.require_registered("still")
     return picture
 
 
-def _filmed_still(work: Work, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
+def _filmed_still(folder: Path, filmed: Mapping[str, Any]) -> NDArray[np.uint8]:
     """Return the median of images evenly spaced over the clips; motionless people stay in it (C4).
 
     Raises:
         InputError: the file differs from the registered one, or is not a video.
     """
-    path = Path(work.folder) / filmed["video"]
+    path = folder / filmed["video"]
     every = np.concatenate(
         [np.arange(first, first + count) for first, count in sorted(filmed["clips"].values())]
     )

@@ -12,9 +12,8 @@ from pydantic import TypeAdapter
 from data_contracts.arrays import Singles
 from data_contracts.pitch import PitchSpec
 from data_contracts.tracking import TRACKING
-from data_contracts.work import Work
 from tasks.clip_inputs import ClipInputs, open_clip
-from tasks.unit import figures_of, open_uncorrected, unit_task
+from tasks.unit import UnitInputs, figures_of, unit_task
 from worldpose.compiled import map_in_threads
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.identities import (
@@ -24,7 +23,7 @@ from worldpose.review.identities import (
     replay_identities,
     stored_identities,
 )
-from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 from worldpose.tracking.diagnosis import diagnose_no_people
 from worldpose.tracking.joins import describe_doubts
 from worldpose.tracking.plane.clocks import PlaneClocks, estimate_plane_clocks
@@ -48,45 +47,42 @@ BLOCK: Final = 256
 
 
 @unit_task
-def tracking(work: Work) -> str:
-    """Publish the person of each detection, with people's corrections; return the key."""
-    store = Store.open(work.project)
-    with store.publish(work) as result:
-        corrections = work.recipe.sources.get("identities") or []
-        edits = TypeAdapter(list[IdentityEdit]).validate_python(corrections)
-        found, figures, warnings = (_open_uncorrected if edits else _track_people)(store, work)
-        result.warnings += warnings
-        replay = replay_identities(found, edits)
-        corrected = replay.identities
-        if edits:
-            figures["undecided"] = float(sum(not join.decided for join in corrected.joins))
-        figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
-        result.write(
-            TRACKING,
-            arrays={
-                "detection_index": corrected.detection_index,
-                "ray_distance": corrected.ray_distance,
-                "joints": corrected.joints,
-                **_ground_arrays(store, work, corrected),
-            },
-            coordinates={"frame": corrected.frame, "person": corrected.person},
-            attributes={
-                "camera": list(corrected.cameras),
-                "tracks": [track.model_dump(mode="json") for track in corrected.tracks],
-                "joins": [join.model_dump(mode="json") for join in corrected.joins],
-                "objections": list(replay.objections),
-            },
-        )
-        result.figures.update(figures)
-    return work.key
+def tracking(inputs: UnitInputs, result: ResultWriter) -> None:
+    """Write the person of each detection, with people's corrections."""
+    corrections = inputs.sources.get("identities") or []
+    edits = TypeAdapter(list[IdentityEdit]).validate_python(corrections)
+    found, figures, warnings = (_open_uncorrected if edits else _track_people)(inputs)
+    result.warnings += warnings
+    replay = replay_identities(found, edits)
+    corrected = replay.identities
+    if edits:
+        figures["undecided"] = float(sum(not join.decided for join in corrected.joins))
+    figures["corrections_refused"] = float(sum(map(bool, replay.objections)))
+    result.write(
+        TRACKING,
+        arrays={
+            "detection_index": corrected.detection_index,
+            "ray_distance": corrected.ray_distance,
+            "joints": corrected.joints,
+            **_ground_arrays(inputs, corrected),
+        },
+        coordinates={"frame": corrected.frame, "person": corrected.person},
+        attributes={
+            "camera": list(corrected.cameras),
+            "tracks": [track.model_dump(mode="json") for track in corrected.tracks],
+            "joins": [join.model_dump(mode="json") for join in corrected.joins],
+            "objections": list(replay.objections),
+        },
+    )
+    result.figures.update(figures)
 
 
-def _ground_arrays(store: Store, work: Work, people: Identities) -> dict[str, NDArray[Any]]:
+def _ground_arrays(inputs: UnitInputs, people: Identities) -> dict[str, NDArray[Any]]:
     """Return the stored places of people on the pitch; empty if all are triangulated."""
-    pitch = _pitch(work)
+    pitch = _pitch(inputs)
     if pitch is None or not people.on_plane.any():
         return {}
-    clip = open_clip(store, work)
+    clip = open_clip(inputs)
     index = np.where(people.on_plane[:, None], people.detection_index, -1)
     # Without triangulated people, all feet tell the clocks.
     is_placed = np.isfinite(people.joints).any()
@@ -109,27 +105,26 @@ Tracked = tuple[Identities, dict[str, float], tuple[str, ...]]
 """The tracker's output, its metrics, and its warnings."""
 
 
-def _open_uncorrected(store: Store, work: Work) -> Tracked:
+def _open_uncorrected(inputs: UnitInputs) -> Tracked:
     """Return the published tracks without corrections; if there are none, track."""
-    published = open_uncorrected(store, work, "identities")
+    published = inputs.open_uncorrected("identities")
     if published is None:
-        return _track_people(store, work)
+        return _track_people(inputs)
     stored, manifest = published
     return stored_identities(stored), dict(manifest.figures), manifest.warnings
 
 
-def _track_people(store: Store, work: Work) -> Tracked:
-    sources: dict[str, Any] = work.recipe.sources
-    clip = open_clip(store, work)
-    pitch = _pitch(work)
-    settings = TrackingSettings.model_validate(work.recipe.settings)
+def _track_people(inputs: UnitInputs) -> Tracked:
+    clip = open_clip(inputs)
+    pitch = _pitch(inputs)
+    settings = inputs.settings(TrackingSettings)
     tracks = track_people(
         clip.cameras,
         clip.detections,
         clip.fps,
         settings,
         pitch_size=None if pitch is None else (pitch.length, pitch.width),
-        people=sources["people"],
+        people=inputs.sources["people"],
         camera_covariance=clip.camera_covariance,
     )
     found = Identities(
@@ -155,14 +150,14 @@ def _track_people(store: Store, work: Work) -> Tracked:
             ground=pitch is not None,
             births=tracks.report.births,
         )
-        said = f"{work.recipe.name} found no person: {reason.message}"
+        said = f"{inputs.recipe.name} found no person: {reason.message}"
     plane = None if pitch is None else _track_on_plane(clip, pitch, found)
     if plane is not None:
         found, further, clocks = plane
         if not len(tracks.person):
             figures |= further
             said = (
-                f"{work.recipe.name} could not triangulate any person: {reason.message} "
+                f"{inputs.recipe.name} could not triangulate any person: {reason.message} "
                 f"{len(found.person)} people are placed on the pitch from their feet, without "
                 f"joints and bodies.{clocks}"
             )
@@ -173,13 +168,13 @@ def _track_people(store: Store, work: Work) -> Tracked:
         np.asarray(found.frame, dtype=np.int64), len(tracks.person), tracks.takeovers, tracks.joins
     )
     if doubts is not None:
-        warnings += (f"{work.recipe.name}: {doubts}.",)
+        warnings += (f"{inputs.recipe.name}: {doubts}.",)
     return found, figures, warnings
 
 
-def _pitch(work: Work) -> PitchTemplate | None:
+def _pitch(inputs: UnitInputs) -> PitchTemplate | None:
     """Return size and surface of the pitch, if there is one."""
-    given: Any = work.recipe.sources["pitch"]
+    given = inputs.sources["pitch"]
     return None if given is None else PitchTemplate.from_spec(PitchSpec(any_size=True, **given))
 
 
@@ -227,7 +222,7 @@ class _Feet:
 
 def _locate_feet(clip: ClipInputs, pitch: PitchTemplate, chosen: NDArray[np.bool_] | None) -> _Feet:
     """Return foot positions by camera of chosen detections; None = all."""
-    pitch = clip.raise_pitch(pitch)
+    pitch = pitch if clip.surface is None else pitch.with_surface(clip.surface)
 
     def locate(first: int) -> tuple[GroundPositions, NDArray[np.int16]]:
         rows = slice(first, first + BLOCK)

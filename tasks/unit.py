@@ -6,13 +6,18 @@ import ctypes
 import functools
 import logging
 import platform
+import shutil
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
+import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from prefect import Task, task
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.context import TaskRunContext
@@ -21,9 +26,10 @@ from prefect.events.worker import EventsWorker
 from prefect.logging.handlers import APILogWorker
 from prefect.settings import PREFECT_API_URL
 
+from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from data_contracts.run import ResultManifest
-from data_contracts.work import Work
+from data_contracts.work import Recipe, Work
 from tasks.watchdog import kill_on_timeout
 from worldpose.errors import (
     CorruptionError,
@@ -35,10 +41,13 @@ from worldpose.errors import (
     require_memory,
 )
 from worldpose.ingest.registration import digest_of_files
+from worldpose.pitch.template import PitchTemplate
 from worldpose.sources import code_version
 from worldpose.store.recipes import libraries, recipe_key
 from worldpose.store.store import Store
+from worldpose.store.writer import ResultWriter
 
+Settings = TypeVar("Settings", bound=Record)
 RETRIES: Final = 2
 RETRY_SECONDS: Final = 1.0
 """Before a retry of a temporary failure."""
@@ -60,19 +69,163 @@ _senders: OrderedDict[str, tuple[APILogWorker, EventsWorker]] = OrderedDict()
 """Senders of this process's log lines and events, by server, the least recently used first."""
 
 
-def unit_task(compute: Callable[[Work], str]) -> Task[[Work], str]:
-    """Turn a function of one `Work` that publishes its result under `work.key` into a task."""
+class Spool:
+    """Arrays by name in a scratch folder, extended by every added chunk."""
 
-    @functools.wraps(compute)
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._form: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+
+    def add(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Append a chunk; frames are the first dimension."""
+        for name, values in arrays.items():
+            frames = self._form[name][1][0] if name in self._form else 0
+            with (self._folder / name).open("ab") as file:
+                np.ascontiguousarray(values).tofile(file)
+            self._form[name] = (values.dtype, (frames + len(values), *values.shape[1:]))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all added data, read from disk on access."""
+        return {
+            name: np.memmap(self._folder / name, dtype, "r", shape=shape)
+            if np.prod(shape)
+            else np.empty(shape, dtype)
+            for name, (dtype, shape) in self._form.items()
+        }
+
+
+@dataclass(frozen=True)
+class UnitInputs:
+    """What one unit is computed from.
+
+    Attributes:
+        store: store with its input results.
+        work: the work order.
+    """
+
+    store: Store
+    work: Work
+
+    @property
+    def recipe(self) -> Recipe:
+        """All that the result depends on."""
+        return self.work.recipe
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit in its stage."""
+        return self.recipe.unit
+
+    @property
+    def sources(self) -> dict[str, Any]:
+        """Input from the match folder."""
+        return self.recipe.sources
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """(frames,) match frames of the unit's clip."""
+        first = self.sources["first_frame"]
+        return np.arange(first, first + self.sources["frame_count"])
+
+    @property
+    def pitch(self) -> PitchTemplate | None:
+        """The pitch of the match; None without one."""
+        pitch = self.sources["pitch"]
+        return None if pitch is None else PitchTemplate.from_spec(PitchSpec.model_validate(pitch))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether `stage/unit` is an input."""
+        return name in self.recipe.inputs
+
+    def open(self, name: str) -> xr.Dataset:
+        """Open the input `stage/unit`; every byte is verified against its manifest on read.
+
+        Raises:
+            StoreError: the input is not published.
+        """
+        stage, _, unit = name.partition("/")
+        return self.store.open_result(self.recipe.match_id, stage, unit, self.recipe.inputs[name])
+
+    def open_first(self, *names: str) -> xr.Dataset:
+        """Open the first of these results that is an input."""
+        return self.open(next(name for name in names if name in self))
+
+    def made_from(self, name: str) -> UnitInputs:
+        """Return what the input `stage/unit` was computed from."""
+        stage, _, unit = name.partition("/")
+        key = self.recipe.inputs[name]
+        recipe = self.store.manifest(self.recipe.match_id, stage, unit, key).recipe
+        return UnitInputs(self.store, self.work.model_copy(update={"recipe": recipe}))
+
+    def settings(self, kind: type[Settings]) -> Settings:
+        """Return the settings that it is computed with."""
+        return kind.model_validate(self.recipe.settings)
+
+    def open_uncorrected(self, corrections: str) -> tuple[xr.Dataset, ResultManifest] | None:
+        """Return the published result of the same recipe without corrections; None without one.
+
+        A new computation would give the same bytes.
+
+        Args:
+            corrections: name of the source with people's corrections.
+        """
+        recipe = self.recipe
+        sources = {name: each for name, each in recipe.sources.items() if name != corrections}
+        key = recipe_key(recipe.model_copy(update={"sources": sources}))
+        place = (recipe.match_id, recipe.stage, recipe.unit, key)
+        if not self.store.has(*place):
+            return None
+        return self.store.open_result(*place), self.store.manifest(*place)
+
+    @contextmanager
+    def open_spool(self) -> Iterator[Spool]:
+        """Yield a temporary spool next to the results in progress, where there is disk space."""
+        folder = self.store.blobs.create_staging()
+        try:
+            yield Spool(folder)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def file(self, name: str) -> Path:
+        """Return the file or folder of the match folder that a source names."""
+        return Path(self.work.folder, self.sources[name])
+
+    def require_registered(self, name: str) -> None:
+        """Refuse the content of `file(name)` if it differs from the registered one.
+
+        Call it after reading, so that it detects changes in between.
+
+        Raises:
+            InputError: the file differs from the registered one.
+        """
+        require_registered(self.file(name), self.sources[f"{name}_sha256"])
+
+
+def unit_task(compute: Callable[[UnitInputs, ResultWriter], None]) -> Task[[Work], str]:
+    """Turn a function that writes the result of one unit into a task that publishes it.
+
+    The task takes the work order, and returns the key of the result.
+    """
+
+    def publish(work: Work) -> str:
+        store = Store.open(work.project)
+        with store.publish(work) as result:
+            compute(UnitInputs(store, work), result)
+        return work.key
+
+    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
+        setattr(publish, name, getattr(compute, name))
+
+    @functools.wraps(publish)
     def run_checked(work: Work) -> str:
         # A log line that Prefect's server rejects (a full disk) is not output of a worker.
         logging.raiseExceptions = False
         send_to_own_server()
         keep_freed_memory()
-        require_same_code(work)
+        require_same_code(work, compute.__module__)
         with kill_on_timeout(work):
             try:
-                return compute(work)
+                return publish(work)
             except WorldposeError:
                 raise
             except Exception as error:
@@ -107,14 +260,18 @@ def keep_freed_memory() -> None:
     mallopt(_TRIM_THRESHOLD, TRIM_BYTES)
 
 
-def require_same_code(work: Work) -> None:
+def require_same_code(work: Work, module: str) -> None:
     """Refuse to compute with other code than that of the key.
+
+    Args:
+        work: the work order.
+        module: module of its task.
 
     Raises:
         InputError: this process has other sources or libraries than the planning process.
     """
     recipe = work.recipe
-    ours = {**code_version(f"tasks.{recipe.stage}"), **libraries()}
+    ours = {**code_version(module), **libraries()}
     theirs = {**recipe.code, **recipe.libraries}
     differing = sorted(name for name in ours | theirs if ours.get(name) != theirs.get(name))
     if differing:
@@ -146,42 +303,6 @@ def send_to_own_server() -> None:
     while len(_senders) > MAX_SERVERS:
         for sender in _senders.popitem(last=False)[1]:
             threading.Thread(target=sender.drain, daemon=True).start()  # its server may be gone
-
-
-def open_input(store: Store, work: Work, name: str) -> xr.Dataset:
-    """Open a published input of this work; every byte is verified against its manifest on read.
-
-    Args:
-        store: the store.
-        work: the current work order.
-        name: the input as `stage/unit`.
-
-    Raises:
-        StoreError: the input is not published.
-    """
-    stage, _, unit = name.partition("/")
-    return store.open_result(work.recipe.match_id, stage, unit, work.recipe.inputs[name])
-
-
-def open_uncorrected(
-    store: Store, work: Work, corrections: str
-) -> tuple[xr.Dataset, ResultManifest] | None:
-    """Return the published result of the same recipe without corrections; None if there is none.
-
-    A new computation would give the same bytes.
-
-    Args:
-        store: the store.
-        work: the current work order.
-        corrections: name of the source with people's corrections.
-    """
-    recipe = work.recipe
-    sources = {name: each for name, each in recipe.sources.items() if name != corrections}
-    key = recipe_key(recipe.model_copy(update={"sources": sources}))
-    if not store.has(recipe.match_id, recipe.stage, recipe.unit, key):
-        return None
-    result = store.open_result(recipe.match_id, recipe.stage, recipe.unit, key)
-    return result, store.manifest(recipe.match_id, recipe.stage, recipe.unit, key)
 
 
 def require_registered(path: Path, sha256: str) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import traceback
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Final
 
 
@@ -50,6 +52,26 @@ def _input_error(
 
 class UsageError(InputError):
     """A command or setting that does not exist or does not fit."""
+
+
+def unknown_name(where: str, name: str, known: Iterable[str], todo: str = "") -> UsageError:
+    """Return the error for a name that is none of the known ones.
+
+    Args:
+        where: option with the name: `--clip second`.
+        name: the unknown name.
+        known: the known names.
+        todo: what the user can do; by default a similar name, if there is one.
+    """
+    names = list(known)
+    close = get_close_matches(name, names, n=1)
+    meant = f"Did you mean {close[0]!r}?" if close else ""
+    return UsageError(
+        where,
+        expected=f"one of {', '.join(names) or '(none)'}",
+        found=repr(name),
+        todo=" ".join(filter(None, (meant, todo))) or "Choose one of these.",
+    )
 
 
 class DegenerateError(WorldposeError):

@@ -49,11 +49,11 @@ GROUPS: Final = {
     "Find out why": {
         "why": "lineage:why",
         "diff": "lineage:diff",
-        "timings": "timings:timings",
+        "timings": "lineage:timings",
     },
     "Keep the project in order": {
-        "pin": "pins:pin",
-        "unpin": "pins:unpin",
+        "pin": "project:pin",
+        "unpin": "project:unpin",
         "verify": "project:verify",
         "gc": "project:gc",
     },

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.console import JsonOption, line, print_json
+from flows.cli.console import JsonOption, answer
 from flows.cli.options import BodyFolderOption
 from worldpose.body.body_file import body_path, install_body
 
@@ -29,7 +29,5 @@ def install(
     """
     model = install_body(file, body_folder, name)
     path = body_path(model.name, body_folder)
-    if as_json:
-        print_json({"body_model": model.name, "file": str(path)})
-    else:
-        line(f"installed body model {model.name} as {path}")
+    told = f"installed body model {model.name} as {path}"
+    answer(as_json, {"body_model": model.name, "file": str(path)}, told)

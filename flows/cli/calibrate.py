@@ -9,7 +9,7 @@ import typer
 
 from data_contracts.arrays import Image
 from flows.cli.console import JsonOption, line, print_json, print_table
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.video.names import is_video
 
 if TYPE_CHECKING:
@@ -121,12 +121,7 @@ def _cameras(boards: Path, camera: str | None) -> dict[str, Path]:
             todo=f"Name the folders after the cameras; images end with {', '.join(IMAGES)}.",
         )
     if camera is not None and camera not in places:
-        raise UsageError(
-            f"--camera {camera}",
-            expected=f"one of {', '.join(places)}",
-            found=repr(camera),
-            todo="Correct the name.",
-        )
+        raise unknown_name(f"--camera {camera}", camera, places)
     return places if camera is None else {camera: places[camera]}
 
 

@@ -63,6 +63,15 @@ def line(text: str, *, to: Console = output) -> None:
     to.print(text, markup=False, highlight=False)
 
 
+def answer(as_json: bool, value: Mapping[str, Any], *lines: str) -> None:
+    """Print what a command did: one JSON object, or lines for people."""
+    if as_json:
+        print_json(value)
+    else:
+        for text in lines:
+            line(text)
+
+
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a plain table; columns that start with ">" are right-aligned.
 

@@ -9,6 +9,11 @@ import typer
 
 from flows.cli.console import JsonOption, errors, line, print_json, print_table
 
+FpsOption = Annotated[
+    float | None,
+    typer.Option("--fps", min=0.001, help="Frames per second; by default the data set's, or 50."),
+]
+
 
 def statistics(
     folders: Annotated[
@@ -22,12 +27,7 @@ def statistics(
         Path | None,
         typer.Option("--page", help="Write an HTML page with statistics and check results."),
     ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(
-            "--fps", min=0.001, help="Frames per second; by default the data set's, or 50."
-        ),
-    ] = None,
+    fps: FpsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count a data set as the paper does: clips, frames, poses, people, distances.
@@ -95,12 +95,7 @@ FAULTY = 1
 
 def check(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of an exported data set.")],
-    fps: Annotated[
-        float | None,
-        typer.Option(
-            "--fps", min=0.001, help="Frames per second; by default the data set's, or 50."
-        ),
-    ] = None,
+    fps: FpsOption = None,
     body: Annotated[
         str | None,
         typer.Option("--body", help="Body model of pose files without one; the open body."),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import typer
@@ -28,6 +28,8 @@ from worldpose.errors import UsageError
 if TYPE_CHECKING:
     from flows.results.ablation import Score
     from flows.results.evaluation import Scores
+
+TableForm = Literal["text", "csv", "latex"]
 
 
 def evaluate(
@@ -99,7 +101,7 @@ def evaluate(
         ),
     ] = None,
     table: Annotated[
-        str, typer.Option("--table", help="Table of methods: text, csv or latex.")
+        TableForm, typer.Option("--table", help="Table of methods: text, csv or latex.")
     ] = "text",
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
@@ -269,9 +271,6 @@ def _row(name: str, scores: list[Score]) -> tuple[str, str, str, str, str]:
     )
 
 
-FORMS: Final = ("text", "csv", "latex")
-
-
 def named_rates(given: Sequence[str]) -> dict[str, float]:
     """Parse NAME=FPS arguments into numbers by name.
 
@@ -295,21 +294,10 @@ def named_rates(given: Sequence[str]) -> dict[str, float]:
     return rates
 
 
-def print_methods(scores: Sequence[MethodScore], form: str, *, as_json: bool) -> None:
-    """Print scores of methods as text, CSV or LaTeX, or in full as JSON.
-
-    Raises:
-        UsageError: an unknown format.
-    """
+def print_methods(scores: Sequence[MethodScore], form: TableForm, *, as_json: bool) -> None:
+    """Print scores of methods as text, CSV or LaTeX, or in full as JSON."""
     from flows.results.baselines import COLUMNS, table_csv, table_latex, table_rows
 
-    if form not in FORMS:
-        raise UsageError(
-            f"--table {form}",
-            expected=", ".join(FORMS),
-            found=repr(form),
-            todo="Choose one of these.",
-        )
     if as_json:
         rows = [score.model_dump(mode="json", exclude_none=True) for score in scores]
         print_json({"methods": rows, "table": [list(row) for row in table_rows(scores)]})

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Final, get_args
 
 import typer
 from pydantic import JsonValue, ValidationError
@@ -15,16 +14,19 @@ from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    answer,
     errors,
     line,
     print_json,
     print_table,
 )
-from worldpose.errors import UsageError
+from flows.settings import parse_value
+from worldpose.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     from worldpose.training.settings import FineTuningSettings
 
+NETS: Final[tuple[NetKind, ...]] = get_args(NetKind)
 SETTING = {"people": "detection.detector", "keypoints": "detection.pose"}
 """Setting that selects each net in a run."""
 
@@ -56,10 +58,8 @@ def label(
 
     settings = DetectionSettings(detector=tuple(detectors or ["embedded"]), pose=pose)
     frames = propose_labels(videos, every, out, settings)
-    if as_json:
-        print_json({"frames": frames, "labels": str(out / "labels.json")})
-    else:
-        line(f"proposed labels of {frames} frames: correct {out / 'labels.json'}")
+    told = f"proposed labels of {frames} frames: correct {out / 'labels.json'}"
+    answer(as_json, {"frames": frames, "labels": str(out / "labels.json")}, told)
 
 
 def finetune(
@@ -98,7 +98,7 @@ def finetune(
             found="a URL",
             todo="Train in a local project: settings name weights by file.",
         )
-    kinds = tuple(_kind(name, "--net") for name in nets or get_args(NetKind))
+    kinds = tuple(_kind(name, "--net") for name in nets or NETS)
     begin = {
         _kind(name, "--start"): Path(file) for name, file in map(_split_assignment, starts or [])
     }
@@ -131,7 +131,14 @@ def finetune(
 
 def _print(versions: list[NetVersion], folder: Path) -> None:
     rows = [
-        (v.net, v.figure, f"{v.before:.3f}", f"{v.after:.3f}", str(len(v.held_out)), _verdict(v))
+        (
+            v.net,
+            v.figure,
+            f"{v.before:.3f}",
+            f"{v.after:.3f}",
+            str(len(v.held_out)),
+            "adopted" if v.adopted else "not better: the old version stays",
+        )
         for v in versions
     ]
     columns = ("net", "metric", ">before", ">after", ">held-out images", "")
@@ -141,21 +148,11 @@ def _print(versions: list[NetVersion], folder: Path) -> None:
         line(f"use it with: worldpose run MATCH {' '.join(chosen)}")
 
 
-def _verdict(version: NetVersion) -> str:
-    return "adopted" if version.adopted else "not better: the old version stays"
-
-
 def _kind(name: str, where: str) -> NetKind:
-    kinds: tuple[NetKind, ...] = get_args(NetKind)
-    for kind in kinds:
+    for kind in NETS:
         if name == kind:
             return kind
-    raise UsageError(
-        f"{where} {name}",
-        expected=" or ".join(kinds),
-        found=repr(name),
-        todo="Name one of the two nets.",
-    )
+    raise unknown_name(f"{where} {name}", name, NETS)
 
 
 def _split_assignment(assignment: str) -> tuple[str, str]:
@@ -178,12 +175,8 @@ def _settings(assignments: list[str]) -> FineTuningSettings:
     groups: dict[str, dict[str, JsonValue]] = {"": {}, "training": {}}
     for assignment in assignments:
         name, text = _split_assignment(assignment)
-        try:
-            value = json.loads(text)
-        except ValueError:
-            value = text
         group, _, field = name.rpartition(".")
-        groups.setdefault(group, {})[field] = value
+        groups.setdefault(group, {})[field] = parse_value(text)
     given = {**groups.pop(""), **groups}
     try:
         return FineTuningSettings.model_validate(given)

@@ -1,4 +1,4 @@
-"""Commands that explain results: diff, why."""
+"""Commands that explain results: diff, why, timings."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ import typer
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
+    MatchArgument,
     ProjectOption,
+    RunOption,
+    answer,
     line,
     print_json,
     print_table,
 )
-from flows.lineage import explain_unit, find_run, run_difference
+from flows.cli.options import MoreSettingsOption
+from flows.registering import find_registration
 from flows.results.comparison import (
     KINDS,
     SubjectChange,
@@ -23,6 +27,8 @@ from flows.results.comparison import (
     count_marks,
     largest_pose_changes,
 )
+from flows.results.timings import run_time
+from flows.run_status import explain_unit, find_run, run_difference
 from flows.settings import parse_overrides
 from worldpose.store.store import Store
 
@@ -105,14 +111,7 @@ def _print_compared(compared: list[SubjectChange]) -> None:
 
 def why(
     unit: Annotated[str, typer.Argument(metavar="UNIT", help="A unit, as MATCH/STAGE/UNIT.")],
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="STAGE.NAME=VALUE",
-            help="A setting beyond those of the latest run; repeatable.",
-        ),
-    ] = None,
+    assignments: MoreSettingsOption = None,
     project: ProjectOption = DEFAULT_PROJECT,
     as_json: JsonOption = False,
 ) -> None:
@@ -124,10 +123,42 @@ def why(
 
     Example: worldpose why tiny-1/triangulation/clip
     """
-    answer = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
+    found = explain_unit(Store.open(project), unit, parse_overrides(assignments or []))
+    reasons = (f"  {reason}" for reason in found.reasons)
+    answer(as_json, asdict(found), f"{found.unit}: {found.state}", *reasons)
+
+
+def timings(
+    match: MatchArgument,
+    run: RunOption = "latest",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the time of each stage of a run, the idle time, core hours and bytes.
+
+    Example: worldpose timings matches/tiny
+    """
+    store = Store.open(project)
+    found = run_time(store, find_registration(store, match).spec.match_id, run)
     if as_json:
-        print_json(asdict(answer))
+        print_json(asdict(found))
         return
-    line(f"{answer.unit}: {answer.state}")
-    for reason in answer.reasons:
-        line(f"  {reason}")
+    columns = ("stage", ">units", ">elapsed s", ">of the run %", ">work s", ">longest unit s")
+    whole = max(found.seconds, 1e-9)
+    rows = [
+        (
+            each.stage,
+            str(each.units),
+            f"{each.elapsed:.2f}",
+            f"{100.0 * each.elapsed / whole:.1f}",
+            f"{each.work:.2f}",
+            f"{each.longest:.2f}",
+        )
+        for each in found.stages
+    ]
+    for name, seconds in (("start", found.start), ("between units", found.between)):
+        rows.append((name, "", f"{seconds:.2f}", f"{100.0 * seconds / whole:.1f}", "", ""))
+    print_table(f"run {found.run_id}, {found.seconds:.1f} s", columns, rows)
+    line(f"all its results, also those of earlier runs: {found.cost}")
+    if not found.stages:
+        line("nothing was computed by this run; --run names another")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from difflib import get_close_matches
 from math import isnan
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.progress import Progress, TaskID
@@ -18,6 +17,7 @@ from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    answer,
     errors,
     line,
     print_json,
@@ -25,7 +25,7 @@ from flows.cli.console import (
 )
 from flows.registering import register
 from flows.stage import Match
-from worldpose.errors import UsageError, WorldposeError
+from worldpose.errors import UsageError, WorldposeError, unknown_name
 from worldpose.ingest.clicks import import_clicks
 from worldpose.ingest.importing import import_lenses, import_match, import_videos
 from worldpose.ingest.match_folder import unclicked_clips
@@ -92,14 +92,8 @@ def simulate(
         print_table("scenarios", ("name", "what happens"), list(about.items()))
         return
     if scenario not in about:
-        close = get_close_matches(scenario, about, n=1)
-        meant = f"Did you mean {close[0]!r}? " if close else ""
-        raise UsageError(
-            f"--scenario {scenario}",
-            expected=f"one of {', '.join(about)}",
-            found=repr(scenario),
-            todo=f"{meant}List the scenarios: worldpose simulate --scenario list.",
-        )
+        todo = "List the scenarios: worldpose simulate --scenario list."
+        raise unknown_name(f"--scenario {scenario}", scenario, about, todo)
     if out is None:
         raise UsageError(
             "--out", expected="a folder to create", found="none", todo="Add --out FOLDER."
@@ -167,10 +161,8 @@ def _refuse_options(what: str, options: dict[str, bool]) -> None:
 
 def _report_match(match_id: str, out: Path, as_json: bool) -> None:
     """Print the id of the created match."""
-    if as_json:
-        print_json({"match": match_id, "folder": str(out)})
-    else:
-        line(f"made match {match_id} in {out}")
+    about = {"match": match_id, "folder": str(out)}
+    answer(as_json, about, f"made match {match_id} in {out}")
 
 
 @contextmanager
@@ -256,63 +248,38 @@ def import_command(
 
     Example: worldpose import --calibration cal.toml --detections poses --fps 25 --out matches/lab
     """
-    if boxes is not None and videos is None:
-        if calibration or detections or pose2sim or fps or match_id or pitch or left_handed:
-            raise _boxes_alone()
-        if clicks or lens or camera:
-            raise _boxes_alone()
+    options = {
+        "--calibration": calibration,
+        "--detections": detections,
+        "--videos": videos,
+        "--boxes": None if videos else boxes,  # with videos, they are a part of the match
+        "--pose2sim": pose2sim,
+        "--fps": fps,
+        "--match-id": match_id,
+        "--pitch": pitch,
+        "--clicks": clicks,
+        "--camera": camera,
+        "--lens": lens,
+        "--left-handed": left_handed,
+    }
+    given = {name for name, value in options.items() if value}
+    kind = next((name for name in ALONE if name in given), None)
+    if kind is not None:
+        _require_alone(kind, given)
+    if kind == "--boxes" and boxes is not None:
         _import_boxes(boxes, out, as_json=as_json)
-        return
-    if pose2sim is not None:
-        if calibration or detections or videos or pitch or left_handed or clicks or lens or camera:
-            raise UsageError(
-                "--pose2sim",
-                expected="--pose2sim with --out, and --fps or --match-id",
-                found="options of another import",
-                todo="Import the trial first; clicks, lenses and a pitch can be added then.",
-            )
+    elif kind == "--lens" and lens is not None:
+        _import_lenses(lens, out, camera, as_json=as_json)
+    elif kind == "--clicks" and clicks is not None:
+        _import_clicks(clicks, out, camera, as_json=as_json)
+    elif kind == "--pitch" and pitch is not None:
+        import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
+    elif pose2sim is not None:
         spec, notes = import_pose2sim(pose2sim, out, fps=fps, match_id=match_id)
         _print_match(spec, out, notes, as_json=as_json)
-        return
-    if lens:
-        if calibration or detections or videos or fps or match_id or pitch or left_handed or clicks:
-            raise UsageError(
-                "--lens",
-                expected="--lens with --out, and --camera if the file does not name its camera",
-                found="options of a match, of clicks or of a pitch",
-                todo="Import the match first, then the lens into its folder.",
-            )
-        _import_lenses(lens, out, camera, as_json=as_json)
-        return
-    if clicks is not None:
-        if calibration or detections or videos or fps or match_id or pitch or left_handed:
-            raise UsageError(
-                "--clicks",
-                expected="--clicks with --out, and --camera if images are not named after cameras",
-                found="options of a match or a pitch",
-                todo="Import the match first, then the clicks into its folder.",
-            )
-        _import_clicks(clicks, out, camera, as_json=as_json)
-        return
-    if camera is not None:
-        raise UsageError(
-            "--camera",
-            expected="--camera with --clicks or --lens",
-            found="neither",
-            todo="Add one of them.",
-        )
-    if pitch is not None:
-        if calibration or detections or videos or fps or match_id:
-            raise UsageError(
-                "--pitch",
-                expected="--pitch with --out alone",
-                found="options of a match",
-                todo="Import the match first, then the pitch into its folder.",
-            )
-        import_pitch(pitch, out, left_handed=left_handed, as_json=as_json)
-        return
-    if videos is not None and detections is None:
+    elif videos is not None and detections is None:
         spec = import_videos(calibration, videos, out, fps=fps, match_id=match_id, boxes=boxes)
+        _print_match(spec, out, [], as_json=as_json)
     elif calibration is None or detections is None or videos is not None or fps is None:
         raise UsageError(
             "worldpose import",
@@ -322,7 +289,31 @@ def import_command(
         )
     else:
         spec = import_match(calibration, detections, fps, out, match_id=match_id)
-    _print_match(spec, out, [], as_json=as_json)
+        _print_match(spec, out, [], as_json=as_json)
+
+
+ALONE: Final = {
+    "--boxes": ("with --videos, or with --out alone", ()),
+    "--pose2sim": ("with --out, and --fps or --match-id", ("--fps", "--match-id")),
+    "--lens": ("with --out, and --camera if the file does not name its camera", ("--camera",)),
+    "--clicks": ("with --out, and --camera if images are not named after cameras", ("--camera",)),
+    "--camera": ("with --clicks or --lens", ()),
+    "--pitch": ("with --out alone", ("--left-handed",)),
+}
+"""Options that decide what is imported, the first given one; and the others that each may have."""
+
+
+def _require_alone(kind: str, given: set[str]) -> None:
+    """Refuse options of another import."""
+    with_what, allowed = ALONE[kind]
+    others = sorted(given - {kind, *allowed})
+    if others or kind == "--camera":
+        raise UsageError(
+            kind,
+            expected=f"{kind} {with_what}",
+            found=", ".join(others) or f"{kind} alone",
+            todo="Import the match first; the rest can be added to its folder then.",
+        )
 
 
 def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool) -> None:
@@ -345,23 +336,11 @@ def _print_match(spec: MatchSpec, out: Path, notes: list[str], *, as_json: bool)
     line(f"next: worldpose {'run' if is_calibrated else 'ingest'} {out}")
 
 
-def _boxes_alone() -> UsageError:
-    return UsageError(
-        "--boxes",
-        expected="--boxes with --videos, or with --out alone",
-        found="options of another import",
-        todo="Import the match first, then the boxes into its folder.",
-    )
-
-
 def _import_boxes(boxes: Path, out: Path, *, as_json: bool) -> None:
     """Copy boxes into a match folder, and print how many there are."""
     counts = import_boxes(boxes, out)
-    if as_json:
-        print_json({"folder": str(out), "boxes": counts})
-        return
-    for name, count in counts.items():
-        line(f"wrote {out / 'boxes' / name}.txt: {count} boxes")
+    lines = (f"wrote {out / 'boxes' / name}.txt: {count} boxes" for name, count in counts.items())
+    answer(as_json, {"folder": str(out), "boxes": counts}, *lines)
 
 
 def _import_lenses(files: list[Path], out: Path, camera: str | None, *, as_json: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
@@ -12,9 +11,9 @@ from rich.progress import BarColumn, DownloadColumn, Progress
 
 from data_contracts.checkpoint import Checkpoint
 from flows.checkpoint_downloads import find_damage, pull, read_catalog
-from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from flows.cli.console import JsonOption, answer, errors, print_json, print_table
 from worldpose.detection.models import model_folder, read_pulled
-from worldpose.errors import UsageError, WorldposeError
+from worldpose.errors import WorldposeError, unknown_name
 
 commands = typer.Typer(name="models", help=__doc__, no_args_is_help=True, rich_markup_mode=None)
 
@@ -46,12 +45,11 @@ def list_models(
     """
     place = folder or model_folder()
     known = read_catalog(catalog)
-    for path in sorted(place.iterdir()) if place.is_dir() else ():
-        pulled = None if path.name.startswith(".") else read_pulled(path.name, place)
-        if pulled is not None:
-            known.setdefault(pulled.name, pulled)
+    there = _read_all_pulled(place)
+    for name, pulled in there.items():
+        known.setdefault(name, pulled)
     if as_json:
-        rows = [_describe(each, place) for each in known.values()]
+        rows = [_describe(each, each.name in there) for each in known.values()]
         print_json({"folder": str(place), "models": rows})
         return
     columns = ("name", "setting", ">MB", "licence", "pulled", "what it is")
@@ -64,12 +62,19 @@ def list_models(
                 _setting_for(each),
                 f"{(_size(each) or 0) / 1e6:.0f}" if _size(each) else "-",
                 each.licence,
-                "no" if read_pulled(each.name, place) is None else "yes",
+                "yes" if each.name in there else "no",
                 each.about,
             )
             for each in known.values()
         ],
     )
+
+
+def _read_all_pulled(place: Path) -> dict[str, Checkpoint]:
+    """Return the pulled checkpoints by the names of their folders, sorted."""
+    names = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
+    found = {name: read_pulled(name, place) for name in names if not name.startswith(".")}
+    return {name: pulled for name, pulled in found.items() if pulled is not None}
 
 
 def _setting_for(checkpoint: Checkpoint) -> str:
@@ -82,13 +87,13 @@ def _size(checkpoint: Checkpoint) -> int | None:
     return sum(sizes) if sizes else None
 
 
-def _describe(checkpoint: Checkpoint, folder: Path) -> dict[str, object]:
+def _describe(checkpoint: Checkpoint, is_pulled: bool) -> dict[str, object]:
     return {
         "name": checkpoint.name,
         "setting": _setting_for(checkpoint),
         "bytes": _size(checkpoint),
         "licence": checkpoint.licence,
-        "pulled": read_pulled(checkpoint.name, folder) is not None,
+        "pulled": is_pulled,
         "about": checkpoint.about,
         "files": [file.model_dump(exclude_none=True) for file in checkpoint.files],
     }
@@ -123,13 +128,9 @@ def pull_model(
             bars.update(tasks[file], completed=done, total=total or None)
 
         path = pull(checkpoint, place, advance)
-    if as_json:
-        print_json({"name": name, "folder": str(path), "setting": _setting_for(checkpoint)})
-        return
-    line(
-        f"pulled {name} into {path} ({checkpoint.licence}); "
-        f"use it: --set {_setting_for(checkpoint)}"
-    )
+    setting = _setting_for(checkpoint)
+    told = f"pulled {name} into {path} ({checkpoint.licence}); use it: --set {setting}"
+    answer(as_json, {"name": name, "folder": str(path), "setting": setting}, told)
 
 
 @commands.command(name="verify")
@@ -146,23 +147,17 @@ def verify_models(
     Example: worldpose models verify
     """
     place = folder or model_folder()
-    there = {
-        path.name: pulled
-        for path in (sorted(place.iterdir()) if place.is_dir() else ())
-        if not path.name.startswith(".") and (pulled := read_pulled(path.name, place)) is not None
-    }
+    there = _read_all_pulled(place)
     checked = {name: _find(name, there) for name in (names or there)}
     damaged = {name: find_damage(place / name, each) for name, each in checked.items()}
     wrong = {name: files for name, files in damaged.items() if files}
     for name in wrong:
         shutil.rmtree(place / name)
-    if as_json:
-        print_json(
-            {"folder": str(place), "right": sorted(set(checked) - set(wrong)), "removed": wrong}
-        )
-    else:
-        for name in checked:
-            line(f"{name}: {'removed' if name in wrong else 'all digests are right'}")
+    answer(
+        as_json,
+        {"folder": str(place), "right": sorted(set(checked) - set(wrong)), "removed": wrong},
+        *(f"{name}: {'removed' if name in wrong else 'all digests are right'}" for name in checked),
+    )
     if wrong:
         said = "; ".join(f"{name}: {', '.join(files)}" for name, files in wrong.items())
         raise WorldposeError(
@@ -173,11 +168,6 @@ def verify_models(
 
 def _find(name: str, known: dict[str, Checkpoint]) -> Checkpoint:
     if name not in known:
-        near = get_close_matches(name, known)
-        raise UsageError(
-            "worldpose models",
-            expected=f"one of {', '.join(known) or 'no checkpoint, since none is pulled'}",
-            found=repr(name) + (f"; did you mean {' or '.join(near)}?" if near else ""),
-            todo="List the names: worldpose models list. --catalog FILE adds your own.",
-        )
+        todo = "List the names: worldpose models list. --catalog FILE adds your own."
+        raise unknown_name("worldpose models", name, known, todo)
     return known[name]

@@ -27,6 +27,14 @@ TimeLimitOption = Annotated[
     ),
 ]
 
+MoreSettingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="STAGE.NAME=VALUE",
+        help="A setting beyond those of a match's latest run; repeatable.",
+    ),
+]
 BodyFolderOption = Annotated[
     Path | None,
     typer.Option(

@@ -11,7 +11,7 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from flows.cli.console import JsonOption, errors, line, print_json, print_table
+from flows.cli.console import JsonOption, answer, errors, line, print_json, print_table
 from worldpose.errors import InputError, UsageError
 
 ANALYSED_WIDTH = 320
@@ -154,9 +154,10 @@ def _take(programme: Path, take: str, out: Path, *, as_json: bool) -> None:
         "broadcast": "main",
         "broadcast_offset_frames": offset,
     }
-    if as_json:
-        print_json({"video": str(out), "clip": {**entry, "first_frame": None}})
-        return
     said = ", ".join(f"{key}: {value}" for key, value in entry.items())
-    line(f"wrote {out}; for match.yaml, first_frame being its match frame:")
-    line(f"  - {{{said}}}")
+    answer(
+        as_json,
+        {"video": str(out), "clip": {**entry, "first_frame": None}},
+        f"wrote {out}; for match.yaml, first_frame being its match frame:",
+        f"  - {{{said}}}",
+    )

@@ -1,17 +1,18 @@
-"""Commands on a whole project: init, status, verify, gc."""
+"""Commands on a whole project: init, status, verify, gc, and names of runs: pin, unpin."""
 
 from __future__ import annotations
 
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
 import typer
 
-from data_contracts.run import WaitingUnit
+from data_contracts.pin import Pin
 from flows.cli.console import (
     DEFAULT_PROJECT,
     JsonOption,
     ProjectOption,
+    answer,
     errors,
     line,
     print_json,
@@ -21,13 +22,13 @@ from flows.cli.console import (
 from flows.registering import find_registration, open_match
 from flows.review.verdicts import still_waiting
 from flows.run_record import latest_run, resolve_settings
-from flows.run_status import UnitState, list_unit_states
-from worldpose.errors import WorldposeError
+from flows.run_status import UnitState, find_run, list_unit_states
+from worldpose.errors import UsageError, WorldposeError
 from worldpose.store.garbage import collect, plan_gc
 from worldpose.store.integrity import repair
 from worldpose.store.integrity import verify as verify_store
-from worldpose.store.paths import damaged_path
-from worldpose.store.runs import list_pins
+from worldpose.store.paths import checked_name, damaged_path
+from worldpose.store.runs import list_pins, pin_run, unpin_run
 from worldpose.store.store import Store
 
 
@@ -40,10 +41,7 @@ def init(
     Example: worldpose init worldpose-data
     """
     store = Store.create(folder)
-    if as_json:
-        print_json({"project": store.url})
-    else:
-        line(f"created project {store.url}")
+    answer(as_json, {"project": store.url}, f"created project {store.url}")
 
 
 def status(
@@ -108,52 +106,49 @@ STATES = tuple(state.value for state in UnitState)
 
 def _match_status(store: Store, match_id: str) -> dict[str, Any]:
     """Return one match's status; unreadable parts are reported, and do not affect other matches."""
-    try:
-        return _readable_status(store, match_id)
-    except (OSError, WorldposeError) as failure:  # a damaged record, an unresponsive disk
-        return {
-            "match": match_id,
-            "run": None,
-            "state": "unreadable",
-            "units": {state: [] for state in STATES},
-            "failed": [],
-            "left_out": {},
-            "warnings": [],
-            "waiting": [],
-            "settings": {},
-            "unfinished_runs": [],
-            "pins": {},
-            "problem": str(failure),
-        }
-
-
-def _readable_status(store: Store, match_id: str) -> dict[str, Any]:
-    latest = latest_run(store, match_id)
-    units: dict[str, list[str]] = {state: [] for state in STATES}
-    problem = None
-    waiting: list[WaitingUnit] = []
-    asked, _ = resolve_settings(store, match_id, latest, {})
-    try:
-        match = open_match(store, match_id)
-        found = list_unit_states(store, match, latest)
-    except (OSError, WorldposeError) as failure:  # a setting can name a missing file, too
-        problem = str(failure)
-    else:
-        waiting = still_waiting(store, match, latest)
-        units = {state.value: names for state, names in found.items()}
-    return {
+    status: dict[str, Any] = {
         "match": match_id,
-        "run": None if latest is None else latest.run_id,
-        "state": "not run" if latest is None else latest.state,
-        "units": units,
-        "failed": [] if latest is None else [failure.unit for failure in latest.failed],
-        "left_out": {} if latest is None else latest.left_out,
-        "warnings": [] if latest is None else list(latest.warnings),
-        "waiting": [unit.unit for unit in waiting],
-        "settings": asked,
+        "run": None,
+        "state": "unreadable",
+        "units": {state: [] for state in STATES},
+        "failed": [],
+        "left_out": {},
+        "warnings": [],
+        "waiting": [],
+        "settings": {},
+        "unfinished_runs": [],
+        "pins": {},
+        "problem": None,
+    }
+    try:
+        status |= _recorded_status(store, match_id)
+        latest, match = latest_run(store, match_id), open_match(store, match_id)
+        found = list_unit_states(store, match, latest)
+        status["units"] = {state.value: names for state, names in found.items()}
+        status["waiting"] = [unit.unit for unit in still_waiting(store, match, latest)]
+    except (OSError, WorldposeError) as failure:  # a damaged record, a setting names a lost file
+        status["problem"] = str(failure)
+    return status
+
+
+def _recorded_status(store: Store, match_id: str) -> dict[str, Any]:
+    """Return what the records of a match's runs tell, without its folder."""
+    latest = latest_run(store, match_id)
+    settings, _ = resolve_settings(store, match_id, latest, {})
+    told: dict[str, Any] = {"state": "not run"}
+    if latest is not None:
+        told = {
+            "run": latest.run_id,
+            "state": latest.state,
+            "failed": [failure.unit for failure in latest.failed],
+            "left_out": latest.left_out,
+            "warnings": list(latest.warnings),
+        }
+    return {
+        **told,
+        "settings": settings,
         "unfinished_runs": [run.run_id for run in store.unfinished_runs(match_id)],
         "pins": {pin.name: pin.run_id for pin in list_pins(store.blobs, match_id)},
-        "problem": problem,
     }
 
 
@@ -227,13 +222,67 @@ def gc(
         store, keep_last=keep_last, forget=forget or [], older_than=timedelta(hours=older_than)
     )
     freed = collect(store, plan) if delete else 0
-    if as_json:
-        rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
-        print_json({"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed})
-        return
-    for garbage in plan.garbage:
-        line(f"{garbage.path}  {garbage.reason}")
-    for reason in plan.held:
-        line(reason)
+    rows = [{"path": g.path, "reason": g.reason, "bytes": g.size} for g in plan.garbage]
     verb = "removed" if delete else "no run reaches"
-    line(f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB")
+    answer(
+        as_json,
+        {"garbage": rows, "held": plan.held, "bytes": plan.size, "freed": freed},
+        *(f"{garbage.path}  {garbage.reason}" for garbage in plan.garbage),
+        *plan.held,
+        f"{verb} {len(plan.garbage)} things, {plan.size / 1e6:.1f} MB",
+    )
+
+
+def pin(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="MATCH/NUMBER, or MATCH: its latest.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the pin, such as v1.")],
+    who: Annotated[
+        str, typer.Option("--who", envvar="WORLDPOSE_REVIEWER", help="Your name; it is recorded.")
+    ],
+    why: Annotated[str, typer.Option(help="Reason for the pin; it is recorded.")] = "",
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Name a run and keep it: gc never forgets a named run, and --run accepts the name.
+
+    Example: worldpose pin tiny-1/0002 paper --who Ada --why "figures of the paper"
+    """
+    store = Store.open(project)
+    record = find_run(store, run)
+    kept = pin_run(
+        store.blobs,
+        Pin(
+            match_id=record.match_id,
+            name=checked_name(name),
+            run_id=record.run_id,
+            who=who,
+            why=why,
+            pinned_at=datetime.now(UTC),
+        ),
+    )
+    _say_pin(kept, "pinned", as_json)
+
+
+def unpin(
+    named: Annotated[str, typer.Argument(metavar="MATCH/NAME", help="A name given by pin.")],
+    project: ProjectOption = DEFAULT_PROJECT,
+    as_json: JsonOption = False,
+) -> None:
+    """Remove the name of a run; gc may then forget the run like any other.
+
+    Example: worldpose unpin tiny-1/paper
+    """
+    match_id, slash, name = named.partition("/")
+    if not (match_id and slash and name):
+        raise UsageError(
+            f"unpin {named}",
+            expected="MATCH/NAME",
+            found=repr(named),
+            todo="List the names: worldpose status.",
+        )
+    _say_pin(unpin_run(Store.open(project).blobs, match_id, name), "unpinned", as_json)
+
+
+def _say_pin(kept: Pin, verb: str, as_json: bool) -> None:
+    told = f"{verb} run {kept.run_id} of {kept.match_id} as {kept.name}"
+    answer(as_json, kept.model_dump(mode="json"), told)

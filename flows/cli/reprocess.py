@@ -19,7 +19,7 @@ from flows.cli.console import (
     print_table,
     progress,
 )
-from flows.cli.options import DaskOption, TimeLimitOption, WorkersOption
+from flows.cli.options import DaskOption, MoreSettingsOption, TimeLimitOption, WorkersOption
 from flows.orchestration.time_limits import parse_time_limits
 from flows.registering import find_registration
 from flows.reprocess import Reprocessed, reprocess_matches
@@ -45,14 +45,7 @@ def reprocess(
     retry: Annotated[
         bool, typer.Option("--retry", help="Retry failed units, even without an edit.")
     ] = False,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="STAGE.NAME=VALUE",
-            help="A setting beyond those of each match's latest run; repeatable.",
-        ),
-    ] = None,
+    assignments: MoreSettingsOption = None,
     dask: DaskOption = None,
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,

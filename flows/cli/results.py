@@ -17,9 +17,9 @@ from flows.cli.console import (
     ProjectOption,
     RunOption,
     StageOption,
+    answer,
     errors,
     line,
-    print_json,
 )
 from worldpose.errors import InputError, UsageError
 from worldpose.store.runs import LATEST
@@ -128,13 +128,11 @@ def export(
         written = export_formats(origin, forms, out, overwrite=overwrite)
     else:
         written = write_release(store, origin, forms, out, release, origin.licence)
-    if as_json:
-        files = [str(path) for path in written]
-        print_json({"match": name, "files": files})
-    else:
-        for path in written:
-            size = f", {path.stat().st_size / 1e6:.1f} MB" if path.suffix == ".html" else ""
-            line(f"wrote {path}{size}")
+    sizes = {
+        path: f", {path.stat().st_size / 1e6:.1f} MB" for path in written if path.suffix == ".html"
+    }
+    told = (f"wrote {path}{sizes.get(path, '')}" for path in written)
+    answer(as_json, {"match": name, "files": [str(path) for path in written]}, *told)
 
 
 def _read_licence(file: Path) -> str:
@@ -234,14 +232,13 @@ def report(
     if figures is not None:
         names = {file.name: None for file in figures.glob("[0-9][0-9]-*.*")}
         record_owner(figures, names, known.match_id)
-    if as_json:
-        written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
-        folder = {} if figures is None else {"figures": str(figures.resolve())}
-        print_json({"match": known.match_id, **written, **folder})
-    else:
-        line(f"report:  {out.resolve()}")
-        for film in films:
-            line(f"video:   {film.resolve()}")
-        if figures is not None:
-            line(f"figures: {figures.resolve()}")
-        line(f"results: {store.url}/results/{known.match_id}")
+    written = {"report": str(out.resolve()), "videos": [str(film.resolve()) for film in films]}
+    folder = {} if figures is None else {"figures": str(figures.resolve())}
+    answer(
+        as_json,
+        {"match": known.match_id, **written, **folder},
+        f"report:  {out.resolve()}",
+        *(f"video:   {film.resolve()}" for film in films),
+        *(f"figures: {place}" for place in folder.values()),
+        f"results: {store.url}/results/{known.match_id}",
+    )

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from itertools import pairwise
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import JsonValue
@@ -80,7 +80,7 @@ def run(
     workers: WorkersOption = None,
     time_limits: TimeLimitOption = None,
     gates: Annotated[
-        str | None,
+        GatePolicy | None,
         typer.Option(
             metavar="POLICY",
             help="When results need review: never (default), auto (metrics beyond limits) or "
@@ -111,7 +111,6 @@ def run(
         return
     overrides = parse_overrides(assignments or [], selected_stages(from_stage, until_stage))
     store = Store.open_or_new(project)
-    policy = None if gates is None else _policy(gates)
     stated = None if iterations is None else parse_iterations(iterations)
     set_body_folder(body_folder)
     request = RunRequest(
@@ -120,7 +119,7 @@ def run(
         until_stage,
         dask,
         workers,
-        policy,
+        gates,
         time_limits=parse_time_limits(time_limits or ()),
         default_settings=default_settings,
     )
@@ -170,19 +169,6 @@ def run(
 def _stated_click_noise(record: RunRecord) -> float:
     stated = record.settings.get("static_calibration", {}).get("click_noise_px")
     return float(stated) if isinstance(stated, int | float) else 1.0
-
-
-def _policy(gates: str) -> GatePolicy:
-    policies: tuple[GatePolicy, ...] = get_args(GatePolicy)
-    for policy in policies:
-        if gates == policy:
-            return policy
-    raise UsageError(
-        f"--gates {gates}",
-        expected="never, auto or always",
-        found=repr(gates),
-        todo="Read the help: worldpose run --help.",
-    )
 
 
 def _print_settings(as_json: bool) -> None:

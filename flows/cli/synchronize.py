@@ -28,7 +28,7 @@ from flows.run_record import require_no_other_run
 from flows.running import RunRequest, run_match
 from flows.stage import Match
 from flows.stages.detection import seen_by, seen_by_cameras
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import InputError, unknown_name
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Run, Store
@@ -147,12 +147,7 @@ def choose_clip(spec: MatchSpec, clip: str | None) -> str:
     """
     names = [each.id for each in spec.clips]
     if clip is not None and clip not in names:
-        raise UsageError(
-            f"--clip {clip}",
-            expected=f"a clip of the match: {', '.join(names)}",
-            found=repr(clip),
-            todo="Correct the name.",
-        )
+        raise unknown_name(f"--clip {clip}", clip, names)
     return clip or max(spec.clips, key=lambda each: each.frame_count).id
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from flows.method import task_modules
 from flows.orchestration.prefect_environment import START_SECONDS, local_cluster_options
 from flows.run_plan import PlannedUnit
 from worldpose.errors import WorldposeError
@@ -38,8 +39,8 @@ def start_cluster(asked: int | None, missing: list[PlannedUnit]) -> PrivateClust
 
     given = dask.config.get("distributed.worker.preload")
     named = [given] if isinstance(given, str) else given
-    stages = sorted({unit.recipe.stage for unit in missing})
-    preload = ["tasks.preload", *named, "prefect_dask", *(f"tasks.{stage}" for stage in stages)]
+    modules = task_modules(unit.recipe.stage for unit in missing)
+    preload = ["tasks.preload", *named, "prefect_dask", *modules]
     preload.append("flows.match")  # Prefect sends the flow along with each of its tasks
     # Dask closes a restarted worker that takes longer than this: 15 s, as long as a start on a slow
     # machine.

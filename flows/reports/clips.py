@@ -16,7 +16,7 @@ from flows.results.best_results import (
     static_cameras,
 )
 from flows.stage import Match
-from flows.stages.redetection import seen_in
+from flows.stages.filtering import seen_in
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, plot_bodies

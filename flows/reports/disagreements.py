@@ -9,7 +9,7 @@ import numpy as np
 from flows.reports.match_pictures import background_image, frame_picture
 from flows.results.best_results import clip_title, estimated_pitch, joint_tracks, static_cameras
 from flows.stage import Match
-from flows.stages.redetection import seen_in
+from flows.stages.filtering import seen_in
 from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import ImageDetections, ReconstructedPeople, plot_detections
 from worldpose.reports.html_page import CaptionedImage

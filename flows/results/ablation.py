@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -124,16 +124,12 @@ def trial(seed: int, clicks: ClickSettings) -> dict[str, Score]:
 
 
 def ablation(
-    seeds: Iterable[int],
-    progress: Callable[[str, int], None] = lambda clicks, seed: None,
-    clicks: Mapping[str, ClickSettings] = CLICKS,
+    seeds: Sequence[int], progress: Callable[[str, int], None]
 ) -> dict[str, list[dict[str, Score]]]:
-    """Return the trials of all seeds, by click settings."""
-    trials: dict[str, list[dict[str, Score]]] = {}
-    numbers = tuple(seeds)
-    for name, settings in clicks.items():
-        trials[name] = []
-        for seed in numbers:
+    """Return the trials of all seeds, by click settings; report each by these and its seed."""
+    trials: dict[str, list[dict[str, Score]]] = {name: [] for name in CLICKS}
+    for name, settings in CLICKS.items():
+        for seed in seeds:
             trials[name].append(trial(seed, settings))
             progress(name, seed)
     return trials

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from data_contracts.evaluation import Evaluation, MethodScore
 from flows.results.evaluation import cameras_of, reference_side
 from worldpose.body.body_file import OPEN_BODY, find_body
-from worldpose.errors import UsageError
+from worldpose.errors import UsageError, unknown_name
 from worldpose.evaluation.matching import EvaluationSettings
 from worldpose.evaluation.metrics import evaluate_joints
 from worldpose.formats.baselines import Method, find_method
@@ -33,7 +33,6 @@ def score_methods(
     first_frame: int | None = None,
     fps: float | None = None,
     seen_fps: Mapping[str, float] | None = None,
-    settings: EvaluationSettings | None = None,
 ) -> tuple[MethodScore, ...]:
     """Score results of baseline methods; return each score with its settings.
 
@@ -46,13 +45,12 @@ def score_methods(
         fps: frames per second; None = the match's, if there is one.
         seen_fps: name of a method to the frames per second of its input video, if not the clip's;
             the result is resampled to the clip's frames.
-        settings: the defaults if None.
 
     Raises:
         UsageError: an unknown method, an unknown camera, or a method that needs `match_in`.
         InputError: a file is not in the method's format.
     """
-    settings = settings or EvaluationSettings()
+    settings = EvaluationSettings()
     truth = reference_side(reference)
     spec = None if truth.match is None else truth.match.spec
     cameras = cameras_of(reference, truth, spec)
@@ -130,12 +128,7 @@ def _require_scored(named: Sequence[str], seen_fps: Mapping[str, float]) -> None
     names = [item.partition("=")[0] for item in named]
     for name in seen_fps:
         if name not in names:
-            raise UsageError(
-                f"--method-fps {name}",
-                expected=f"one of {', '.join(names)}",
-                found=repr(name),
-                todo="Use the name from --method.",
-            )
+            raise unknown_name(f"--method-fps {name}", name, names, "Use the name from --method.")
 
 
 def _clip_fps(fps: float | None, name: str) -> float:

@@ -25,7 +25,8 @@ from worldpose.errors import InputError, UsageError
 from worldpose.formats.joints_file import ExtraTracks, JointTracks, fill_gaps
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.static_calibration.venue import join_cameras
+from worldpose.ingest.match_folder import read_match
+from worldpose.static_calibration.venue import Venue, join_cameras
 from worldpose.store.runs import LATEST
 from worldpose.store.store import Run, Store, open_run
 
@@ -38,10 +39,8 @@ JointDefinition = Literal["body", "detector"]
 """Where a joint of a fitted body is: where the body model has it, or where the detector sees it."""
 PLANE = "broadcast_tracking"
 """Stage that places people on the pitch in clips without static cameras."""
-MID_HIP = [11, 12]
-"""The hips in COCO-17."""
 ADJUSTED = "bundle_adjustment/cameras"
-"""Result with all static cameras after adjustment."""
+MID_HIP = [11, 12]  # of COCO-17
 
 
 def find_clips(record: RunRecord) -> tuple[str, ...]:
@@ -84,8 +83,8 @@ RUN_ENDS: Final[Mapping[RunState, str]] = {
 def open_results(store: Store, match_id: str, run_id: str = LATEST) -> Run:
     """Open a run; for `latest`, the latest run with people, in 3D or on the pitch.
 
-    A run that waits for review or failed comes after all others: it can lack results that an
-    earlier run has. If no run has people, `latest` is the latest run.
+    A run that waits for review or failed comes after all others, which can have more results. If
+    no run has people, `latest` is the latest run.
 
     Raises:
         InputError: there is no such run.
@@ -124,10 +123,9 @@ def joint_tracks(
 ) -> JointTracks:
     """Return the joints of one clip, from the best available or the given stage.
 
-    People that a broadcast camera alone films have the joints of their bodies; all joints are NaN
-    if none has a body. Triangulated joints have the detector's definition always. If the first
-    triangulation is the best available, the frames that it skipped have the tracker's joints,
-    without covariance; if `stage` names it, they are missing.
+    People that a broadcast camera alone films have the joints of their bodies, or NaN. Triangulated
+    joints have the detector's definition always. If the first triangulation is the best available,
+    the frames that it skipped have the tracker's joints, without covariance.
 
     Raises:
         UsageError: the run has no such result.
@@ -176,13 +174,9 @@ def joint_tracks(
 def _extra_tracks(
     run: Run, result: xr.Dataset, seen: xr.Dataset, definition: JointDefinition
 ) -> ExtraTracks | None:
-    """Return the points besides COCO-17 of a result; None without any.
+    """Return the points besides COCO-17 of bodies or triangulated joints; None without any.
 
-    Args:
-        run: the run of these results.
-        result: bodies or triangulated joints.
-        seen: the triangulation of the same people.
-        definition: definition of the points of bodies.
+    `seen` is the triangulation of the same people.
     """
     if "extra_joints" not in result:
         return None
@@ -274,12 +268,10 @@ def body_tracks(run: Run, clip: str) -> BodyTracks | None:
 
 @dataclass(frozen=True)
 class Footage:
-    """Videos of a match."""
+    """Videos of a match, whose latest run in the store maps match frames to video frames."""
 
     store: Store
-    """Its latest run maps match frames to video frames."""
     match: Match
-    """Names the videos."""
 
 
 @dataclass(frozen=True)
@@ -310,6 +302,16 @@ class Origin:
     def clips(self) -> tuple[str, ...]:
         """Return the clips that have joints."""
         return clips_of(self.run.record)
+
+    @property
+    def static_cameras(self) -> dict[str, Camera]:
+        """Return the static cameras of the exported joints, by id."""
+        return static_cameras(self.run, self.spec, self.stage)
+
+    @property
+    def pitch(self) -> PitchSpec | None:
+        """Return the pitch of the match folder; None without one."""
+        return read_match(Path(self.registration.folder)).pitch
 
     def tracks(self, clip: str) -> JointTracks:
         """Return the joints of one clip."""
@@ -389,13 +391,9 @@ def _stage_joints(run: Run, clip: str, stage: str) -> xr.Dataset:
 def _with_tracked_joints(
     run: Run, clip: str, joints: Floats, views: NDArray[np.int64]
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Return joints and views with the tracker's in the frames that triangulation skipped.
+    """Return joints (frames, persons, 17, 3) [m] and views (frames, persons, 17) of a clip.
 
-    Args:
-        run: the run.
-        clip: the clip.
-        joints: (frames, persons, 17, 3) [m].
-        views: (frames, persons, 17) cameras.
+    The frames that triangulation skipped have those of the tracker.
     """
     computed = run[f"triangulation/{clip}"]
     tracking = run[f"tracking/{clip}"].sel(person=computed["person"])
@@ -437,16 +435,21 @@ def static_cameras(run: Run, spec: MatchSpec, stage: str | None = None) -> dict[
         adjusted = run[ADJUSTED]
         cameras = camera_from_arrays(adjusted.data_vars)
         return {str(name): cameras[c] for c, name in enumerate(adjusted["camera"].values)}
-    units = {
-        camera.id: f"static_calibration/{camera.id}"
+    venue, camera_ids = _join_calibrated(run, spec)
+    if venue is None:
+        return {}
+    return {camera_id: venue.cameras[index] for index, camera_id in enumerate(camera_ids)}
+
+
+def _join_calibrated(run: Run, spec: MatchSpec) -> tuple[Venue | None, list[str]]:
+    """Return the calibrated static cameras that a run did not leave out, and their ids."""
+    found = {
+        camera.id: run[unit].data_vars
         for camera in spec.static_cameras
         if camera.id not in run.record.left_out
+        and (unit := f"static_calibration/{camera.id}") in run
     }
-    found = {camera_id: run[unit].data_vars for camera_id, unit in units.items() if unit in run}
-    if not found:
-        return {}
-    cameras = join_cameras(list(found.values())).cameras
-    return {camera_id: cameras[index] for index, camera_id in enumerate(found)}
+    return (join_cameras(list(found.values())) if found else None), list(found)
 
 
 def estimated_pitch(
@@ -458,9 +461,8 @@ def estimated_pitch(
         run: the run.
         pitch: pitch of the match folder.
         spec: the match.
-        clip: size, crown and markings are those that this clip's broadcast camera shows, if it
-            estimated them; None, or no such estimate: crown and end fall are those that the static
-            cameras show together.
+        clip: the pitch is that of this clip's broadcast camera, if it estimated one; otherwise
+            crown and end fall are those that the static cameras show together.
     """
     if pitch is None:
         return None
@@ -474,11 +476,9 @@ def estimated_pitch(
     if ADJUSTED in run:
         surface = run[ADJUSTED].attrs["surface"]
     else:
-        used = [camera.id for camera in spec.static_cameras if camera.id not in run.record.left_out]
-        units = [f"static_calibration/{camera_id}" for camera_id in used]
-        known = [run[unit].data_vars for unit in units if unit in run]
-        venue = join_cameras(known).surface if known else None
-        surface = None if venue is None else venue.shape.tolist()
+        venue, _ = _join_calibrated(run, spec)
+        shown = None if venue is None else venue.surface
+        surface = None if shown is None else shown.shape.tolist()
     if surface is None:
         return pitch
     # Not validated: an estimated crown may be slightly negative.

@@ -46,7 +46,6 @@ def check(
     fps: float | None = None,
     body: str | None = None,
     pitch: bool = True,
-    settings: CheckSettings | None = None,
 ) -> CheckReport:
     """Check a data set and return faults and measurements; one clip is in memory at a time.
 
@@ -55,12 +54,10 @@ def check(
         fps: frames per second; None = as the data set states, or 50.
         body: body model of pose files that name none; None = the open body.
         pitch: whether the ground is z = 0; a manifest can state otherwise.
-        settings: thresholds of the checks.
 
     Raises:
         InputError: a file cannot be read.
     """
-    settings = settings or CheckSettings()
     manifest = read_manifest(folder)
     findings = []
     if manifest is not None and (changed := changed_files(folder, manifest)):
@@ -85,7 +82,7 @@ def check(
             rate or USUAL_FPS,
             pitch and (manifest is None or manifest.pitch),
         )
-        figures[name], found = check_clip(shipped, settings)
+        figures[name], found = check_clip(shipped, CheckSettings())
         findings += found
     return CheckReport(clips=figures, findings=tuple(findings))
 

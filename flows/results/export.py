@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -27,9 +25,14 @@ from flows.results.best_results import (
     fitted_bodies,
     person_kinds,
     placed_joints,
-    static_cameras,
 )
-from flows.results.outputs import RELEASE, record_owner, require_own
+from flows.results.outputs import (
+    RELEASE,
+    VIEWER_SUFFIX,
+    record_owner,
+    require_own,
+    write_whole,
+)
 from flows.results.tool_exports import TOOL_EXPORTS
 from worldpose.dataset.manifest import (
     FRAME_RATES,
@@ -43,7 +46,7 @@ from worldpose.dataset.manifest import (
     write_manifest,
     write_origins,
 )
-from worldpose.errors import InputError, UsageError
+from worldpose.errors import InputError, UsageError, unknown_name
 from worldpose.formats.baselines.result import (
     write_baseline_settings,
     write_slahmr_cameras,
@@ -60,11 +63,9 @@ from worldpose.formats.challenge import (
     write_static_camera,
     write_submission,
 )
-from worldpose.formats.files import FULL
 from worldpose.formats.joints_file import write_joints, write_poses
 from worldpose.formats.motion_capture import coco_dataset, write_coco
 from worldpose.formats.tables import write_positions
-from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.runs import pin_run
@@ -75,17 +76,15 @@ PITCH_SPACING = 0.5
 """Spacing of the points in pitch_points.txt [m]."""
 
 
-def export_joints(origin: Origin, out: Path) -> list[Path]:
+def export_joints(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `joints.npz`, or `<clip>.joints.npz` per clip if there are several."""
-    written = []
     for clip in origin.clips:
         path = out / ("joints.npz" if len(origin.clips) == 1 else f"{clip}.joints.npz")
         write_joints(path, origin.tracks(clip))
-        written.append(path)
-    return written
+        yield path
 
 
-def export_coco(origin: Origin, out: Path) -> list[Path]:
+def export_coco(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `<camera>.json` for each static camera, in `<clip>/` if there are several.
 
     Raises:
@@ -98,12 +97,10 @@ def export_coco(origin: Origin, out: Path) -> list[Path]:
             found="a match with a broadcast camera alone",
             todo="Choose another format, such as joints.",
         )
-    written = []
     for clip in origin.clips:
         tracks = origin.tracks(clip)
         inliers = placed_joints(origin.run, clip)["inliers"]
-        cameras = static_cameras(origin.run, origin.spec, origin.stage)
-        for camera_id, camera in cameras.items():
+        for camera_id, camera in origin.static_cameras.items():
             dataset = coco_dataset(
                 camera_id,
                 camera,
@@ -113,33 +110,31 @@ def export_coco(origin: Origin, out: Path) -> list[Path]:
             )
             path = (out if len(origin.clips) == 1 else out / clip) / f"{camera_id}.json"
             write_coco(path, dataset)
-            written.append(path)
-    return written
+            yield path
 
 
-def export_worldpose(origin: Origin, out: Path) -> list[Path]:
+def export_worldpose(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `poses/<clip>.npz` and `cameras/<clip or static camera>.npz` (X3)."""
-    written = []
     for clip in origin.clips:
         model, poses, _ = fitted_bodies(origin.run, clip)
-        written.append(out / "poses" / f"{clip}.npz")
-        write_poses(written[-1], poses, model.name)
+        path = out / "poses" / f"{clip}.npz"
+        write_poses(path, poses, model.name)
+        yield path
         if f"broadcast_calibration/{clip}" in origin.run:
-            written.append(out / "cameras" / f"{clip}.npz")
-            write_moving_camera(written[-1], broadcast_camera(origin.run, clip))
-    for name, camera in static_cameras(origin.run, origin.spec, origin.stage).items():
-        written.append(out / "cameras" / f"{name}.npz")
-        write_static_camera(written[-1], camera.to_calibration(name))
-    return written
+            path = out / "cameras" / f"{clip}.npz"
+            write_moving_camera(path, broadcast_camera(origin.run, clip))
+            yield path
+    for name, camera in origin.static_cameras.items():
+        path = out / "cameras" / f"{name}.npz"
+        write_static_camera(path, camera.to_calibration(name))
+        yield path
 
 
-def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list[Path]:
+def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> Iterator[Path]:
     """Write cameras, boxes, skeletons, pitch points and the submission."""
-    pitch = read_match(Path(origin.registration.folder)).pitch
     for clip in origin.clips:
         fitted_bodies(origin.run, clip)
         broadcast_camera(origin.run, clip)
-    written = []
     together: dict[str, ChallengeClip] = {}
     submissions: dict[str, NDArray[np.float64]] = {}
     for clip in origin.clips:
@@ -147,87 +142,85 @@ def export_challenge(origin: Origin, out: Path, edition: Edition = 2026) -> list
         model, poses, _ = fitted_bodies(origin.run, clip)
         truth = challenge_truth(model, poses, camera)
         submissions[clip] = truth.submission
-        written.append(out / "cameras" / f"{clip}.npz")
-        write_challenge_camera(written[-1], camera, edition)
+        path = out / "cameras" / f"{clip}.npz"
+        write_challenge_camera(path, camera, edition)
+        yield path
         if edition == 2025:
             together[clip] = truth.clip
         else:
-            written += write_challenge(out, {clip: truth.clip}, edition)
+            yield from write_challenge(out, {clip: truth.clip}, edition)
     if edition == 2025:
-        written += write_challenge(out, together, edition)
-    if pitch is not None:
-        written.append(out / "pitch_points.txt")
-        samples = PitchTemplate.from_spec(pitch).sample_lines(PITCH_SPACING)
-        write_pitch_points(written[-1], samples.points_world)
-    written.append(out / "submission.zip")
-    write_submission(written[-1], submissions)
-    return written
+        yield from write_challenge(out, together, edition)
+    if origin.pitch is not None:
+        path = out / "pitch_points.txt"
+        samples = PitchTemplate.from_spec(origin.pitch).sample_lines(PITCH_SPACING)
+        write_pitch_points(path, samples.points_world)
+        yield path
+    path = out / "submission.zip"
+    write_submission(path, submissions)
+    yield path
 
 
-def export_challenge_2025(origin: Origin, out: Path) -> list[Path]:
+def export_challenge_2025(origin: Origin, out: Path) -> Iterator[Path]:
     """Write the files of `export_challenge` in the 2025 layout."""
     return export_challenge(origin, out, 2025)
 
 
-def export_tracks(origin: Origin, out: Path) -> list[Path]:
+def export_tracks(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `tracks/<clip>.txt`, our boxes in the broadcast image, and the paper's settings."""
-    written = [out / "baseline_settings.json"]
-    write_baseline_settings(written[0], BaselineSettings())
+    yield _write_baseline_settings(out)
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
         truth = challenge_truth(model, poses, broadcast_camera(origin.run, clip))
-        written.append(out / "tracks" / f"{clip}.txt")
-        write_tracks(written[-1], truth.clip.boxes, persons[truth.persons].astype(np.int64))
-    return written
+        path = out / "tracks" / f"{clip}.txt"
+        write_tracks(path, truth.clip.boxes, persons[truth.persons].astype(np.int64))
+        yield path
 
 
-def export_slahmr_cameras(origin: Origin, out: Path) -> list[Path]:
+def export_slahmr_cameras(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `slahmr/cameras/<clip>/shot-0/cameras.npz`, and the paper's settings."""
-    written = [out / "baseline_settings.json"]
-    write_baseline_settings(written[0], BaselineSettings())
+    yield _write_baseline_settings(out)
     for clip in origin.clips:
-        written.append(out / "slahmr" / "cameras" / clip / "shot-0" / "cameras.npz")
-        write_slahmr_cameras(written[-1], broadcast_camera(origin.run, clip))
-    return written
+        path = out / "slahmr" / "cameras" / clip / "shot-0" / "cameras.npz"
+        write_slahmr_cameras(path, broadcast_camera(origin.run, clip))
+        yield path
 
 
-def export_recording(origin: Origin, out: Path) -> list[Path]:
+def _write_baseline_settings(out: Path) -> Path:
+    path = out / "baseline_settings.json"
+    write_baseline_settings(path, BaselineSettings())
+    return path
+
+
+def export_recording(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `rerun/<clip>.rrd` for the rerun viewer."""
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.rerun_recording import write_recording
 
-    written = []
     for clip in origin.clips:
         tracks = origin.tracks(clip)
         known = f"broadcast_calibration/{clip}" in origin.run
-        moving = camera_in_frames(origin.run, clip, tracks.frames) if known else None
-        written.append(out / "rerun" / f"{clip}.rrd")
+        path = out / "rerun" / f"{clip}.rrd"
         write_recording(
-            written[-1],
+            path,
             tracks,
             origin.spec.fps,
-            cameras=static_cameras(origin.run, origin.spec, origin.stage),
-            broadcast=moving,
-            pitch=estimated_pitch(
-                origin.run,
-                read_match(Path(origin.registration.folder)).pitch,
-                origin.spec,
-                clip,
-            ),
+            cameras=origin.static_cameras,
+            broadcast=camera_in_frames(origin.run, clip, tracks.frames) if known else None,
+            pitch=estimated_pitch(origin.run, origin.pitch, origin.spec, clip),
         )
-    return written
+        yield path
 
 
-def export_positions(origin: Origin, out: Path) -> list[Path]:
+def export_positions(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `positions/<clip>.csv`: people on the pitch, triangulated or placed by their feet."""
-    written = []
     for clip in origin.clips:
-        written.append(out / "positions" / f"{clip}.csv")
-        write_positions(written[-1], clip_positions(origin.run, clip), origin.spec.fps)
-    return written
+        path = out / "positions" / f"{clip}.csv"
+        write_positions(path, clip_positions(origin.run, clip), origin.spec.fps)
+        yield path
 
 
-def export_minimap(origin: Origin, out: Path) -> list[Path]:
+def export_minimap(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `minimap/<clip>.mp4`: the pitch from above with all people and their kind.
 
     Raises:
@@ -236,21 +229,19 @@ def export_minimap(origin: Origin, out: Path) -> list[Path]:
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.videos import minimap_frames
 
-    pitch = read_match(Path(origin.registration.folder)).pitch
-    if pitch is None:
+    if origin.pitch is None:
         raise UsageError(
             "--format minimap",
             expected="a match with a pitch",
             found="a match without one",
             todo="Choose another format, such as joints.",
         )
-    written = []
     for clip in origin.clips:
-        written.append(out / "minimap" / f"{clip}.mp4")
-        written[-1].parent.mkdir(parents=True, exist_ok=True)
-        frames = minimap_frames(clip_positions(origin.run, clip), pitch)
-        write_video(written[-1], frames, origin.spec.fps)
-    return written
+        path = out / "minimap" / f"{clip}.mp4"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        frames = minimap_frames(clip_positions(origin.run, clip), origin.pitch)
+        write_video(path, frames, origin.spec.fps)
+        yield path
 
 
 def export_viewer(origin: Origin, out: Path) -> list[Path]:
@@ -265,7 +256,7 @@ def export_viewer(origin: Origin, out: Path) -> list[Path]:
     return write_viewers(origin, out)
 
 
-EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
+EXPORTS: dict[str, Callable[[Origin, Path], Iterable[Path]]] = {
     "joints": export_joints,
     "coco": export_coco,
     "worldpose": export_worldpose,
@@ -279,15 +270,13 @@ EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
     "slahmr-cameras": export_slahmr_cameras,
     "rerun": export_recording,
 }
-"""Name in `EXPORT_FORMATS` to function, which takes the source and a folder, returns the files."""
+"""Name in `EXPORT_FORMATS` to function, which writes the source into a folder, file by file."""
 
 
 CLASHING = {"worldpose", "challenge", "challenge-2025"}
 """Formats with the same file names; a folder can hold one of them."""
 SHARED = {FRAME_RATES, KINDS}
 """Files to which exports of further clips are added."""
-VIEWER_SUFFIX = ".html"
-"""An output that ends so is one viewer file, not a folder."""
 COUNTED = {"joints", *CLASHING}
 """Formats that `check` and `statistics` read, and that lack the frame rate."""
 
@@ -336,94 +325,7 @@ def export(origin: Origin, forms: list[str], out: Path, *, overwrite: bool = Fal
         require_own(folder, drafts, (match_id,), overwrite=overwrite)
         record_owner(folder, drafts, match_id)
 
-    return _write_whole(out, write, claim)
-
-
-def _write_whole(
-    out: Path,
-    write: Callable[[Path], list[Path]],
-    claim: Callable[[Path, Mapping[str, Path]], None],
-) -> list[Path]:
-    """Write files to a temporary place next to `out`, then move all of them; return them there.
-
-    An error while they are written leaves `out` as it was.
-
-    Args:
-        out: a folder, or a file of the viewer.
-        write: writes into a folder, or a file, and returns the files.
-        claim: refuses to replace files of a folder, given their drafts by name.
-
-    Raises:
-        InputError: `out` cannot be written, or one of its files is a folder.
-    """
-    is_file = out.suffix == VIEWER_SUFFIX
-    if out.exists() and out.is_dir() == is_file:
-        raise _unwritable(out, "a folder" if is_file else "a file")
-    above = out if out.is_dir() else out.parent
-    absent = [place for place in (above, *above.parents) if not place.exists()]
-    try:
-        above.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=above) as workshop:
-            place = Path(workshop) / out.name
-            if not is_file:
-                place.mkdir()
-                for name in (FRAME_RATES, KINDS):  # further clips are added to them
-                    if (out / name).is_file():
-                        shutil.copyfile(out / name, place / name)
-            try:
-                written = write(place)
-            except InputError as error:
-                # A message about a file names it where it was to be.
-                where = error.where.replace(str(place), str(out))
-                raise type(error)(
-                    where, expected=error.expected, found=error.found, todo=error.todo
-                ) from error
-            targets = {path: out / path.relative_to(place) for path in written}
-            if is_file:
-                targets = dict.fromkeys(written, out)
-            for target in targets.values():
-                if target.is_dir():
-                    raise _unwritable(target, "a folder")
-            above_files = out.parent if is_file else out
-            claim(
-                above_files,
-                {
-                    target.relative_to(above_files).as_posix(): path
-                    for path, target in targets.items()
-                    if target.name not in SHARED
-                },
-            )
-            for path, target in targets.items():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                path.replace(target)
-    except OSError as error:
-        _remove_empty(absent)
-        named = str(error.filename or "")
-        if error.errno in FULL or named.startswith((str(above), str(out))):
-            raise _unwritable(out, error.strerror or str(error)) from error
-        raise
-    except BaseException:
-        _remove_empty(absent)
-        raise
-    return list(targets.values())
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders that were made, the innermost first, up to one with content."""
-    for folder in folders:
-        try:
-            folder.rmdir()
-        except OSError:
-            return
-
-
-def _unwritable(out: Path, found: str) -> InputError:
-    return InputError(
-        f"--out {out}",
-        expected="a folder that can be written, or with --format viewer a file FILE.html",
-        found=found,
-        todo="Choose another place, or free space and rights there; nothing was written.",
-    )
+    return write_whole(out, write, claim, SHARED)
 
 
 def _file_for_folder(out: Path, forms: list[str]) -> UsageError:
@@ -442,12 +344,7 @@ def _export(origin: Origin, forms: list[str], out: Path) -> list[Path]:
     """
     for form in forms:
         if form not in EXPORTS:
-            raise UsageError(
-                f"--format {form}",
-                expected=f"one of {', '.join(EXPORTS)}",
-                found=repr(form),
-                todo="Choose one of these.",
-            )
+            raise unknown_name(f"--format {form}", form, EXPORTS)
     if len(clashing := CLASHING & set(forms)) > 1:
         raise UsageError(
             f"--format {' --format '.join(sorted(clashing))}",
@@ -517,7 +414,7 @@ def release(
         released = f"{RELEASE}{name} of {spec.match_id}"
         require_own(folder, drafts, (released, spec.match_id), overwrite=False)
 
-    return _write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim)
+    return write_whole(out, lambda place: _write_release(origin, forms, place, ours), claim, SHARED)
 
 
 def _write_release(
@@ -541,14 +438,13 @@ def _write_release(
         )
     bodies = [bodies_unit(origin.run, clip) for clip in origin.clips]
     models = {origin.run[unit].attrs["body_model"] for unit in bodies if unit in origin.run}
-    cameras = static_cameras(origin.run, spec, origin.stage)
     pictures = {camera.id: (camera.width, camera.height) for camera in spec.cameras}
     manifest = ReleaseManifest(
         **ours,
         fps=spec.fps,
         clips=clips,
         pictures={
-            **{camera: pictures[camera] for camera in cameras},
+            **{camera: pictures[camera] for camera in origin.static_cameras},
             **{c.id: pictures[c.broadcast] for c in spec.clips if c.broadcast and c.id in clips},
         },
         pitch=spec.pitch != NO_PITCH,

@@ -1,10 +1,12 @@
-"""Whose files a folder of outputs holds: no command replaces those of another match silently."""
+"""Files that commands write: whole or not at all, and over no other match's files silently."""
 
 from __future__ import annotations
 
 import filecmp
 import json
-from collections.abc import Mapping
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -12,10 +14,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from worldpose.dataset.manifest import MANIFEST, read_manifest
 from worldpose.errors import InputError
-from worldpose.formats.files import whole_file
+from worldpose.formats.files import FULL, whole_file
 
 OWNERS: Final = ".worldpose-outputs"
 """File in a folder of outputs with the owner of each: a match, a data set, or another input."""
+VIEWER_SUFFIX: Final = ".html"
+"""An output that ends so is one viewer file, not a folder."""
 RELEASE: Final = "release "
 """Begins the owner of released files, which nothing replaces."""
 _OWNERS: Final = TypeAdapter(dict[str, str])
@@ -73,14 +77,14 @@ def record_owner(folder: Path, names: Mapping[str, Path | None], owner: str) -> 
         draft.write_text(json.dumps(owners, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def claim_file(file: Path | None, owner: str, *, overwrite: bool = False) -> None:
+def claim_file(file: Path | None, owner: str) -> None:
     """Record the owner of a file that a command writes next; without a file do nothing.
 
     Raises:
         InputError: the file exists and has another owner.
     """
     if file is not None:
-        require_own(file.parent, {file.name: None}, (owner,), overwrite=overwrite)
+        require_own(file.parent, {file.name: None}, (owner,), overwrite=False)
         record_owner(file.parent, {file.name: None}, owner)
 
 
@@ -97,3 +101,92 @@ def require_new(file: Path | None) -> None:
             found="a file",
             todo="Choose another name, or move the file away. Nothing was written.",
         )
+
+
+def write_whole(
+    out: Path,
+    write: Callable[[Path], list[Path]],
+    claim: Callable[[Path, Mapping[str, Path]], None],
+    shared: Collection[str],
+) -> list[Path]:
+    """Write files to a temporary place next to `out`, then move all of them; return them there.
+
+    An error while they are written leaves `out` as it was.
+
+    Args:
+        out: a folder, or a file of the viewer.
+        write: writes into a folder, or a file, and returns the files.
+        claim: refuses to replace files of a folder, given their drafts by name.
+        shared: names of files that have no owner, and to which this call adds.
+
+    Raises:
+        InputError: `out` cannot be written, or one of its files is a folder.
+    """
+    is_file = out.suffix == VIEWER_SUFFIX
+    if out.exists() and out.is_dir() == is_file:
+        raise _unwritable(out, "a folder" if is_file else "a file")
+    above = out if out.is_dir() else out.parent
+    absent = [place for place in (above, *above.parents) if not place.exists()]
+    try:
+        above.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=above) as workshop:
+            place = Path(workshop) / out.name
+            if not is_file:
+                place.mkdir()
+                for name in shared:
+                    if (out / name).is_file():
+                        shutil.copyfile(out / name, place / name)
+            try:
+                written = write(place)
+            except InputError as error:
+                # A message about a file names it where it was to be.
+                where = error.where.replace(str(place), str(out))
+                raise type(error)(
+                    where, expected=error.expected, found=error.found, todo=error.todo
+                ) from error
+            targets = {path: out / path.relative_to(place) for path in written}
+            if is_file:
+                targets = dict.fromkeys(written, out)
+            for target in targets.values():
+                if target.is_dir():
+                    raise _unwritable(target, "a folder")
+            above_files = out.parent if is_file else out
+            claim(
+                above_files,
+                {
+                    target.relative_to(above_files).as_posix(): path
+                    for path, target in targets.items()
+                    if target.name not in shared
+                },
+            )
+            for path, target in targets.items():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                path.replace(target)
+    except OSError as error:
+        _remove_empty(absent)
+        named = str(error.filename or "")
+        if error.errno in FULL or named.startswith((str(above), str(out))):
+            raise _unwritable(out, error.strerror or str(error)) from error
+        raise
+    except BaseException:
+        _remove_empty(absent)
+        raise
+    return list(targets.values())
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that were made, the innermost first, up to one with content."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+
+
+def _unwritable(out: Path, found: str) -> InputError:
+    return InputError(
+        f"--out {out}",
+        expected="a folder that can be written, or with --format viewer a file FILE.html",
+        found=found,
+        todo="Choose another place, or free space and rights there; nothing was written.",
+    )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -21,12 +21,11 @@ from flows.results.best_results import (
     estimated_pitch,
     fitted_bodies,
     person_kinds,
-    static_cameras,
 )
-from worldpose.body.model import BodyModel
 from worldpose.errors import UsageError
 from worldpose.formats.c3d_file import write_c3d
 from worldpose.formats.gltf_file import AnimatedBody, write_gltf
+from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.motion_capture import (
     OPENSIM_CONVENTION,
     opensim_coordinates,
@@ -43,8 +42,6 @@ from worldpose.formats.tables import (
     write_parquet,
 )
 from worldpose.formats.usd_file import write_usd
-from worldpose.geometry.cameras import Camera
-from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Run
 
 if TYPE_CHECKING:
@@ -118,53 +115,47 @@ def _joint_definition(origin: Origin, clip: str, stage: str) -> str:
     return "COCO-17 keypoints of the detector, triangulated"
 
 
-def export_markers(origin: Origin, out: Path) -> list[Path]:
+def export_markers(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `markers/<clip>/person_<id>.trc` for every person with a joint."""
-    written = []
     for clip in origin.clips:
         tracks = origin.tracks(clip)
-        for person, person_id in enumerate(tracks.person_ids):
-            if np.isfinite(tracks.joints[:, person]).any():
-                written.append(out / "markers" / clip / f"person_{person_id:03d}.trc")
-                write_markers(written[-1], tracks, person, origin.spec.fps)
-    return written
+        for person, person_id in _people_with_joints(tracks):
+            path = out / "markers" / clip / f"person_{person_id:03d}.trc"
+            write_markers(path, tracks, person, origin.spec.fps)
+            yield path
 
 
-def export_c3d(origin: Origin, out: Path) -> list[Path]:
+def export_c3d(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `markers/<clip>/person_<id>.c3d` for every person with a joint."""
-    written = []
     for clip in origin.clips:
         tracks, kinds = origin.tracks(clip), person_kinds(origin.run, clip)
         notes = describe_clip(origin, clip)
-        for person, person_id in enumerate(tracks.person_ids.tolist()):
-            if np.isfinite(tracks.joints[:, person]).any():
-                written.append(out / "markers" / clip / f"person_{person_id:03d}.c3d")
-                about = {
-                    **notes,
-                    "kind": kinds[person_id],
-                    "first_match_frame": f"{tracks.frames[0]}",
-                }
-                write_c3d(written[-1], tracks, person, origin.spec.fps, about)
-    return written
+        for person, person_id in _people_with_joints(tracks):
+            path = out / "markers" / clip / f"person_{person_id:03d}.c3d"
+            about = {"kind": kinds[person_id], "first_match_frame": f"{tracks.frames[0]}"}
+            write_c3d(path, tracks, person, origin.spec.fps, notes | about)
+            yield path
 
 
-def export_motion(origin: Origin, out: Path) -> list[Path]:
+def _people_with_joints(tracks: JointTracks) -> Iterator[tuple[int, int]]:
+    """Yield index and id of every person with a joint."""
+    for person, person_id in enumerate(tracks.person_ids.tolist()):
+        if np.isfinite(tracks.joints[:, person]).any():
+            yield person, person_id
+
+
+def export_motion(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `motion/<clip>/person_<id>_frame_<first>.bvh` for every uninterrupted interval."""
-    written = []
     for clip in origin.clips:
-        model, poses, persons = fitted_bodies(origin.run, clip)
-        frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
-        for person, person_id in enumerate(persons):
-            for part in stretches(poses[person]):
-                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.bvh"
-                written.append(out / "motion" / clip / name)
-                write_motion(written[-1], model, poses[person, part], origin.spec.fps)
-    return written
+        model, poses, _ = fitted_bodies(origin.run, clip)
+        for name, person, part in _motions(origin, clip):
+            path = out / "motion" / clip / f"{name}.bvh"
+            write_motion(path, model, poses[person, part], origin.spec.fps)
+            yield path
 
 
-def export_opensim(origin: Origin, out: Path) -> list[Path]:
+def export_opensim(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `opensim/<clip>/person_<id>_frame_<first>.mot` for every uninterrupted interval."""
-    written = []
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
         frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
@@ -174,47 +165,39 @@ def export_opensim(origin: Origin, out: Path) -> list[Path]:
             "joints": OPENSIM_CONVENTION,
             "units": "degrees, metres, seconds; time is match frame / frames per second",
         }
-        for person, person_id in enumerate(persons.tolist()):
-            for part in stretches(poses[person]):
-                name = f"person_{person_id:03d}_frame_{frames[part.start]:06d}.mot"
-                written.append(out / "opensim" / clip / name)
-                write_opensim_motion(
-                    written[-1],
-                    opensim_coordinates(model, poses[person, part]),
-                    frames[part] / origin.spec.fps,
-                    notes | {"kind": kinds[person_id]},
-                )
-    return written
+        for name, person, part in _motions(origin, clip):
+            path = out / "opensim" / clip / f"{name}.mot"
+            write_opensim_motion(
+                path,
+                opensim_coordinates(model, poses[person, part]),
+                frames[part] / origin.spec.fps,
+                notes | {"kind": kinds[int(persons[person])]},
+            )
+            yield path
 
 
-def export_gltf(origin: Origin, out: Path) -> list[Path]:
+def _motions(origin: Origin, clip: str) -> Iterator[tuple[str, int, slice]]:
+    """Yield name, person index and frames of every uninterrupted interval of a clip's bodies."""
+    _, poses, persons = fitted_bodies(origin.run, clip)
+    frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
+    for person, person_id in enumerate(persons):
+        for part in stretches(poses[person]):
+            yield f"person_{person_id:03d}_frame_{frames[part.start]:06d}", person, part
+
+
+def export_gltf(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `scenes/<clip>.glb`: bodies, cameras and the pitch."""
     return _write_scenes(origin, out, "glb", write_gltf)
 
 
-def export_usd(origin: Origin, out: Path) -> list[Path]:
+def export_usd(origin: Origin, out: Path) -> Iterator[Path]:
     """Write `scenes/<clip>.usdc` with the same content."""
     return _write_scenes(origin, out, "usdc", write_usd)
 
 
-class _SceneWriter(Protocol):
-    """`write_gltf` and `write_usd`."""
-
-    def __call__(
-        self,
-        path: Path,
-        model: BodyModel,
-        people: Sequence[AnimatedBody],
-        fps: float,
-        *,
-        cameras: Mapping[str, Camera],
-        markings: Sequence[Floats],
-        notes: Mapping[str, str],
-        surface: bool = True,
-    ) -> None: ...
-
-
-def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -> list[Path]:
+def _write_scenes(
+    origin: Origin, out: Path, suffix: str, write: Callable[..., None]
+) -> Iterator[Path]:
     """Write `scenes/<clip>.<suffix>`: bodies, cameras and the pitch.
 
     Raises:
@@ -223,9 +206,7 @@ def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings
 
-    given = read_match(Path(origin.registration.folder)).pitch
-    pitch = estimated_pitch(origin.run, given, origin.spec)
-    written = []
+    pitch = estimated_pitch(origin.run, origin.pitch, origin.spec)
     for clip in origin.clips:
         model, poses, persons = fitted_bodies(origin.run, clip)
         frames = origin.run[bodies_unit(origin.run, clip)]["frame"].values
@@ -237,7 +218,7 @@ def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -
                 found="none",
                 todo="Give their text, which goes into the file, or export without --surface.",
             )
-        cameras = static_cameras(origin.run, origin.spec, origin.stage)
+        cameras = origin.static_cameras
         if f"broadcast_calibration/{clip}" in origin.run:
             cameras["broadcast"] = broadcast_camera(origin.run, clip)
         kinds = person_kinds(origin.run, clip)
@@ -252,9 +233,9 @@ def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -
         notes = describe_clip(origin, clip)
         notes["joints"] = f"the 24 joints of body model {model.name}, named as SMPL's"
         notes |= {"units": "metres, seconds", "first_match_frame": f"{frames[0]}"}
-        written.append(out / "scenes" / f"{clip}.{suffix}")
+        path = out / "scenes" / f"{clip}.{suffix}"
         write(
-            written[-1],
+            path,
             model,
             people,
             origin.spec.fps,
@@ -263,16 +244,16 @@ def _write_scenes(origin: Origin, out: Path, suffix: str, write: _SceneWriter) -
             notes=notes,
             surface=free or origin.surface,
         )
-    return written
+        yield path
 
 
-def export_csv(origin: Origin, out: Path) -> list[Path]:
-    """Write `tables/<clip>.<table>.csv` with its description, for the tables of `_tables`."""
+def export_csv(origin: Origin, out: Path) -> Iterator[Path]:
+    """Write `tables/<clip>.<table>.csv` with its description, for joints, people and strides."""
     return _write_tables(origin, out, "csv", write_csv)
 
 
-def export_parquet(origin: Origin, out: Path) -> list[Path]:
-    """Write `tables/<clip>.<table>.parquet` for the tables of `_tables`."""
+def export_parquet(origin: Origin, out: Path) -> Iterator[Path]:
+    """Write `tables/<clip>.<table>.parquet` for joints, people and strides."""
     return _write_tables(origin, out, "parquet", write_parquet)
 
 
@@ -281,26 +262,21 @@ def _write_tables(
     out: Path,
     suffix: str,
     write: Callable[[Path, pd.DataFrame, Mapping[str, str]], list[Path]],
-) -> list[Path]:
-    written = []
+) -> Iterator[Path]:
+    fps = origin.spec.fps
     for clip in origin.clips:
         notes = {**describe_clip(origin, clip), "units": "in the name of each column"}
-        for name, table in _tables(origin, clip).items():
-            written += write(out / "tables" / f"{clip}.{name}.{suffix}", table, notes)
-    return written
+        tracks = origin.tracks(clip)
+        tables = {
+            "joints": joints_table(tracks, fps, person_kinds(origin.run, clip)),
+            "people": people_table(clip_positions(origin.run, clip), fps),
+            "strides": strides_table(tracks, fps),
+        }
+        for name, table in tables.items():
+            yield from write(out / "tables" / f"{clip}.{name}.{suffix}", table, notes)
 
 
-def _tables(origin: Origin, clip: str) -> dict[str, pd.DataFrame]:
-    """Return joints, people and strides of a clip."""
-    tracks, fps = origin.tracks(clip), origin.spec.fps
-    return {
-        "joints": joints_table(tracks, fps, person_kinds(origin.run, clip)),
-        "people": people_table(clip_positions(origin.run, clip), fps),
-        "strides": strides_table(tracks, fps),
-    }
-
-
-TOOL_EXPORTS: dict[str, Callable[[Origin, Path], list[Path]]] = {
+TOOL_EXPORTS: dict[str, Callable[[Origin, Path], Iterator[Path]]] = {
     "trc": export_markers,
     "c3d": export_c3d,
     "bvh": export_motion,

@@ -1,43 +1,38 @@
-"""Stage `body_fitting`: one unit per clip, from its triangulated joints (S1-S3)."""
+"""Stages `body_fitting` and `refitting`: bodies of one clip each.
+
+`body_fitting` fits them to triangulated joints (S1-S3). `refitting` has the clips with broadcast
+detections or with players of other clips (S1, S4), and without static cameras those whose people
+are tracked and have monocular poses.
+"""
 
 from __future__ import annotations
 
 from pydantic import JsonValue
 
-from flows.stage import Match, Stage
-from flows.stages import detection, tracking
-from worldpose.body.body_file import digest_of_body, is_open_body
+from data_contracts.records import Record
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import broadcast_calibration, detection, tracking, triangulation
+from worldpose.body.body_file import OPEN_BODY, digest_of_body, is_open_body
 from worldpose.body_fitting.settings import BodyFittingSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the results with triangulated joints, and with every camera's tracked detections."""
-    seen = detection.seen_by_cameras(match, unit)
-    return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}", f"retriangulation/{unit}")
+    return (*triangulation.adjusted_inputs(match, unit), f"retriangulation/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the clip, the clock, the camera order, and the pitch that bounds the feet."""
-    pitch = match.folder.pitch
-    return {
-        **tracking.clip_sources(match, unit),
-        "pitch": None if pitch is None else pitch.model_dump(mode="json"),
-    }
+    return {**tracking.clip_sources(match, unit), "pitch": match.pitch_source}
 
 
-def outside(settings: BodyFittingSettings) -> dict[str, JsonValue]:
-    """Return the digest of an installed body model."""
-    return digest_of_model(settings.body_model)
-
-
-def digest_of_model(name: str) -> dict[str, JsonValue]:
+def body_model_digest(settings: BodyFittingSettings | RefittingSettings) -> dict[str, JsonValue]:
     """Return the digest of an installed body model.
 
     It is None for the open body, which is part of the code and so of the code's digest.
     """
-    if is_open_body(name):
-        return {"body_model_sha256": None}
-    return {"body_model_sha256": digest_of_body(name)}
+    name = settings.body_model
+    return {"body_model_sha256": None if is_open_body(name) else digest_of_body(name)}
 
 
 STAGE = Stage(
@@ -48,7 +43,99 @@ STAGE = Stage(
     inputs=inputs,
     sources=sources,
     previous_pass_inputs=tracking.filtering_inputs,
-    late_inputs=tracking.found_again,
-    external_inputs=outside,
+    late_inputs=detection.again_by_cameras,
+    external_inputs=body_model_digest,
     needs_static_cameras=True,
+)
+
+
+class RefittingSettings(Record):
+    """Bodies of triangulated people are refitted with the settings of `body_fitting`."""
+
+    body_model: str = OPEN_BODY
+    """Body model of people in a match without static cameras, which `body_fitting` has no units
+    for: the open body, or one installed with `worldpose body install`."""
+
+
+@once_a_match
+def refitted_clips(match: Match) -> tuple[str, ...]:
+    """Return clips with broadcast camera and detections, and those with players of other clips.
+
+    Without static cameras these are the clips with tracked people and monocular poses.
+    """
+    if not match.has_static_cameras:
+        tracked = broadcast_calibration.clips_without_static_cameras(match)
+        return tuple(clip for clip in tracked if clip in match.folder.estimates)
+    clips = (clip.id for clip in match.folder.spec.clips)
+    return tuple(clip for clip in clips if _is_broadcast(match, clip) or _namesakes(match, clip))
+
+
+def last_bodies(match: Match, clip: str) -> str:
+    """Return the result with the last fitted bodies of a clip."""
+    return f"refitting/{clip}" if clip in refitted_clips(match) else f"body_fitting/{clip}"
+
+
+def refitting_inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return `body_fitting`, its inputs, the broadcast camera, and other clips' shapes.
+
+    Without static cameras: the broadcast camera, its detections and the tracks on the pitch.
+    """
+    camera = broadcast_calibration.camera_inputs(match, unit)
+    if not match.has_static_cameras:
+        return (*camera, f"broadcast_tracking/{unit}")
+    others = (f"body_fitting/{clip}" for clip in _namesakes(match, unit))
+    fitted = (*inputs(match, unit), f"body_fitting/{unit}")
+    return (*fitted, *(camera if _is_broadcast(match, unit) else ()), *others)
+
+
+def refitting_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return the clip, monocular poses of the broadcast video, its clock, and the identities."""
+    clip = match.folder.spec.clip(unit)
+    file = match.folder.estimates.get(unit) if _is_broadcast(match, unit) else None
+    estimated = {
+        **match.file_sources("estimates", file),
+        "offset_frames": match.frame_sources(unit)["offset_frames"],
+    }
+    if not match.has_static_cameras:
+        return {**broadcast_calibration.tracking_sources(match, unit), **estimated}
+    named = {unit: clip.people, **_namesakes(match, unit)}
+    return {
+        **sources(match, unit),
+        **estimated,
+        "seen_in_broadcast": next(iter(detection.seen_in_broadcast(match, unit)), None),
+        "broadcast_offset_frames": clip.broadcast_offset_frames,
+        "people": {
+            name: {str(person): player for person, player in sorted(people.items())}
+            for name, people in named.items()
+        },
+    }
+
+
+def _is_broadcast(match: Match, unit: str) -> bool:
+    """Return whether a broadcast camera is calibrated, and has detections."""
+    seen = detection.seen_in_broadcast(match, unit)
+    return bool(seen) and unit in broadcast_calibration.units(match)
+
+
+def _namesakes(match: Match, unit: str) -> dict[str, dict[int, str]]:
+    """Return a clip's players in other clips: clip to their person ids and names there."""
+    here = set(match.folder.spec.clip(unit).people.values())
+    there = {
+        clip.id: {person: name for person, name in clip.people.items() if name in here}
+        for clip in match.folder.spec.clips
+        if clip.id != unit
+    }
+    return {clip: people for clip, people in there.items() if people}
+
+
+REFITTING = Stage(
+    name="refitting",
+    about="fit bodies again with the broadcast camera and other clips",
+    settings=RefittingSettings,
+    units=refitted_clips,
+    inputs=refitting_inputs,
+    sources=refitting_sources,
+    previous_pass_inputs=tracking.filtering_inputs,
+    late_inputs=detection.again_by_cameras,
+    external_inputs=body_model_digest,
 )

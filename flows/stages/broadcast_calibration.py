@@ -1,14 +1,19 @@
-"""Stage `broadcast_calibration`: one unit per clip with key frames, clicked or proposed (M1-M6)."""
+"""Stages of the broadcast camera: one unit per clip each.
+
+`broadcast_calibration` has the clips with key frames, clicked or proposed (M1-M6),
+`broadcast_pooling` those whose camera filmed other clips, too (M1), and `broadcast_tracking` the
+calibrated clips of a match without static cameras.
+"""
 
 from __future__ import annotations
 
 from pydantic import JsonValue
 
+from data_contracts.records import Record
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.ingest.annotations import key_frames_file
-from worldpose.ingest.footage import unit_frames
 
 
 @once_a_match
@@ -35,30 +40,24 @@ def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     runs names the file, the frame and the point.
     """
     folder = match.folder
-    video = folder.videos[unit]
-    path = video.relative_to(folder.folder).as_posix()
-    frames = unit_frames(folder.spec, unit)
-    clicked: dict[str, JsonValue] = {
-        str(key.frame): {
-            "points": {point.name: list(point.xy) for point in key.markings.points},
-            "drawn": {
-                marking.name: [[x, y] for x, y in marking.xy] for marking in key.markings.drawn
-            },
-        }
-        for key in (folder.key_frames[unit].key_frames if unit in folder.key_frames else ())
-    }
+    known = folder.key_frames[unit].key_frames if unit in folder.key_frames else ()
+    clicked: dict[str, JsonValue] = {str(key.frame): key.markings.by_name() for key in known}
     proposed = {"side": folder.broadcast_side(unit)} if unit in folder.proposed_clips else {}
     return {
-        "video": path,
-        "video_sha256": match.registration.digest_of(path),
+        **video_sources(match, unit),
         "key_frames": {key_frames_file(unit): clicked},
         **proposed,
-        "first_frame": frames.first,
-        "frame_count": frames.count,
-        "offset_frames": frames.offset,
         "broadcast_offset_frames": folder.spec.clip(unit).broadcast_offset_frames,
-        "fps": folder.spec.fps,
-        "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),
+    }
+
+
+def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return a clip's broadcast video, its frame mapping to match time, and the pitch."""
+    return {
+        **match.file_sources("video", match.folder.videos[unit]),
+        **match.frame_sources(unit),
+        "fps": match.folder.spec.fps,
+        "pitch": match.pitch_source,
     }
 
 
@@ -69,4 +68,64 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
+)
+
+
+class BroadcastPoolingSettings(Record):
+    """No settings: the covariances of the clips decide whether their positions agree."""
+
+
+@once_a_match
+def pooled_clips(match: Match) -> dict[str, tuple[str, ...]]:
+    """Return the clips whose camera is also calibrated in others, each with all of these clips."""
+    clips: dict[str | None, tuple[str, ...]] = {}
+    cameras = {clip: match.folder.spec.clip(clip).broadcast for clip in units(match)}
+    for clip, camera in cameras.items():
+        clips[camera] = (*clips.get(camera, ()), clip)
+    return {clip: clips[camera] for clip, camera in cameras.items() if len(clips[camera]) > 1}
+
+
+POOLING = Stage(
+    name="broadcast_pooling",
+    task_file="broadcast_calibration",
+    about="give the broadcast camera one place in all its clips",
+    settings=BroadcastPoolingSettings,
+    units=lambda match: tuple(pooled_clips(match)),
+    inputs=lambda match, unit: tuple(
+        f"broadcast_calibration/{clip}" for clip in pooled_clips(match)[unit]
+    ),
+    sources=lambda match, unit: {"clips": list(pooled_clips(match)[unit])},
+)
+
+
+class BroadcastTrackingSettings(Record):
+    """No settings: covariances of feet and camera, and shirts, decide who is one person."""
+
+
+@once_a_match
+def clips_without_static_cameras(match: Match) -> tuple[str, ...]:
+    """Return the clips with a calibrated broadcast camera and detections, and no other camera."""
+    clips = () if match.has_static_cameras else units(match)
+    return tuple(clip for clip in clips if detection.seen_in_broadcast(match, clip))
+
+
+def camera_inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return a clip's camera, also at the pooled position if there is one, and its detections."""
+    pooled = (f"broadcast_pooling/{unit}",) if unit in pooled_clips(match) else ()
+    return (*detection.seen_in_broadcast(match, unit), f"broadcast_calibration/{unit}", *pooled)
+
+
+def tracking_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return the clip, its video and clock, the pitch, and whether there are monocular poses."""
+    return {**video_sources(match, unit), "has_estimates": unit in match.folder.estimates}
+
+
+TRACKING = Stage(
+    name="broadcast_tracking",
+    task_file="broadcast_calibration",
+    about="place the broadcast camera's people on the pitch",
+    settings=BroadcastTrackingSettings,
+    units=clips_without_static_cameras,
+    inputs=camera_inputs,
+    sources=tracking_sources,
 )

@@ -22,29 +22,29 @@ def inputs(match: Match, unit: str) -> tuple[str, ...]:
     return (*seen, *people)
 
 
-def again(match: Match, unit: str) -> tuple[str, ...]:
+def inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
     """Return the filtering results of every clip: keypoints that the bodies rejected."""
     return tuple(
         name for clip in tracking.units(match) for name in tracking.filtering_inputs(match, clip)
     )
 
 
-def later(match: Match, unit: str) -> tuple[str, ...]:
+def late_inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the redetection results of all cameras in every clip."""
     return tuple(
-        name for clip in tracking.units(match) for name in tracking.found_again(match, clip)
+        name for clip in tracking.units(match) for name in detection.again_by_cameras(match, clip)
     )
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the clips, the clock, the camera order, and the pitch that clicked points refer to."""
-    spec, pitch = match.folder.spec, match.folder.pitch
+    spec = match.folder.spec
     return {
         "cameras": [camera.id for camera in spec.static_cameras],
         "seen": {clip.id: list(detection.seen_by_cameras(match, clip.id)) for clip in spec.clips},
         "clips": {clip.id: [clip.first_frame, clip.frame_count] for clip in spec.clips},
         "fps": spec.fps,
-        "pitch": None if pitch is None else pitch.model_dump(mode="json"),
+        "pitch": match.pitch_source,
     }
 
 
@@ -55,7 +55,7 @@ STAGE = Stage(
     units=units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=again,
-    late_inputs=later,
+    previous_pass_inputs=inputs_from_before,
+    late_inputs=late_inputs,
     needs_static_cameras=True,
 )

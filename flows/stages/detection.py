@@ -21,8 +21,7 @@ def seen_by(match: Match, camera_id: str, clip_id: str) -> str:
 
 def seen_by_cameras(match: Match, clip_id: str) -> tuple[str, ...]:
     """Return `seen_by` of every static camera, in order."""
-    cameras = match.folder.spec.static_cameras
-    return tuple(seen_by(match, camera.id, clip_id) for camera in cameras)
+    return tuple(seen_by(match, each.id, clip_id) for each in match.folder.spec.static_cameras)
 
 
 def again(match: Match, camera_id: str, clip_id: str) -> tuple[str, ...]:
@@ -66,40 +65,29 @@ def _units(match: Match) -> dict[str, tuple[str, str]]:
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the index of the video, and the camera, which separates players from the crowd."""
     footage, _ = _units(match)[unit]
-    return tuple(f"{stage}/{footage}" for stage in _stages(match, footage))
+    known = (f"static_calibration/{footage}",) if _is_on_pitch(match, footage) else ()
+    return (f"ingest/{footage}", *known)
 
 
-def _stages(match: Match, footage: str) -> tuple[str, ...]:
+def _is_on_pitch(match: Match, footage: str) -> bool:
+    """Return whether a video is of a static camera of a match with a pitch."""
     static = {camera.id for camera in match.folder.spec.static_cameras}
-    known = footage in static and match.folder.pitch is not None
-    return ("ingest", "static_calibration") if known else ("ingest",)
+    return footage in static and match.folder.pitch is not None
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the video, the clip, the pitch that separates the crowd, given boxes, corrections."""
     footage, clip_id = _units(match)[unit]
-    clip, pitch = match.folder.spec.clip(clip_id), match.folder.pitch
-    known = len(_stages(match, footage)) > 1
-    video = ingest.video_sources(match, footage)
+    clip, boxes = match.folder.spec.clip(clip_id), match.folder.boxes.get(footage)
     return {
         "camera": footage,
-        "video": video["video"],
-        "video_sha256": video["video_sha256"],
+        **match.file_sources("video", match.folder.videos[footage]),
         "first_frame": clip.first_frame,
         "frame_count": clip.frame_count,
-        "pitch": pitch.model_dump(mode="json") if known and pitch is not None else None,
-        **_boxes_of(match, footage),
+        "pitch": match.pitch_source if _is_on_pitch(match, footage) else None,
+        **({} if boxes is None else match.file_sources("boxes", boxes)),
         **ingest.edits_of(match, footage, clip.first_frame, clip.frame_count),
     }
-
-
-def _boxes_of(match: Match, footage: str) -> dict[str, JsonValue]:
-    """Return the given boxes of a video; empty if there are none, so that keys stay."""
-    file = match.folder.boxes.get(footage)
-    if file is None:
-        return {}
-    path = file.relative_to(match.folder.folder).as_posix()
-    return {"boxes": path, "boxes_sha256": match.registration.digest_of(path)}
 
 
 def outside(settings: DetectionSettings) -> dict[str, JsonValue]:

@@ -1,18 +1,26 @@
-"""Stage `filtering`: one unit per clip, comparing its detections with its bodies (R2)."""
+"""Stages `filtering` and `redetection`: detections compared with the bodies (R2).
+
+`filtering` has one unit per clip. `redetection` searches again, from the second iteration on, where
+the bodies of the previous one say that people are: one unit per static camera's video and clip.
+"""
 
 from __future__ import annotations
 
-from flows.stage import Match, Stage
-from flows.stages import detection, refitting, tracking
+from collections.abc import Container
+
+from pydantic import JsonValue
+
+from data_contracts.detection import detection_unit
+from flows.stage import Match, Stage, once_a_match
+from flows.stages import body_fitting, detection, tracking, triangulation
+from worldpose.detection.settings import RedetectionSettings
 from worldpose.filtering.settings import FilteringSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return the last fitted bodies, the cameras, their detections, and the tracks."""
-    bodies = "refitting" if unit in refitting.units(match) else "body_fitting"
-    seen = detection.seen_by_cameras(match, unit)
-    people = (f"tracking/{unit}", f"retriangulation/{unit}", f"{bodies}/{unit}")
-    return (*seen, "bundle_adjustment/cameras", f"triangulation/{unit}", *people)
+    placed = (f"retriangulation/{unit}", body_fitting.last_bodies(match, unit))
+    return (*triangulation.retriangulation_inputs(match, unit), *placed)
 
 
 STAGE = Stage(
@@ -23,6 +31,66 @@ STAGE = Stage(
     inputs=inputs,
     sources=tracking.clip_sources,
     previous_pass_inputs=tracking.filtering_inputs,
-    late_inputs=tracking.found_again,
+    late_inputs=detection.again_by_cameras,
+    needs_static_cameras=True,
+)
+
+
+@once_a_match
+def _searched(match: Match) -> dict[str, tuple[str, str]]:
+    """Return the static camera and the clip of each unit: those with detections from a video."""
+    spec = match.folder.spec
+    return {
+        detection_unit(camera.id, clip.id): (camera.id, clip.id)
+        for camera in spec.static_cameras
+        for clip in spec.clips
+        if detection.again(match, camera.id, clip.id)
+    }
+
+
+def redetection_inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the index of the video, and the detections."""
+    camera, clip = _searched(match)[unit]
+    return (f"ingest/{camera}", detection.seen_by(match, camera, clip))
+
+
+def redetection_inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the adjusted cameras, the last fitted bodies, and the filtering results."""
+    _, clip = _searched(match)[unit]
+    placed = (f"{stage}/{clip}" for stage in ("tracking", "triangulation", "retriangulation"))
+    bodies = body_fitting.last_bodies(match, clip)
+    return ("bundle_adjustment/cameras", *placed, bodies, f"filtering/{clip}")
+
+
+def redetection_sources(match: Match, unit: str) -> dict[str, JsonValue]:
+    """Return camera and clip; `detection` has all other sources."""
+    camera, clip = _searched(match)[unit]
+    return {"camera": camera, "clip": clip}
+
+
+def seen_in(run: Container[str], match: Match, camera_id: str, clip_id: str) -> str:
+    """Return the result with all of a static camera's people in a clip that a run used.
+
+    Args:
+        run: names of the run's results, as `stage/unit`.
+        match: the match.
+        camera_id: the static camera.
+        clip_id: the clip.
+    """
+    again = (name for name in detection.again(match, camera_id, clip_id) if name in run)
+    return next(again, detection.seen_by(match, camera_id, clip_id))
+
+
+REDETECTION = Stage(
+    name="redetection",
+    task_file="filtering",
+    about="look again for people where bodies say they must be",
+    settings=RedetectionSettings,
+    units=lambda match: tuple(_searched(match)),
+    inputs=redetection_inputs,
+    sources=redetection_sources,
+    previous_pass_inputs=redetection_inputs_from_before,
+    first_pass=2,
+    worker_tag="GPU",
     needs_static_cameras=True,
 )

@@ -36,31 +36,19 @@ def units(match: Match) -> tuple[str, ...]:
     )
 
 
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return nothing: `ingest` is the first stage."""
-    return ()
-
-
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the unit's detections or else its video, and its frame mapping to match time.
 
     Corrections of given detections are included; without them the key is unchanged.
     """
     folder = match.folder
-    frames = unit_frames(folder.spec, unit)
-    clock: dict[str, JsonValue] = {
-        "first_frame": frames.first,
-        "frame_count": frames.count,
-        "offset_frames": frames.offset,
-    }
     if unit not in folder.detections:
-        return {**video_sources(match, unit), **clock}
-    path = folder.detections[unit].relative_to(folder.folder).as_posix()
+        return {**video_sources(match, unit), **match.frame_sources(unit)}
+    ranges = unit_frames(folder.spec, unit).ranges
     return {
-        "detections": path,
-        "detections_sha256": match.registration.digest_of(path),
-        **clock,
-        "ranges": [[first, count] for first, count in frames.ranges],
+        **match.file_sources("detections", folder.detections[unit]),
+        **match.frame_sources(unit),
+        "ranges": [[first, count] for first, count in ranges],
         **edits_of(match, unit),
     }
 
@@ -86,10 +74,8 @@ def edits_by_camera(match: Match) -> dict[str, list[DetectionEdit]]:
 def video_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     """Return the unit's video, its selected frames, and its required properties."""
     folder = match.folder
-    path = folder.videos[unit].relative_to(folder.folder).as_posix()
     return {
-        "video": path,
-        "video_sha256": match.registration.digest_of(path),
+        **match.file_sources("video", folder.videos[unit]),
         "fps": folder.spec.fps,
         "image_size": list(footage_size(folder.spec, unit)),
         "clips": {clip: [first, count] for clip, first, count in footage_clips(folder.spec, unit)},
@@ -101,6 +87,6 @@ STAGE = Stage(
     about="take in 2D poses and videos",
     settings=IngestSettings,
     units=units,
-    inputs=inputs,
+    inputs=lambda match, unit: (),
     sources=sources,
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from data_contracts.static_calibration import ClickedMarkings
 from flows.stage import Match, Stage, once_a_match
 from flows.stages import detection
 from flows.stages.ingest import video_sources
@@ -80,17 +79,14 @@ def camera_sources(match: Match, unit: str) -> dict[str, JsonValue]:
     if given is not None:
         return {"calibration": given.model_dump(mode="json")}
     clicked = folder.clicked.get(unit)
-    still = folder.stills.get(unit)
-    path = None if still is None else still.relative_to(folder.folder).as_posix()
-    lens = folder.lenses.get(unit)
+    still, lens = folder.stills.get(unit), folder.lenses.get(unit)
     return {
         "calibration": None,
         **({} if lens is None else {"lens": lens.model_dump(mode="json")}),
-        "clicked": {} if clicked is None else {clicked_file(unit): _by_name(clicked)},
-        "pitch": None if folder.pitch is None else folder.pitch.model_dump(mode="json"),
+        "clicked": {} if clicked is None else {clicked_file(unit): clicked.by_name()},
+        "pitch": match.pitch_source,
         "image_size": [camera.width, camera.height],
-        "still": path,
-        "still_sha256": None if path is None else match.registration.digest_of(path),
+        **match.file_sources("still", still),
         "filmed": _video_for_still(match, unit) if still is None else None,
     }
 
@@ -100,18 +96,11 @@ def _needs_people(match: Match) -> bool:
     return None in proposed_cameras(match).values()
 
 
-def _by_name(clicked: ClickedMarkings) -> dict[str, JsonValue]:
-    return {
-        "points": {point.name: list(point.xy) for point in clicked.points},
-        "drawn": {marking.name: [list(xy) for xy in marking.xy] for marking in clicked.drawn},
-    }
-
-
 def _video_for_still(match: Match, unit: str) -> dict[str, JsonValue] | None:
     """Return the camera's video, for a still without people if none is given."""
     if unit not in match.folder.videos:
         return None
-    offset = unit_frames(match.folder.spec, unit).offset
+    offset = match.frame_sources(unit)["offset_frames"]
     return {**video_sources(match, unit), "offset_frames": offset}
 
 

@@ -12,20 +12,12 @@ def units(match: Match) -> tuple[str, ...]:
     return tuple(camera.id for camera in match.folder.spec.static_cameras)
 
 
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the proposals of a camera without clicks.
-
-    Where a side is unknown, they are those of all cameras. A camera with clicks has no inputs.
-    """
-    return needed_proposals(match, unit)
-
-
 STAGE = Stage(
     name="static_calibration",
     about="find every static camera from clicked or proposed markings",
     settings=StaticCalibrationSettings,
     units=units,
-    inputs=inputs,
+    inputs=needed_proposals,
     sources=camera_sources,
     leaves_out=True,
     needs_static_cameras=True,

@@ -21,24 +21,14 @@ def units(match: Match) -> tuple[str, ...]:
     return tuple(clip.id for clip in clips)
 
 
-def inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return every static camera, and its detections in the clip."""
-    return camera_inputs(match, unit)
-
-
-def again(match: Match, unit: str) -> tuple[str, ...]:
+def inputs_from_before(match: Match, unit: str) -> tuple[str, ...]:
     """Return cameras adjusted to people (C6), and the filtering results (R2)."""
     return ("bundle_adjustment/cameras", *filtering_inputs(match, unit))
 
 
 def filtering_inputs(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the filtering results of the clip's detections."""
-    return (f"filtering/{unit}",)
-
-
-def found_again(match: Match, unit: str) -> tuple[str, ...]:
-    """Return the redetection results of the clip's cameras."""
-    return detection.again_by_cameras(match, unit)
+    """Return the filtering results of the clip's detections; none without static cameras."""
+    return (f"filtering/{unit}",) if match.has_static_cameras else ()
 
 
 def camera_inputs(match: Match, clip_id: str) -> tuple[str, ...]:
@@ -87,10 +77,10 @@ STAGE = Stage(
     about="identify people across cameras and over time",
     settings=TrackingSettings,
     units=units,
-    inputs=inputs,
+    inputs=camera_inputs,
     sources=sources,
-    previous_pass_inputs=again,
-    late_inputs=found_again,
+    previous_pass_inputs=inputs_from_before,
+    late_inputs=detection.again_by_cameras,
     min_cameras=MIN_CAMERAS,
     needs_static_cameras=True,
 )

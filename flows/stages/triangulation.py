@@ -1,17 +1,18 @@
-"""Stage `triangulation`: one unit per clip, from its tracks and all static cameras (T3, T4)."""
+"""Stages `triangulation` and `retriangulation`: one unit per clip, from its tracks (T3, T4, B2)."""
 
 from __future__ import annotations
 
 from pydantic import JsonValue
 
+from data_contracts.records import Record
 from flows.stage import Match, Stage
-from flows.stages import tracking
+from flows.stages import detection, tracking
 from worldpose.triangulation.settings import TriangulationSettings
 
 
 def inputs(match: Match, unit: str) -> tuple[str, ...]:
     """Return every static camera, its detections, and the tracks."""
-    return (*tracking.inputs(match, unit), f"tracking/{unit}")
+    return (*tracking.camera_inputs(match, unit), f"tracking/{unit}")
 
 
 def sources(match: Match, unit: str) -> dict[str, JsonValue]:
@@ -27,7 +28,36 @@ STAGE = Stage(
     units=tracking.units,
     inputs=inputs,
     sources=sources,
-    previous_pass_inputs=tracking.again,
-    late_inputs=tracking.found_again,
+    previous_pass_inputs=tracking.inputs_from_before,
+    late_inputs=detection.again_by_cameras,
+    needs_static_cameras=True,
+)
+
+
+class RetriangulationSettings(Record):
+    """No settings of its own: joints are triangulated with the settings of `triangulation`."""
+
+
+def adjusted_inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the adjusted cameras, their detections, and the tracks of a clip."""
+    seen = detection.seen_by_cameras(match, unit)
+    return (*seen, "bundle_adjustment/cameras", f"tracking/{unit}")
+
+
+def retriangulation_inputs(match: Match, unit: str) -> tuple[str, ...]:
+    """Return the adjusted cameras, their detections, the tracks, and the first triangulation."""
+    return (*adjusted_inputs(match, unit), f"triangulation/{unit}")
+
+
+RETRIANGULATION = Stage(
+    name="retriangulation",
+    task_file="triangulation",
+    about="place every joint again with the adjusted cameras",
+    settings=RetriangulationSettings,
+    units=tracking.units,
+    inputs=retriangulation_inputs,
+    sources=tracking.clip_sources,
+    previous_pass_inputs=tracking.filtering_inputs,
+    late_inputs=detection.again_by_cameras,
     needs_static_cameras=True,
 )

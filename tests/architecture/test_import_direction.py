@@ -47,7 +47,6 @@ ORDER_IN_WORLDPOSE = (
     "body_fitting",
     "broadcast_calibration",
     "filtering",
-    "redetection",
     "pipeline",
     "evaluation",
     "dataset",

@@ -27,9 +27,6 @@ def test_rows_have_mean_and_spread_and_the_paper_is_apart(two_trials, capsys):
     told = {line.split("  ")[0]: line.split()[-2:] for line in paper.splitlines() if line}
     assert told["base"] == ["83.5", "70.8"]
     assert told["+ BA + SMPL"] == ["80.0", "66.3"]
-
-
-def test_machines_get_every_trial(two_trials, capsys):
     print_ablation(2, as_json=True)
     told = json.loads(capsys.readouterr().out)
     assert told["few clicks"]["base"]["g_mpjpe_mm"] == [70.0, 74.0]

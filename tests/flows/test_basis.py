@@ -71,13 +71,3 @@ def test_a_new_setting_of_a_later_stage_finds_the_pass_before_as_it_was(clips):
         assert (record.state, record.iteration) == ("complete", 2)
         kept = [name for name in latest.results if name.startswith("tracking/")]
         assert {record.results[name] for name in kept} == {latest.results[name] for name in kept}
-
-
-def test_the_whole_method_goes_on_from_nothing_but_the_pass_before(clips):
-    store, match = clips
-    latest = iterate(store, match, OTHER, 2)
-    stages = selected_stages("ingest", "tracking")
-    gatekeeper = Gatekeeper(store, match, "never")
-    assert RunPlan.begin(gatekeeper, stages, {}, latest, 1).results == {}
-    plan = RunPlan.begin(gatekeeper, stages, {}, latest, 2)
-    assert plan.before == {unit.name: unit.key for unit in plan_run(store, match, {})}

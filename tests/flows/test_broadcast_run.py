@@ -105,8 +105,12 @@ FORMATS = ("joints", "csv", "worldpose", "tracks", "trc", "c3d", "bvh", "mot", "
 def positions_of(name, project, match, out):
     """Errors [m] of exported positions, the share in their 95 % regions, and the people."""
     succeed("export", name, *project, "--format", "positions", "--out", out)
-    with (out / "positions/clip.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    return errors_of(out / "positions/clip.csv", match)
+
+
+def errors_of(file, match):
+    with file.open() as table:
+        rows = list(csv.DictReader(table))
     assert {row["kind"] for row in rows} == {"plane"}
     truth = library.read_joints(match / "reference/joints.npz")
     hips = truth.joints[:, :, 11:13, :2].mean(axis=2)

@@ -3,9 +3,8 @@
 import json
 import shutil
 
-import page_client
 import pytest
-from command_line import TINY, succeed, worldpose
+from command_line import TINY, worldpose
 
 from worldpose.store.store import open_run
 
@@ -39,25 +38,3 @@ def test_a_camera_with_clicks_of_the_other_end_is_named_and_left_out(tiny, tmp_p
     assert "cam02" not in tracks["camera"].values.tolist()
     assert len(tracks["camera"].values.tolist()) == 5
     assert run.record.figures["tracking/clip"]["unmatched_share"] < 0.1
-
-
-@pytest.mark.usefixtures("server")
-def test_the_gate_asks_about_a_camera_with_clicks_of_the_other_end(tiny, tmp_path):
-    match, project = shutil.copytree(tiny, tmp_path / "match"), tmp_path / "project"
-    click_the_other_end(match, "cam02")
-    run_to_gates = ("run", match, "--project", project, "--until", "tracking", "--gates", "auto")
-    assert worldpose(*run_to_gates).code == 3
-    succeed("review", "approve", TINY, "--who", "Ada", "--why", "seen", "--project", project)
-    assert worldpose(*run_to_gates).code == 3
-    ada = page_client.log_in(page_client.served(project), "Ada")
-    reviews = ada.get(page_client.MATCH).json()["reviews"]
-    (asked,) = (each for each in reviews if each["state"] == "waits")
-    assert asked["unit"] == "camera_consistency/clip"
-    assert "cam02 would be left out: its calibration is rotated" in asked["reasons"][0]
-    evidence = ada.get(f"{page_client.MATCH}/reviews/{asked['id']}/evidence").json()
-    assert evidence["clicked"] == ["cam02"]
-    assert [row[0] for row in evidence["tables"][0]["rows"]] == ["cam02"]
-    (caption,) = evidence["pictures"]
-    assert caption.startswith("Camera cam02.")
-    (row,) = (each for each in ada.get("/api/matches").json()["matches"] if each["match"] == TINY)
-    assert len(row["waiting"]) == 1

@@ -44,7 +44,7 @@ def test_an_offset_is_found_drawn_and_written(server, shifted, tmp_path):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--clip", "second"), "--clip second: expected a clip of the match: clip, found 'second'"),
+        (("--clip", "second"), "--clip second: expected one of clip, found 'second'"),
         (("--plot", "clocks.doc"), "clocks.doc: expected a file name that ends with .svg, .pdf"),
     ],
 )

@@ -19,20 +19,9 @@ def test_every_command_loads_and_is_listed_with_its_help(name):
     assert command.name == name
     first = " ".join(command.help.partition("\n\n")[0].split())
     assert first == summary(name)
+    assert hasattr(command, "commands") or "Example: worldpose" in command.help
     listed = CliRunner().invoke(app, ["--help"]).output
     assert f"\n  {name} " in listed
-
-
-def test_the_list_of_commands_and_the_version_import_no_estimator():
-    script = (
-        "import sys\n"
-        "from flows.cli.app import app\n"
-        "for option in ('--help', '--version'):\n"
-        "    app([option], standalone_mode=False)\n"
-        "loaded = {'numpy', 'pydantic', 'zarr', 'cv2', 'prefect', 'dask'} & set(sys.modules)\n"
-        "assert not loaded, loaded\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 
 
 def test_a_run_imports_nothing_that_only_draws():
@@ -54,7 +43,7 @@ def test_the_program_answers_without_an_orchestrator_or_a_numeric_library(option
         "    main()\n"
         "except SystemExit as end:\n"
         "    assert not end.code\n"
-        "heavy = {'prefect', 'dask', 'distributed', 'torch', 'numpy', 'scipy', 'xarray', 'cv2'}\n"
+        "heavy = {'prefect', 'dask', 'distributed', 'torch', 'numpy', 'cv2', 'pydantic'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
@@ -85,9 +74,3 @@ def test_a_misspelt_command_names_the_one_that_may_be_meant():
     answer = CliRunner().invoke(app, ["simualte"])
     assert answer.exit_code == 2
     assert "No such command 'simualte'. Did you mean simulate?" in answer.output
-
-
-def test_a_group_lists_its_commands():
-    answer = CliRunner().invoke(app, ["body", "--help"])
-    assert answer.exit_code == 0
-    assert "install" in answer.output.partition("Commands:")[2]

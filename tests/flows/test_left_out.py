@@ -3,17 +3,9 @@
 import json
 import shutil
 
-import pytest
 from command_line import TINY, succeed, worldpose
 
-from flows.left_out import left_out_cameras, left_out_warnings
-from flows.method import METHOD
-from flows.registering import register
-from flows.run_plan import RunPlan, plan_run
-from tasks.static_calibration import static_calibration
-from worldpose.store.store import Store, open_run
-
-STAGES = {stage.name: stage for stage in METHOD}
+from worldpose.store.store import open_run
 
 
 def spoil(folder, camera):
@@ -22,60 +14,6 @@ def spoil(folder, camera):
     clicked = json.loads(file.read_text())
     clicked["points"], clicked["drawn"] = clicked["points"][:2], []
     file.write_text(json.dumps(clicked))
-
-
-@pytest.fixture
-def calibrated(tiny, tmp_path):
-    """A store, and a match all of whose cameras but cam01 are calibrated."""
-    folder = shutil.copytree(tiny, tmp_path / "match")
-    spoil(folder, "cam01")
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, folder)
-    for unit in plan_run(store, match, {}):
-        if unit.recipe.stage == "static_calibration":
-            static_calibration.fn(unit.work(store.url, match, "0001"))
-    return store, match
-
-
-def test_later_stages_are_planned_without_a_camera_that_is_left_out(calibrated):
-    store, match = calibrated
-    every = [camera.id for camera in match.folder.spec.static_cameras]
-    left = [camera for camera in every if camera != "cam01"]
-    planned = plan_run(store, match, {})
-    names = {unit.name for unit in planned}
-    assert {f"static_calibration/{camera}" for camera in every} <= names
-    assert {f"ingest/{camera}" for camera in every} <= names
-    listed = [unit.recipe for unit in planned if "cameras" in unit.recipe.sources]
-    assert {recipe.stage for recipe in listed} >= {"tracking", "triangulation", "bundle_adjustment"}
-    for recipe in listed:
-        assert recipe.sources["cameras"] == left
-        assert not [name for name in recipe.inputs if name.endswith("/cam01")]
-
-
-def test_a_corrected_camera_takes_part_again(calibrated, tiny, tmp_path):
-    store, match = calibrated
-    before = {unit.name: unit.key for unit in plan_run(store, match, {})}
-    annotations = "annotations/static_calibration/cam01.json"
-    shutil.copy(tiny / annotations, tmp_path / "match" / annotations)
-    match, _ = register(store, tmp_path / "match")
-    after = {unit.name: unit for unit in plan_run(store, match, {})}
-    assert "static_calibration/cam01" in after["tracking/clip"].recipe.inputs
-    assert after["tracking/clip"].key != before["tracking/clip"]
-    assert after["static_calibration/cam00"].key == before["static_calibration/cam00"]
-
-
-def test_people_are_not_tracked_with_fewer_than_two_cameras(calibrated):
-    store, match = calibrated
-    results = {unit.name: unit.key for unit in plan_run(store, match, {})}
-    only = match.without([camera.id for camera in match.folder.spec.static_cameras][2:])
-    plan = RunPlan(store, only, {}, results=results)
-    assert plan.plan_stage(STAGES["tracking"]) == []
-    assert plan.lacks_cameras
-    assert plan.blocked == ["tracking/clip"]
-    left_out = left_out_cameras(store, only, METHOD, results)
-    first, second = left_out_warnings(only, left_out, 2)
-    assert first.startswith("camera cam01 is left out: annotations/static_calibration/cam01.json")
-    assert "1 of 2 static cameras can be used (cam00), and 2 are needed" in second
 
 
 def test_a_match_with_a_camera_that_cannot_be_calibrated_is_complete_and_warns(tiny, tmp_path):

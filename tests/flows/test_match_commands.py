@@ -111,17 +111,6 @@ def test_a_camera_without_calibration_is_sent_where_it_can_get_one(store, tmp_pa
     assert told in said(store, "ingest", str(made(tmp_path / "a", "a", pitch))).stdout
 
 
-def test_status_cuts_no_id_or_state_and_tells_problems_below(store, tmp_path):
-    match_id = "a-match-with-quite-a-long-name-as-leagues-and-seasons-give-them"
-    register(store, made(tmp_path / "a", match_id), unfinished=True)
-    answer = said(store, "status")
-    head, row, problem = answer.stdout.splitlines()[1:]
-    assert row.split()[:4] == [match_id, "-", "not", "run"]
-    assert head.split()[-1] == "next"
-    assert problem.startswith(f"{match_id}: {tmp_path / 'a'}: expected a given calibration")
-    assert "worldpose review serve" in problem
-
-
 def ended(state):
     """The record of a run that ended so."""
     waiting = tuple(

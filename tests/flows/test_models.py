@@ -259,7 +259,7 @@ def test_the_commands_list_pull_and_verify_checkpoints_of_a_users_file(hub, tmp_
     assert "toy: model.onnx" in str(answer.exception)
     assert not (folder / "toy").exists()
     answer = run("models", "pull", "yolox-smal")
-    assert "did you mean yolox-s" in str(answer.exception)
+    assert "Did you mean 'yolox-s'" in str(answer.exception)
 
 
 def test_a_catalog_with_a_wrong_entry_or_a_shipped_name_is_refused(tmp_path):

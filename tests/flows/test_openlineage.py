@@ -1,21 +1,15 @@
 """Lineage of a run as OpenLineage events, checked against the published schema."""
 
 import json
-import os
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from threading import Thread
 
 import pytest
 from command_line import TINY
-from jsonschema import Draft202012Validator
 
 from data_contracts.run import UnitFailure
 from flows.openlineage import lineage_events, tell_lineage
 from worldpose.store.store import Store
-
-SCHEMA = os.environ.get("WORLDPOSE_OPENLINEAGE_SCHEMA")
 
 
 @pytest.fixture
@@ -57,20 +51,6 @@ def test_every_result_leads_back_to_the_files_of_the_match(store, record):
     (failed,) = [each for each in events if each["eventType"] == "FAIL"]
     assert failed["run"]["facets"]["errorMessage"]["message"] == "no body"
     assert len({each["run"]["facets"]["parent"]["run"]["runId"] for each in events}) == 1
-
-
-@pytest.mark.skipif(SCHEMA is None, reason="WORLDPOSE_OPENLINEAGE_SCHEMA names no schema")
-def test_events_follow_the_published_schema(store, record):
-    schema = json.loads(Path(SCHEMA).read_text())
-    check = Draft202012Validator(
-        {**schema, "oneOf": [{"$ref": "#/$defs/RunEvent"}]},
-        format_checker=Draft202012Validator.FORMAT_CHECKER,
-    )
-    for event in lineage_events(store, record):
-        check.validate(event)
-        assert event["schemaURL"] == f"{schema['$id']}#/$defs/RunEvent"
-    assert not check.is_valid({**event, "eventType": "DONE"})
-    assert not check.is_valid({**event, "run": {"runId": 1}})
 
 
 @pytest.fixture
@@ -115,10 +95,3 @@ def test_events_go_to_a_server_or_a_file(store, record, receiver, tmp_path, monk
         tell_lineage(store, record)
     assert len(caplog.messages) == 3
     assert "secret" not in caplog.text
-
-
-def test_the_events_of_a_run_take_less_than_a_hundredth_of_it(store, record, tmp_path, monkeypatch):
-    monkeypatch.setenv("OPENLINEAGE_URL", f"file://{tmp_path}/lineage.ndjson")
-    began = time.perf_counter()
-    tell_lineage(store, record)
-    assert time.perf_counter() - began < 0.01 * record.seconds

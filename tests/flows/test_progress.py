@@ -18,7 +18,7 @@ from rich.console import Console
 from data_contracts.match import MatchSpec
 from flows import progress
 from flows.cli import console
-from flows.progress import MOST_TOLD, Reporter, format_duration
+from flows.progress import MOST_TOLD, Reporter
 from flows.registering import open_match
 from flows.run_plan import plan_run
 from flows.run_record import (
@@ -57,15 +57,6 @@ def test_of_very_many_units_some_are_told_of_and_the_last_is(units, told):
     assert heard.left == 0
 
 
-def test_every_failure_is_told_of_and_counts(caplog):
-    heard = Heard()
-    heard.stage_started("ingest", "take in", units=1000, missing=1000)
-    for number in range(1000):
-        heard.unit_failed(f"ingest/c{number}", "why")
-    assert heard.left == 0
-    assert len([each for each in caplog.records if each.levelname == "ERROR"]) == 1000
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """The monotonic clock, which a test sets."""
@@ -98,21 +89,6 @@ def test_percent_and_time_left_of_stage_and_run_follow_the_expected_work(clock):
     assert str(heard.run_progress) == "62 % 14 s"
     heard.unit_done("tracking/b", 5.0, {})
     assert str(heard.run_progress) == str(heard.stage_progress) == "100 %"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0, "0 s"),
-        (99.4, "99 s"),
-        (99.6, "2 min"),
-        (5900.0, "98 min"),
-        (6000.0, "1.7 h"),
-        (4e5, "5 d"),
-    ],
-)
-def test_a_duration_is_short(seconds, text):
-    assert format_duration(seconds) == text
 
 
 @pytest.mark.parametrize("verbose", [False, True])
@@ -220,35 +196,6 @@ def test_ctrl_c_says_what_is_kept_and_leaves_neither_warning_nor_traceback(serve
     assert len(found) >= kept >= 1
     assert "working" not in last and "Traceback" not in text and "leaked" not in text
     succeed("run", tiny, "--project", tmp_path / "project", "--until", "tracking")
-
-
-INTERRUPTED_WHILE_PRINTING = """
-import os, signal, threading, time
-from rich.console import Console
-from flows.cli import console
-from flows.running import end_at_once
-
-class Terminal:  # its main thread is interrupted while the spinner's thread waits for it
-    def write(self, text):
-        if "a line" in text and threading.current_thread() is threading.main_thread():
-            time.sleep(0.5)
-            os.kill(os.getpid(), signal.SIGINT)
-        return len(text)
-
-    def flush(self):
-        pass
-
-console.errors = Console(file=Terminal(), force_terminal=True)
-with console.progress() as reporter, end_at_once():
-    reporter.say("a line")
-"""
-
-
-def test_ctrl_c_ends_a_run_that_is_printing():
-    process = [sys.executable, "-c", INTERRUPTED_WHILE_PRINTING]
-    done = subprocess.run(process, stderr=subprocess.PIPE, timeout=120)
-    last = "interrupted: 0 new results are kept; the same command continues"
-    assert (done.returncode, done.stderr.decode().splitlines()[-1]) == (130, last)
 
 
 def test_pages_read_what_the_command_line_prints(clock, monkeypatch):

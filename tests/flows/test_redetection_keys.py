@@ -2,11 +2,11 @@
 
 import pytest
 from filmed import write_filmed
-from test_iteration import LATER, keys, reached
+from test_iteration import LATER, keys
 from test_refitting import halves
 
 from flows.registering import register
-from flows.stages.redetection import STAGE
+from flows.stages.filtering import REDETECTION
 from worldpose.store.store import Store
 
 
@@ -42,24 +42,6 @@ def test_detections_stay_and_all_later_stages_are_made_from_those_found_again(fi
             assert all(unit.recipe.inputs[each] == units[number, each].key for each in mine)
 
 
-@pytest.mark.parametrize("stage", ["detection", "redetection", "body_fitting"])
-def test_a_setting_reaches_its_dependency_set(filmed, stage):
-    store, folder = filmed
-    value = {
-        "detection": {"high_score_threshold": 0.3},
-        "redetection": {"min_confidence": 0.6},
-        "body_fitting": {"loss_scale": 3.0},
-    }[stage]
-    before = keys(store, folder, 3)
-    after = keys(store, folder, 3, {stage: value})
-    match, _ = register(store, folder)
-    starts = {name for _, name in before if name.startswith(f"{stage}/")}
-    changed = {name for name in after if after[name].key != before[name].key}
-    assert changed == reached(match, 3, *starts)
-    assert (2, "redetection/left.first") in changed
-    assert ((1, "filtering/first") in changed) == (stage != "redetection")
-
-
 def test_of_given_poses_nobody_is_looked_for(tiny, tmp_path):
     match, _ = register(Store.create(tmp_path / "project"), halves(tiny, tmp_path / "match"))
-    assert STAGE.units(match) == ()
+    assert REDETECTION.units(match) == ()

@@ -10,7 +10,7 @@ from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import open_match, register
 from flows.run_plan import plan_run
-from flows.stages.refitting import STAGE
+from flows.stages.body_fitting import REFITTING
 from worldpose.errors import InputError
 from worldpose.store.store import Store
 
@@ -37,22 +37,22 @@ def halves(tiny, folder, **people):
 def test_a_match_without_calibrated_broadcast_or_names_has_nothing_to_refit(tiny, tmp_path):
     store = Store.create(tmp_path / "project")
     match, _ = register(store, tiny)
-    assert STAGE.units(match) == ()
+    assert REFITTING.units(match) == ()
     named = halves(tiny, tmp_path / "match", first={0: "ann"}, second={1: "bea"})
-    assert STAGE.units(register(store, named)[0]) == ()
+    assert REFITTING.units(register(store, named)[0]) == ()
 
 
 def test_clips_with_the_same_person_are_fitted_again_with_each_others_shapes(tiny, tmp_path):
     folder = halves(tiny, tmp_path / "match", first={0: "ann", 2: "bea"}, second={1: "ann"})
     match, _ = register(Store.create(tmp_path / "project"), folder)
-    assert STAGE.units(match) == ("first", "second")
-    assert "body_fitting/second" in STAGE.inputs(match, "first")
-    assert STAGE.sources(match, "first")["people"] == {
+    assert REFITTING.units(match) == ("first", "second")
+    assert "body_fitting/second" in REFITTING.inputs(match, "first")
+    assert REFITTING.sources(match, "first")["people"] == {
         "first": {"0": "ann", "2": "bea"},
         "second": {"1": "ann"},
     }
     # Only namesakes of the clip itself matter: another name there makes nothing stale.
-    assert STAGE.sources(match, "second")["people"]["first"] == {"0": "ann"}
+    assert REFITTING.sources(match, "second")["people"]["first"] == {"0": "ann"}
 
 
 def test_names_beyond_the_roster_are_refused(tiny, tmp_path):
@@ -103,7 +103,8 @@ def test_the_camera_at_its_clips_common_place_is_what_bodies_are_fitted_with(
     monkeypatch.setattr(
         "flows.stages.detection.seen_in_broadcast", lambda match, unit: ("ingest/clip",)
     )
-    assert "broadcast_calibration/clip" in STAGE.inputs(match, "clip")
-    assert "broadcast_pooling/clip" not in STAGE.inputs(match, "clip")
-    monkeypatch.setattr("flows.stages.broadcast_pooling.units", lambda match: ("clip",))
-    assert "broadcast_pooling/clip" in STAGE.inputs(match, "clip")
+    assert "broadcast_calibration/clip" in REFITTING.inputs(match, "clip")
+    assert "broadcast_pooling/clip" not in REFITTING.inputs(match, "clip")
+    pooled = {"clip": ("clip", "other")}
+    monkeypatch.setattr("flows.stages.broadcast_calibration.pooled_clips", lambda match: pooled)
+    assert "broadcast_pooling/clip" in REFITTING.inputs(match, "clip")

@@ -8,7 +8,6 @@ import pytest
 from command_line import TINY, succeed, worldpose
 
 from worldpose.errors import InputError
-from worldpose.simulation.recordings import read_bvh
 from worldpose.store.garbage import plan_gc
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
@@ -86,32 +85,3 @@ def test_a_release_is_frozen(released, exporting):
     assert answer.code == 2
     assert "a release is never overwritten" in answer.err
     assert {path: path.read_bytes() for path in released.rglob("*.*")} == before
-
-
-def test_a_release_without_a_licence_is_refused(tiny_run, tmp_path):
-    answer = worldpose(
-        *("export", TINY, "--format", "joints", "--release", "first"),
-        *("--out", tmp_path / "out", "--project", tiny_run),
-    )
-    assert answer.code == 2
-    assert "--licence" in answer.err
-
-
-def test_formats_that_want_the_same_files_are_refused_together(tiny_run, tmp_path):
-    answer = worldpose(
-        *("export", TINY, "--format", "worldpose", "--format", "challenge"),
-        *("--out", tmp_path / "out", "--project", tiny_run),
-    )
-    assert answer.code == 2
-    assert "different folders" in answer.err
-
-
-def test_markers_and_motion_of_everybody_are_written(tiny_run, tmp_path):
-    succeed(
-        *("export", TINY, "--format", "trc", "--format", "bvh"),
-        *("--out", tmp_path, "--project", tiny_run),
-    )
-    assert len(list((tmp_path / "markers" / "clip").glob("person_00?.trc"))) == 5
-    motions = sorted((tmp_path / "motion" / "clip").glob("*.bvh"))
-    assert len(motions) == 5
-    assert read_bvh(motions[0]).positions.shape[0] == 30

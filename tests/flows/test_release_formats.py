@@ -118,6 +118,10 @@ def origin(folder, **results):
     return Origin(StubRun(**results), SimpleNamespace(spec=spec, folder=str(folder)))
 
 
+def write(form, run, out):
+    return list(EXPORTS[form](run, out))
+
+
 def test_every_format_has_a_writer_and_is_named_in_the_help_and_the_reference():
     help_text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
     help_text = re.sub(r"-\n\s+", "-", help_text)  # a line may end at a hyphen
@@ -138,7 +142,7 @@ def test_the_challenge_is_written_from_bodies_and_the_broadcast_camera(
 ):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     out = tmp_path / "out"
-    written = {path.relative_to(out).as_posix() for path in EXPORTS[form](run, out)}
+    written = {path.relative_to(out).as_posix() for path in write(form, run, out)}
     kinds = ("boxes", "skel_2d", "skel_3d")
     files = {f"{k}.npz" for k in kinds} if "2025" in form else {f"{k}/A_1.npy" for k in kinds}
     assert written == files | {"cameras/A_1.npz", "pitch_points.txt", "submission.zip"}
@@ -162,7 +166,7 @@ def test_the_challenge_is_written_from_bodies_and_the_broadcast_camera(
 
 def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
-    EXPORTS["worldpose"](run, tmp_path / "out")
+    write("worldpose", run, tmp_path / "out")
     poses, model = read_poses(tmp_path / "out" / "poses" / "A_1.npz")
     assert (poses.batch_shape, model) == ((2, 4), "open-neutral/2")
     camera = read_camera(tmp_path / "out" / "cameras" / "A_1.npz")
@@ -172,28 +176,18 @@ def test_the_broadcast_camera_joins_the_release_layout_where_there_is_one(match_
 def test_a_format_that_needs_the_broadcast_camera_says_so(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies())
     with pytest.raises(WorldposeError, match=r"broadcast_calibration/A_1.*calibrate that camera"):
-        EXPORTS["challenge"](run, tmp_path / "out")
+        write("challenge", run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_motion_file_is_named_after_person_and_first_frame(match_folder, tmp_path):
-    run = origin(match_folder, body_fitting__A_1=bodies())
-    names = [path.name for path in EXPORTS["bvh"](run, tmp_path / "out")]
-    assert names == [
-        "person_003_frame_000100.bvh",
-        "person_008_frame_000100.bvh",
-        "person_008_frame_000103.bvh",
-    ]
 
 
 def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
-    written = EXPORTS["tracks"](run, tmp_path / "out")
+    written = write("tracks", run, tmp_path / "out")
     assert [path.name for path in written] == ["baseline_settings.json", "A_1.txt"]
     rows = np.loadtxt(written[1], delimiter=",")
     # The second person is lost in the third image, the camera in the fourth.
     assert rows[:, :2].tolist() == [[1, 4], [1, 9], [2, 4], [2, 9], [3, 4]]
-    EXPORTS["challenge"](run, tmp_path / "challenge")
+    write("challenge", run, tmp_path / "challenge")
     boxes = read_challenge(tmp_path / "challenge")["A_1"].boxes
     x0, y0, x1, y1 = boxes[0, 1]
     # Pixels count from 1, at corners, there; texts hold hundredths.
@@ -205,9 +199,9 @@ def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
 def test_slahmr_gets_true_cameras_over_a_ground_with_y_down(match_folder, tmp_path):
     results = {"body_fitting__A_1": bodies(), "broadcast_calibration__A_1": broadcast()}
     with pytest.raises(InputError, match="none in 1 of 4, the first 3"):
-        EXPORTS["slahmr-cameras"](origin(match_folder, **results), tmp_path / "gap")
+        write("slahmr-cameras", origin(match_folder, **results), tmp_path / "gap")
     results["body_fitting__A_1"] = bodies().isel(frame=slice(0, 3))
-    path = EXPORTS["slahmr-cameras"](origin(match_folder, **results), tmp_path / "out")[1]
+    path = write("slahmr-cameras", origin(match_folder, **results), tmp_path / "out")[1]
     assert path.relative_to(tmp_path).as_posix() == "out/slahmr/cameras/A_1/shot-0/cameras.npz"
     with np.load(path) as found:
         w2c, (fx, fy, cx, cy) = found["w2c"][0], found["intrins"][0]
@@ -255,7 +249,7 @@ def tracked():
 
 def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
-    files = {form: EXPORTS[form](run, tmp_path) for form in ("c3d", "csv", "mot", "gltf")}
+    files = {form: write(form, run, tmp_path) for form in ("c3d", "csv", "mot", "gltf")}
     names = {path.relative_to(tmp_path).as_posix() for found in files.values() for path in found}
     assert names == {
         *(f"markers/A_1/person_00{person}.c3d" for person in (3, 8)),
@@ -278,7 +272,7 @@ def test_files_for_tools_say_what_they_hold(match_folder, tmp_path):
     assert b"mixed" in texts[0] and b"mixed" in texts[2] and b'"kind":"mixed"' in texts[3]
     assert b"COCO-17 keypoints of the fitted body open-neutral/2" in texts[1]
     unstated = replace(run, licence=None)
-    EXPORTS["c3d"](unstated, tmp_path / "unstated")
+    write("c3d", unstated, tmp_path / "unstated")
     assert b"not stated" in (tmp_path / "unstated/markers/A_1/person_003.c3d").read_bytes()
 
 
@@ -287,7 +281,7 @@ def test_a_usd_scene_has_the_people_and_the_notes(match_folder, tmp_path):
     from pxr import Usd
 
     run = replace(origin(match_folder, **tracked()), licence="For tests alone.")
-    (path,) = EXPORTS["usd"](run, tmp_path)
+    (path,) = write("usd", run, tmp_path)
     assert path.relative_to(tmp_path).as_posix() == "scenes/A_1.usdc"
     stage = Usd.Stage.Open(str(path))
     notes = stage.GetRootLayer().customLayerData
@@ -315,10 +309,10 @@ def test_a_surface_with_terms_of_its_own_is_written_on_request_with_them(
     other = dataclasses.replace(load_open_body(), name="smpl-neutral")
     monkeypatch.setattr(best_results, "find_body", lambda name, folder: other)
     run = origin(match_folder, **tracked())
-    (path,) = EXPORTS["gltf"](run, tmp_path / "joints")
+    (path,) = write("gltf", run, tmp_path / "joints")
     assert b'"skins"' not in path.read_bytes() and b"person_003_left_hip" in path.read_bytes()
     with pytest.raises(UsageError, match="--licence FILE with the terms of body model smpl-neu"):
-        EXPORTS["gltf"](replace(run, surface=True), tmp_path / "refused")
+        write("gltf", replace(run, surface=True), tmp_path / "refused")
     asked = replace(run, surface=True, licence="Terms of the model.")
-    (path,) = EXPORTS["gltf"](asked, tmp_path / "asked")
+    (path,) = write("gltf", asked, tmp_path / "asked")
     assert b'"skins"' in path.read_bytes() and b"Terms of the model." in path.read_bytes()

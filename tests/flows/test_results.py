@@ -249,10 +249,3 @@ def test_a_run_without_joints_cannot_be_exported(ingested, tmp_path):
     assert answer.code == 1
     assert "Run the match to the end" in answer.err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("command", ["status", "verify", "gc", "ingest", "run", "why", "diff"])
-def test_every_command_explains_itself_with_an_example(command):
-    answer = succeed(command, "--help")
-    assert "Example: worldpose" in answer.out
-    assert "--json" in answer.out

@@ -46,12 +46,8 @@ def compared(monkeypatch):
         (0.100, 0.1015, "worse"),
         (0.100, 0.0992, "unchanged"),  # 0.8 %
         (0.010, 0.0095, "unchanged"),  # 5 %, but half a millimetre of at least one
-        (0.200, 0.19799, "better"),
-        (0.200, 0.19801, "unchanged"),
         (0.200, 0.20201, "worse"),  # 1.005 % of what it was, though less of what it is
-        (0.200, 0.20199, "unchanged"),
         (0.010, 0.01101, "worse"),  # 10 %, and a hundredth more than a millimetre
-        (0.010, 0.01099, "unchanged"),
     ],
 )
 def test_a_figure_must_change_by_a_part_and_by_what_matters(compared, before, after, mark):
@@ -59,39 +55,6 @@ def test_a_figure_must_change_by_a_part_and_by_what_matters(compared, before, af
     found = compared(*({"static_calibration/cam01": {name: x}} for x in (before, after)))
     assert found["camera cam01"].mark == mark
     assert found["camera cam01"].figures[0].mark == mark
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "mark"),
-    [
-        (0.0, 0.0, "unchanged"),
-        (0.0, 1.0, "worse"),
-        (2.0, 1.0, "better"),
-        (200.0, 201.0, "unchanged"),
-    ],
-)
-def test_of_a_count_every_change_matters_that_is_a_part_of_it(compared, before, after, mark):
-    counts = ({"static_calibration/cam01": {"clicks_wrong": x}} for x in (before, after))
-    assert compared(*counts)["camera cam01"].mark == mark
-
-
-def test_a_run_is_told_from_the_match_to_its_players_as_people_count(compared):
-    error = {"expected_ground_error_median_m": 0.1}
-    figures = {
-        "body_fitting/clip": {"residual_m.person10": 0.01, "residual_m.person2": 0.01},
-        "static_calibration/cam10": error,
-        "static_calibration/cam2": error,
-        "filtering/clip": {"held_out_error": 0.04},
-        "bundle_adjustment/cameras": {"held_out_error_after_px": 2.0},
-    }
-    assert list(compared(figures, figures)) == [
-        "match cameras",
-        "clip clip",
-        "camera cam2",
-        "camera cam10",
-        "player clip: person 2",
-        "player clip: person 10",
-    ]
 
 
 def test_better_and_worse_together_are_mixed(compared):
@@ -157,13 +120,6 @@ def test_who_stands_where_somebody_stood_is_that_person():
     assert pair_people(before, after + 2.0) == {}
     assert pair_people(before, np.repeat(before[:, :1], 2, axis=1)) == {0: 0}
     assert pair_people(before[:, :0], after) == {}
-
-
-def test_people_who_are_never_there_together_are_no_pair():
-    before = np.zeros((2, 1, 3, 3))
-    after = before.copy()
-    before[0], after[1] = np.nan, np.nan
-    assert pair_people(before, after) == {}
 
 
 def test_the_picture_in_which_somebody_moved_most_is_found(monkeypatch):

@@ -57,11 +57,3 @@ def test_core_hours_and_bytes_are_those_of_all_results():
         cost = timings.run_time(store, "m", "0001").cost
         assert (cost.core_hours, cost.bytes) == (pytest.approx(13.0 / 3600.0), 4 * 750)
     assert str(cost) == "0.00361 core hours, 3 kB"
-
-
-@pytest.mark.parametrize(
-    ("size", "text"),
-    [(0, "0 B"), (999, "999 B"), (999_600, "1 MB"), (1_234_000, "1.23 MB"), (2e15, "2e+03 TB")],
-)
-def test_a_size_is_short(size, text):
-    assert timings.in_bytes(size) == text

@@ -1,7 +1,5 @@
 """Small units in one task: each is published or fails as in a task of its own."""
 
-import threading
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -39,7 +37,7 @@ def works(tmp_path):
 def run(works, compute, monkeypatch):
     monkeypatch.setattr(tracking, "tracking", SimpleNamespace(fn=compute))
     monkeypatch.setattr(batch, "RETRY_SECONDS", 0.0)
-    return batch.batch.fn("tracking", [each.model_dump_json() for each in works])
+    return batch.batch.fn("tracking", "tasks.tracking", [each.model_dump_json() for each in works])
 
 
 def test_a_units_failure_is_its_own(works, monkeypatch):
@@ -67,19 +65,3 @@ def test_what_may_pass_is_tried_again_and_what_is_there_is_not(works, monkeypatc
     failures = run(works, compute, monkeypatch)
     assert sorted(tried) == ["b", "b", "c", "c", "c"]
     assert [type(each) for each in failures] == [type(None), type(None), StoreError]
-
-
-@pytest.mark.parametrize("interrupted", ["", "b"])
-def test_units_run_in_pairs_unless_one_ended_its_process_before(works, interrupted, monkeypatch):
-    at_work, most, changing = set(), [], threading.Lock()
-
-    def compute(work):
-        with changing:
-            at_work.add(work.recipe.unit)
-            most.append(len(at_work))
-        time.sleep(0.1)
-        at_work.remove(work.recipe.unit)
-
-    monkeypatch.setattr(batch, "was_interrupted", lambda work: work.recipe.unit == interrupted)
-    assert run(works, compute, monkeypatch) == [None, None, None]
-    assert max(most) == (1 if interrupted else 2)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tasks import clip_inputs
 from tasks.clip_inputs import PAGE, StoredArray, read_rows, select_frames
 
 
@@ -79,15 +78,3 @@ def test_chosen_frames_are_those_of_their_numbers():
         assert found["x"].values.tolist() == [frame - 50 for frame in frames]
     with pytest.raises(KeyError):
         select_frames(stored, np.array([59, 60]))
-
-
-@pytest.mark.parametrize(("limit", "reads"), [(2**20, 6), (0, 12)])
-def test_a_short_clip_is_read_once_and_a_long_one_page_by_page(monkeypatch, limit, reads):
-    monkeypatch.setattr(clip_inputs, "SMALL_BYTES", limit)
-    frames = 6 * PAGE - 10
-    values = np.arange(2 * frames, dtype=np.float32).reshape(frames, 2)
-    camera = xr.Dataset({"score": (("frame", "detection"), values)})
-    stored = StoredArray([camera], "score")
-    for _ in range(2):
-        np.testing.assert_array_equal(stored[:][:, 0], values)
-    assert stored._page.cache_info().misses == reads

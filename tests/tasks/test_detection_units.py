@@ -11,12 +11,12 @@ from filmed import write_filmed
 import tasks.detection
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.review import Correction, DeletedDetection
-from data_contracts.work import Work
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import RunPlan
 from tasks.clip_inputs import open_clip, open_frames
+from tasks.unit import UnitInputs
 from worldpose.detection.interfaces import People
 from worldpose.errors import InputError
 from worldpose.ingest.writing import import_boxes
@@ -58,11 +58,12 @@ def filmed(tmp_path):
 
 
 def computed(store, match, stages):
-    """Results of the first stages, by `stage/unit`."""
+    """Results of the first stages, by `stage/unit`; those that are there are not computed."""
     results = {}
     for stage in METHOD[:stages]:
         for unit in RunPlan(store, match, {}, results=results).plan_stage(stage):
-            task_of(stage).fn(unit.work(store.url, match, "0001"))
+            if not unit.published:
+                task_of(stage).fn(unit.work(store.url, match, "0001"))
             results[unit.name] = unit.key
     return results
 
@@ -83,7 +84,7 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
         *("static_calibration/left", "static_calibration/right"),
     }
     for work, frames in ((early, np.arange(2, 14)), (late, np.arange(20, 30))):
-        clip = open_clip(store, work)
+        clip = open_clip(UnitInputs(store, work))
         assert clip.detections.keypoints.shape == (len(frames), 2, 1, 17, 2)
         shown = clip.detections.keypoints[:][:, :, 0, 0, 0]
         expected = frames[:, None] + list(OFFSETS.values()) + 0.0
@@ -101,7 +102,7 @@ def test_people_of_videos_reach_tracking_on_the_match_s_clock(filmed, tmp_path, 
             },
         }
     )
-    both = open_frames(store, Work(**{**dict(late), "recipe": recipe}), chosen)
+    both = open_frames(UnitInputs(store, late.model_copy(update={"recipe": recipe})), chosen)
     np.testing.assert_array_equal(
         both.detections.keypoints[:, :, 0, 0, 0], [[3, 6], [7, 10], [21, 24], [28, np.nan]]
     )
@@ -122,46 +123,6 @@ def test_a_video_of_which_no_image_can_be_decoded_fails_with_its_name(filmed, tm
     match, _ = register(store, filmed)
     with pytest.raises(InputError, match=r"left\.mp4.*none in 12 frames"):
         computed(store, match, [stage.name for stage in METHOD].index("tracking"))
-
-
-class Marking:
-    """Marks one point of every person, at the left of the box."""
-
-    points = ("left_heel", "right_heel")
-
-    def add_points(self, picture, people):
-        at = np.full((len(people.score), 2, 2), np.nan)
-        at[:, 0] = people.boxes[:, :2] + [0.0, 5.0]
-        return people.add_points(self.points, at, np.where(np.isfinite(at[..., 0]), 0.5, np.nan))
-
-
-def test_landmarks_of_videos_reach_triangulation_and_cameras_without_them_have_none(
-    filmed, tmp_path, reading, monkeypatch
-):
-    store = Store.create(tmp_path / "project")
-    match, _ = register(store, filmed)
-    names = [stage.name for stage in METHOD]
-    plain = computed(store, match, names.index("tracking"))
-    monkeypatch.setattr(tasks.detection, "load_landmarks", lambda settings: Marking())
-    other = Store.create(tmp_path / "other")
-    match, _ = register(other, filmed)
-    results = computed(other, match, names.index("tracking"))
-    seen = other.open_result("filmed", "detection", "left.early", results["detection/left.early"])
-    assert seen["point"].values.tolist() == list(Marking.points)
-    before = store.open_result("filmed", "detection", "left.early", plain["detection/left.early"])
-    assert "extra_keypoints" not in before and "point" not in before.attrs
-    for name in ("keypoints", "confidence", "boxes", "score"):
-        np.testing.assert_array_equal(seen[name].values, before[name].values)
-    plan = RunPlan(other, match, {}, results=results)
-    early, _ = plan.plan_stage(METHOD[names.index("tracking")])
-    clip = open_clip(other, early.work(other.url, match, "0001")).detections
-    assert clip.points == Marking.points
-    part = clip[:3]
-    assert part.extra_keypoints.shape == (3, 2, 1, 2, 2)
-    np.testing.assert_array_equal(
-        part.extra_keypoints[:, :, 0, 0], part.boxes[:, :, 0, :2] + [0.0, 5.0]
-    )
-    assert np.isnan(part.extra_keypoints[:, :, :, 1]).all()
 
 
 def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
@@ -187,7 +148,7 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
         else:
             before = computed(store, match, stages)
             monkeypatch.setattr(tasks.detection, "load_detectors", None)  # would fail
-            after = computed_again(store, corrected, stages, before)
+            after = computed(store, corrected, stages)
             assert {n for n in after if after[n] != before[n]} == {"detection/left.early"}
         unit = ("filmed", "detection", "left.early", after["detection/left.early"])
         found.append((store.manifest(*unit), store.open_result(*unit)["score"].values))
@@ -195,17 +156,6 @@ def test_a_corrected_detection_is_the_same_whether_or_not_the_nets_look_again(
     assert np.isnan(score[:, 0]).tolist() == [n == 4 - 2 for n in range(12)]
     assert (fresh.content, fresh.figures) == (kept.content, kept.figures)
     assert fresh.figures["corrections_refused"] == 0
-
-
-def computed_again(store, match, stages, before):
-    """The same where what is there already is not computed."""
-    results = {}
-    for stage in METHOD[:stages]:
-        for unit in RunPlan(store, match, {}, results=results).plan_stage(stage):
-            if before.get(unit.name) != unit.key:
-                task_of(stage).fn(unit.work(store.url, match, "0001"))
-            results[unit.name] = unit.key
-    return results
 
 
 def test_other_weights_than_planned_with_are_refused(filmed, tmp_path, reading, monkeypatch):
@@ -270,29 +220,3 @@ def test_given_boxes_take_the_place_of_the_detector(filmed, tmp_path, reading, m
     np.testing.assert_array_equal(found[..., 1], np.where(np.isnan(expected), np.nan, [10.0, 20.0]))
     manifest = store.manifest("filmed", "detection", "right.early", after["detection/right.early"])
     assert manifest.figures["empty_share"] == 0.5
-
-
-def test_boxes_belong_to_a_video_without_2d_poses(filmed, tmp_path):
-    boxes = tmp_path / "boxes"
-    boxes.mkdir()
-    with pytest.raises(InputError, match=r"without 2D poses: left, right, found no .txt file"):
-        import_boxes(boxes, filmed)
-    (boxes / "middle.txt").write_text("1,1,5,5,5,5,1\n")
-    with pytest.raises(InputError, match=r"left, right, found middle.txt"):
-        import_boxes(boxes, filmed)
-    (boxes / "middle.txt").rename(boxes / "right.txt")
-    (boxes / "left.txt").write_text("41,1,5,5,5,5,1\n")
-    with pytest.raises(InputError, match=r"left.txt: line 1: frame: .* from 1 to 40"):
-        import_boxes(boxes, filmed)
-    assert not (filmed / "boxes").exists()
-    (boxes / "left.txt").unlink()
-    import_boxes(boxes, filmed)
-    with pytest.raises(InputError, match=r"right.txt: expected no boxes of right yet"):
-        import_boxes(boxes, filmed)
-    # A file that was edited afterwards is refused when the match is registered.
-    (filmed / "boxes" / "right.txt").write_text("1,1,5,5,5,-5,1\n")
-    with pytest.raises(InputError, match="more than 0 px"):
-        register(Store.create(tmp_path / "project"), filmed)
-    (filmed / "boxes" / "right.txt").rename(filmed / "boxes" / "main.txt")
-    with pytest.raises(InputError, match=r"main.txt: expected a camera or clip with a video"):
-        register(Store.create(tmp_path / "other"), filmed)

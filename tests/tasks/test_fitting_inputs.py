@@ -1,4 +1,4 @@
-"""Inputs of body fitting: triangulated keypoints, other clips' shapes, clock offsets."""
+"""Images of the broadcast camera as input of body fitting: clock offsets."""
 
 from types import SimpleNamespace
 
@@ -6,62 +6,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from data_contracts.conventions import COCO17
-from data_contracts.keypoints import KeypointDetections
-from tasks import body_fitting, refitting
-from tasks.clip_inputs import ClipInputs
+from tasks import refitting
 from worldpose.body_fitting.monocular import MonocularEstimates
 from worldpose.body_fitting.pose_space import GATHER
 from worldpose.body_fitting.ray_constraints import constrain_to_rays
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rigid import Rigid
 from worldpose.simulation.scene import look_at
-
-LEGS = [COCO17.index(f"{side}_{name}") for name in ("knee", "ankle") for side in ("left", "right")]
-
-
-def stored(**arrays):
-    """A result with these arrays and arbitrary dimensions."""
-    return {name: xr.DataArray(np.asarray(values)) for name, values in arrays.items()}
-
-
-def test_legs_that_triangulation_exchanged_are_exchanged_for_bodies_too(monkeypatch):
-    truth = np.random.default_rng(1).uniform(0.0, 1000.0, (4, 2, 3, 17, 2))
-    index = np.array([[0, 2], [1, -1]])[None].repeat(4, axis=0)
-    exchanged = np.zeros((4, 2, 2, 3), dtype=bool)
-    exchanged[2, 0, 1, 2] = True  # the second person's legs, in the first camera
-    seen = truth.copy()
-    legs = [*LEGS, COCO17.index("left_hip"), COCO17.index("right_hip")]
-    other = [joint + (1 if COCO17[joint].startswith("left") else -1) for joint in legs]
-    seen[2, 0, 2, legs] = truth[2, 0, 2, other]
-    results = {
-        "retriangulation/clip": stored(
-            person=[0, 1],
-            joints=np.zeros((4, 2, 17, 3)),
-            covariance=np.zeros((4, 2, 17, 3, 3)),
-            shared_covariance=np.zeros((4, 2, 3, 3)),
-            common_bias=np.zeros(17),
-            exchanged=exchanged,
-        ),
-        "tracking/clip": stored(detection_index=index),
-    }
-    detections = KeypointDetections.from_keypoints(seen, seen[..., 0], frame=np.arange(4))
-    clip = ClipInputs(("a", "b"), None, None, detections, 50.0)
-    monkeypatch.setattr(body_fitting, "open_clip", lambda *_: clip)
-    monkeypatch.setattr(body_fitting, "open_input", lambda store, work, name: results[name])
-    people = body_fitting.open_people(None, SimpleNamespace(recipe=SimpleNamespace(unit="clip")))
-    np.testing.assert_array_equal(people[:].keypoints, truth)
-
-
-@pytest.mark.parametrize("weight", [0.25, 1.0, 4.0])
-def test_clips_that_say_nothing_of_somebody_leave_him_anybody(monkeypatch, weight):
-    silent = stored(person=[7], betas=np.zeros((1, 10)), betas_covariance=[np.eye(10) / weight])
-    named = {"here": {"3": "ann"}, "second": {"7": "ann"}, "third": {"7": "ann"}}
-    recipe = SimpleNamespace(unit="here", sources={"people": named})
-    monkeypatch.setattr(refitting, "open_input", lambda *_: silent)
-    known = refitting._known_shapes(None, SimpleNamespace(recipe=recipe), np.array([2, 3]), weight)
-    assert list(known) == [1]
-    np.testing.assert_allclose(known[1].covariance, np.eye(10) / weight)
 
 
 def beside(frames):
@@ -84,18 +35,8 @@ def runner(frame):
     return (body + (frame - 5.5)[:, None, None] * [0.5, 0.5, 0.0])[:, None]
 
 
-def of_clip(**sources):
-    """Work on the clip of twelve frames from match frame 100 on."""
-    here = {"first_frame": 100, "frame_count": 12, **sources}
-    inputs = {"broadcast_calibration/clip": "key"}
-    recipe = SimpleNamespace(match_id="match", unit="clip", inputs=inputs, sources=here)
-    return SimpleNamespace(recipe=recipe, folder="folder")
-
-
 @pytest.mark.parametrize(("feed_offset", "late"), [("report", -0.25), ("correct", 1.25)])
-def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
-    monkeypatch, feed_offset, late
-):
+def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(feed_offset, late):
     arrays = camera_arrays(beside(3))
     seen = xr.Dataset(
         {"keypoints": (("frame", "detection", "joint", "axis"), np.zeros((3, 1, 17, 2)))},
@@ -108,18 +49,22 @@ def test_pictures_are_late_by_what_rounding_leaves_and_what_was_measured(
         },
         attrs={"feed_offset": {"frames": 1.5}},
     )
-    inputs = {"broadcast_calibration/clip": found, "ingest/clip": seen}
-    monkeypatch.setattr(refitting, "open_input", lambda store, work, name: inputs[name])
+    results = {"broadcast_calibration/clip": found, "ingest/clip": seen}
     calibrated = SimpleNamespace(recipe=SimpleNamespace(settings={"feed_offset": feed_offset}))
-    store = SimpleNamespace(manifest=lambda *_: calibrated)
-    work = of_clip(
-        frame_count=3,
-        offset_frames=4,
-        broadcast_offset_frames=4.25,
-        seen_in_broadcast="ingest/clip",
-        estimates=None,
+    inputs = SimpleNamespace(
+        unit="clip",
+        sources={
+            "offset_frames": 4,
+            "broadcast_offset_frames": 4.25,
+            "seen_in_broadcast": "ingest/clip",
+            "estimates": None,
+        },
+        frames=np.arange(100, 103),
+        open=results.__getitem__,
+        open_first=lambda pooled, calibrated: results[calibrated],
+        made_from=lambda name: calibrated,
     )
-    pictures = refitting._BroadcastViews.open(store, work, {"joints": None})
+    pictures = refitting._BroadcastViews.open(inputs, {"joints": None})
     # Match frame 100 is at 104.25 of the video: its image 104 was taken a quarter earlier. The
     # feed was measured to show what static cameras show one and a half frames on.
     assert pictures.late == late

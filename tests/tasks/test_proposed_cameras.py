@@ -85,15 +85,6 @@ def test_a_camera_with_a_side_is_calibrated_from_its_image(folder, tmp_path):
     assert np.linalg.norm(off) < 0.5
 
 
-def test_shared_people_decide_the_side_of_a_camera(folder, tmp_path):
-    take_clicks(folder, {TURNED: None})
-    state_side(folder, "cam00", "near")
-    found, reasons = calibrate(folder, tmp_path, TURNED)
-    assert not reasons
-    off = camera_from_arrays(found[TURNED].data_vars).center - true_camera(folder, TURNED).center
-    assert np.linalg.norm(off) < 0.5
-
-
 def test_people_contradict_a_wrong_side(folder, tmp_path):
     take_clicks(folder, {TURNED: "near", "cam04": None})
     found, reasons = calibrate(folder, tmp_path, TURNED, "cam04")
@@ -147,9 +138,3 @@ def test_one_side_has_to_be_stated(folder, tmp_path):
     state_side(folder, "cam03", "left")
     match, _ = register(store, folder)
     assert match.folder.to_click == ()
-
-
-def test_a_camera_without_clicks_and_image_has_to_be_clicked(folder, tmp_path):
-    (folder / "annotations" / "static_calibration" / "cam00.json").unlink()
-    with pytest.raises(InputError, match=r"missing camera cam00.*give one camera a side"):
-        register(Store.create(tmp_path / "project"), folder)

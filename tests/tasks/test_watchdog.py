@@ -53,14 +53,12 @@ def test_who_ends_three_processes_is_given_up_once(work, tmp_path):
         pass
 
 
-@pytest.mark.parametrize("again", ["another project", "a new project at the same place"])
-def test_what_killed_runs_left_counts_for_no_other_run(work, tmp_path, monkeypatch, again):
+def test_what_killed_runs_left_counts_for_no_other_run(work, tmp_path, monkeypatch):
     for _ in range(3):
         die(work)
-    if again == "another project":
-        work = work.model_copy(update={"project": "q"})
-    else:
-        at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1001")
+    with kill_on_timeout(work.model_copy(update={"project": "q"})):
+        pass
+    at_work(monkeypatch, tmp_path, "tcp://127.0.0.1:1001")  # a new project at the same place
     with kill_on_timeout(work):
         pass
 

@@ -71,7 +71,7 @@ def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, N
     }
 
 
-def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
+def moving_from_arrays(arrays: Mapping[Any, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
     """Return the moving camera of stored arrays, and its covariance."""
     names = ("covariance", "shared_covariance", "clip_covariance")
     own, across, shared = (np.asarray(arrays[name]) for name in names)

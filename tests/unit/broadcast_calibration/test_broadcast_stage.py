@@ -16,9 +16,8 @@ from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from flows.registering import register
 from flows.run_plan import plan_run
-from flows.stages.broadcast_pooling import STAGE as POOLING
-from tasks.broadcast_calibration import broadcast_calibration
-from tasks.broadcast_pooling import broadcast_pooling
+from flows.stages.broadcast_calibration import POOLING
+from tasks.broadcast_calibration import broadcast_calibration, broadcast_pooling
 from tasks.ingest import ingest
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.writing import MatchAnnotations, write_match

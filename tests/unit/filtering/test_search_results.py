@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_contracts.keypoints import KeypointDetections
-from worldpose.redetection import (
+from worldpose.filtering.redetection import (
     MissingPeople,
     RedetectionSettings,
     judge_search_results,

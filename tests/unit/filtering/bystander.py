@@ -3,9 +3,9 @@
 import numpy as np
 
 from worldpose.filtering.judging import BodyViews, Spread, view_bodies
+from worldpose.filtering.redetection import Expected
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.redetection import Expected
 
 FOCAL, SIZE = 1000.0, (1000, 600)
 AWAY = 20.0

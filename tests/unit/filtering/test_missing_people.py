@@ -7,8 +7,8 @@ from bystander import SIZE, camera, expected
 from data_contracts.pitch import PitchSpec
 from worldpose.detection.pipeline import Place
 from worldpose.detection.settings import RedetectionSettings
+from worldpose.filtering.redetection import find_detected_people, select_missing_people
 from worldpose.pitch.template import PitchTemplate
-from worldpose.redetection import find_detected_people, select_missing_people
 
 SETTINGS = RedetectionSettings()
 
