@@ -360,7 +360,7 @@ def register_world(
     ]
     motion = _one(motions, int(np.argmin(left)))
     for _ in range(_ROUNDS):
-        distances = joint_distances(motion.apply(_flat(predicted)).reshape(predicted.shape), true)
+        distances = joint_distances(move_people(motion, predicted), true)
         found = take_matched(predicted, match_people(distances, gate))
         if not np.isfinite(found).any():
             break
@@ -373,9 +373,9 @@ def _any_joint(people: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(people[..., 0]).any((-1, -2)))
 
 
-def _flat(people: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return people reshaped to (frames, persons * joints, 3)."""
-    return people.reshape(len(people), -1, 3)
+def move_people(motion: Similarity, people: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return people (frames, persons, joints, 3) [m] after a motion of the world."""
+    return motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
 
 
 def _pairs(
@@ -450,13 +450,11 @@ def match_tracks(
         cost = np.where(np.isnan(overlap), np.inf, 1.0 - overlap)
         return merge_tracks(match_boxes(overlap, settings.min_overlap), cost)
     possible = min(
-        int(np.isfinite(side[..., 0]).any(-1).sum())
-        for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
+        int(np.isfinite(side[..., 0]).any(-1).sum()) for side in (people, true[_any_joint(people)])
     )
     if (match >= 0).sum() < settings.min_matched_share * possible:
         motion = register_world(people, true, settings.match_gate_m)
         if motion is not None:
-            moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
-            distances = joint_distances(moved, true)
+            distances = joint_distances(move_people(motion, people), true)
             match = match_people(distances, settings.match_gate_m)
     return merge_tracks(match, distances)

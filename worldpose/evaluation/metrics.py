@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
@@ -315,7 +316,7 @@ def evaluate_joints(
     idle[frame, match[frame, person]] = True
 
     true = np.where(counts[..., None], reference.joints, np.nan)
-    tally = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
+    scores_of = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
     identity = identity_scores(distances, present, exists & ~idle, settings.match_gate_m)
     around = None if boxes is None else select_frames(boxes, prediction.frames, reference.frames)
     tracks = match_tracks(people, reference.joints, distances, match, camera, around, settings)
@@ -324,18 +325,13 @@ def evaluate_joints(
     )
     minutes = _minutes(reference.frames, fps)
     evaluation = Evaluation(
-        **tally.scores((slice(None), slice(None))),
+        **scores_of(slice(None)),
         **figures,
         false_persons_per_frame=_ratio(exists.sum() - (match >= 0).sum(), frames),
-        idf1=identity.idf1,
-        hota=identity.hota,
-        detection_accuracy=identity.detection_accuracy,
-        association_accuracy=identity.association_accuracy,
-        switches=identity.switches,
+        **asdict(identity),
         switches_per_minute=(
             None if identity.switches is None or not minutes else identity.switches / minutes
         ),
-        fragmentations=identity.fragmentations,
         persons=int(present.any(axis=0).sum()),
         frames=frames,
     )
@@ -343,7 +339,7 @@ def evaluate_joints(
         PersonScore(
             person_id=int(person_id),
             frames=int(present[:, index].sum()),
-            **tally.scores((slice(None), index)),
+            **scores_of(index),
             **persons[index],
         )
         for index, person_id in enumerate(reference.person_ids)
@@ -351,44 +347,30 @@ def evaluate_joints(
     return evaluation, scores
 
 
-@dataclass(frozen=True, eq=False)
-class _Tally:
-    """Counts and errors of matched people; the first dimensions are frames and true persons."""
-
-    frames: NDArray[np.bool_]
-    matched: NDArray[np.bool_]
-    joints: NDArray[np.bool_]
-    found: NDArray[np.bool_]
-    error: NDArray[np.float64]
-    limbs: NDArray[np.bool_]
-    correct: NDArray[np.bool_]
-
-    def scores(self, part: tuple[slice, slice | int]) -> dict[str, float | None]:
-        """Return metrics over a part of the frames and persons."""
-        return {
-            "coverage": _ratio(self.matched[part].sum(), self.frames[part].sum()),
-            "joint_coverage": _ratio(self.found[part].sum(), self.joints[part].sum()),
-            "mpjpe_mm": _ratio(1000.0 * self.error[part].sum(), self.found[part].sum()),
-            "pcp3d": _ratio(100.0 * self.correct[part].sum(), self.limbs[part].sum()),
-        }
-
-
 def _tally(
     predicted: NDArray[np.float64],
     true: NDArray[np.float64],
     present: NDArray[np.bool_],
     alpha: float,
-) -> _Tally:
+) -> Callable[[slice | int], dict[str, float | None]]:
+    """Compare matched people (frames, persons, 17, 3) [m]; return metrics by true persons."""
     error = np.linalg.norm(predicted - true, axis=-1)
-    return _Tally(
-        frames=present,
-        matched=present & np.any(np.isfinite(predicted[..., 0]), axis=-1),
-        joints=np.isfinite(true[..., 0]),
-        found=np.isfinite(error),
-        error=np.where(np.isfinite(error), error, 0.0),
-        limbs=np.all(np.isfinite(limb_ends(true)), axis=(-1, -2)),
-        correct=correct_limbs(predicted, true, alpha),
-    )
+    found = np.isfinite(error)
+    matched = present & np.any(np.isfinite(predicted[..., 0]), axis=-1)
+    joints = np.isfinite(true[..., 0])
+    error = np.where(found, error, 0.0)
+    limbs = np.all(np.isfinite(limb_ends(true)), axis=(-1, -2))
+    correct = correct_limbs(predicted, true, alpha)
+
+    def scores(who: slice | int) -> dict[str, float | None]:
+        return {
+            "coverage": _ratio(matched[:, who].sum(), present[:, who].sum()),
+            "joint_coverage": _ratio(found[:, who].sum(), joints[:, who].sum()),
+            "mpjpe_mm": _ratio(1000.0 * error[:, who].sum(), found[:, who].sum()),
+            "pcp3d": _ratio(100.0 * correct[:, who].sum(), limbs[:, who].sum()),
+        }
+
+    return scores
 
 
 def _ratio(part: float, whole: float) -> float | None:

@@ -21,11 +21,12 @@ from worldpose.reports.drawing import (
     LINE,
     TEMPLATE,
     draw_label,
+    draw_markings,
     markings,
     picture_panels,
     png,
     show_image,
-    style,
+    style_ground,
 )
 
 ACCEPTED: Final = "#0072b2"
@@ -78,13 +79,8 @@ def plot_calibration(
 ) -> bytes:
     """Return a PNG with the template and all clicks over the still, and the coverage map below.
 
-    Args:
-        camera: a single camera.
-        title: names the camera.
-        pitch: its markings are projected.
-        clicks: inliers are circles, outliers crosses with their names.
-        still: the camera's image (height, width, 3), RGB; None = plain ground.
-        error_map: coverage map; None = no map.
+    The camera is single; inlier clicks are circles, outliers crosses with their names. `still` is
+    the camera's image (height, width, 3), RGB, None = plain ground.
     """
     width, height = (int(n) for n in camera.image_size)
     below = 0 if error_map is None else MAP_HEIGHT
@@ -93,9 +89,7 @@ def plot_calibration(
     )
     if error_map is not None:
         _draw_error_map(figure, error_map, pitch)
-    for line in markings(pitch):
-        color = TEMPLATE if still is not None else LINE
-        axes.plot(*camera.project(line).T, color=color, linewidth=1.2, zorder=1)
+    draw_markings(axes, camera, pitch, LINE if still is None else TEMPLATE)
     for click in clicks:
         sign, color = ("o", ACCEPTED) if click.inlier else ("x", REFUSED)
         axes.plot(
@@ -130,9 +124,7 @@ def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> No
     )
     for line in markings(pitch):
         axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.0, zorder=1)
-    axes.set_xlabel("x, along the touch line [m]", color=INK)
-    axes.set_ylabel("y, across [m]", color=INK)
-    style(axes)
+    style_ground(axes)
     beside = figure.add_axes((0.83, 0.12 * high, 0.015, 0.76 * high))
     bar = figure.colorbar(shades, cax=beside, extend="both")
     bar.set_label("expected ground error [m]", color=INK)
@@ -223,6 +215,5 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     # The square root makes distances of a few pixels visible.
     grey = np.sqrt(np.minimum(distance, MAX_DISTANCE_PX))
     show_image(right, np.rint(255.0 * grey / max(float(grey.max()), 1.0)).astype(np.uint8))
-    for line in markings(pitch):
-        right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
+    draw_markings(right, camera, pitch, TEMPLATE, 0.8, zorder=2)
     return png(figure), float((off < ON_PAINT_PX).mean()) if len(off) else float("nan")

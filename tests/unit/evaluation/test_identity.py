@@ -63,20 +63,6 @@ def test_case_s_two_people_exchange_ids():
     assert exchanged.association_accuracy == pytest.approx(0.7 * 7 / 13 + 0.3 * 3 / 17, abs=1e-15)
 
 
-def test_an_id_that_comes_back_after_another_switches_twice():
-    assert line(0, 1, 0).switches == 2
-
-
-def test_a_gap_before_the_first_and_after_the_last_frame_is_no_fragmentation():
-    assert line(-1, 0, 0, -1).fragmentations == 0
-
-
-def test_absence_of_the_true_person_is_no_fragmentation():
-    distances = np.zeros((5, 1, 1))
-    distances[2] = np.inf
-    assert scores(distances).fragmentations == 0
-
-
 def test_a_person_keeps_the_prediction_of_the_frame_before_though_another_is_nearer():
     distances = np.array([[[0.1, 0.5]], [[0.4, 0.2]], [[0.4, 0.2]]])
     assert scores(distances).switches == 0
