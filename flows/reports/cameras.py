@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
-from flows.reports.match_pictures import background_image
-from flows.results.best_results import estimated_pitch
+from flows.reports.match_pictures import background_image, shown_pitch
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera, camera_from_arrays
 from worldpose.reports.html_page import CaptionedImage, Table
@@ -113,7 +112,7 @@ def paint_pictures(
     still = background_image(store, match, name)
     if still is None:  # no image of the video's clips can be read
         return []
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     assert pitch is not None  # of the match folder
     png, share = plot_paint(cameras[name], still, pitch)
     return [
@@ -129,10 +128,11 @@ def paint_pictures(
 
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
     """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     assert pitch is not None, "nothing is clicked without a pitch"
     result = run[f"static_calibration/{name}"]
-    inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
+    names = (str(point) for point in result["point"].values)
+    inlier = dict(zip(names, result["point_inlier"].values.tolist(), strict=True))
     return plot_calibration(
         camera,
         f"camera {name}",
@@ -177,11 +177,6 @@ def proposal_evidence(
     )
     columns = ("marking", ">length in the image [px]", ">on paint")
     return CaptionedImage(caption, png), Table("Markings that the proposal expects", columns, rows)
-
-
-def _names(run: Run, camera_id: str) -> list[str]:
-    """Return the clicked points in the order of the result's arrays."""
-    return [str(name) for name in run[f"static_calibration/{camera_id}"]["point"].values]
 
 
 def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:

@@ -36,13 +36,13 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.store.store import Run
+from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
 """Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
-"""Files that the server keeps; the oldest is removed for a new one."""
+"""Files that are kept; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
     "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'none'"
@@ -50,14 +50,14 @@ REPORT_POLICY: Final = (
 """The report carries its own scripts: the browser gives it no session and no requests."""
 
 
-class _Files:
+class DrawnFiles:
     """Files that were drawn on request, each once per run."""
 
     def __init__(self) -> None:
-        self._folder = TemporaryDirectory(prefix="worldpose-results-")
+        self._folder = TemporaryDirectory(prefix="worldpose-pages-")
         self._lock = Lock()  # one at a time: drawing needs memory for all images
 
-    def get(self, run: Run, name: str, draw: Callable[[Path], None]) -> Path:
+    def get(self, run: Run, name: str, draw: Callable[[Path], object]) -> Path:
         """Return the file `name` of a run, drawn by `draw` if it is not there."""
         record = run.record
         unique = hashlib.sha256(f"{record.match_id} {record.run_id} {name}".encode()).hexdigest()
@@ -72,6 +72,13 @@ class _Files:
                     draw(made)
                     shutil.move(made, file)
         return file
+
+    def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
+        """Return the response with the overlay video of a clip."""
+        file = self.get(
+            run, f"{clip}.mp4", lambda file: write_clip_video(store, run, match, clip, file)
+        )
+        return FileResponse(file, media_type="video/mp4")
 
 
 class _Clips:
@@ -91,11 +98,6 @@ class _Clips:
                 self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
                 self._key = key
             return self._clip
-
-
-def _require_clip(run: Run, clip: str) -> None:
-    if clip not in clips_of(run.record):
-        raise HTTPException(404, "the run has no such clip")
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
@@ -124,11 +126,17 @@ def why_without_joints(run: Run, clip: str) -> str | None:
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run that has people."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
-    files, shown = _Files(), _Clips()
+    files, shown = DrawnFiles(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
         return match, open_results(context.store, match_id)
+
+    def open_clip(match_id: str, clip: str) -> ViewerClip:
+        match, run = open_latest(match_id)
+        if clip not in clips_of(run.record):
+            raise HTTPException(404, "the run has no such clip")
+        return shown.get(run, match, clip)
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
@@ -179,9 +187,7 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("/scenes/{clip}")
     def scene(match_id: str, clip: str) -> Response:
-        match, run = open_latest(match_id)
-        _require_clip(run, clip)
-        return Response(encode_scene(shown.get(run, match, clip)), media_type=BINARY)
+        return Response(encode_scene(open_clip(match_id, clip)), media_type=BINARY)
 
     @router.get("/scenes/{clip}/frames")
     def frames(
@@ -190,9 +196,7 @@ def routes(context: PageContext) -> APIRouter:
         first: Annotated[int, Query(ge=0)],
         count: Annotated[int, Query(ge=1, le=10_000)],
     ) -> Response:
-        match, run = open_latest(match_id)
-        _require_clip(run, clip)
-        return Response(encode_frames(shown.get(run, match, clip), first, count), media_type=BINARY)
+        return Response(encode_frames(open_clip(match_id, clip), first, count), media_type=BINARY)
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:
@@ -213,11 +217,7 @@ def routes(context: PageContext) -> APIRouter:
         match, run = open_latest(match_id)
         if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
             raise HTTPException(404, "no camera of such a clip has a video")
-
-        def draw(file: Path) -> None:
-            write_clip_video(context.store, run, match, clip, file)
-
-        return FileResponse(files.get(run, f"{clip}.mp4", draw), media_type="video/mp4")
+        return files.clip_video(context.store, run, match, clip)
 
     @router.get("/exports/{form}")
     def export_zip(match_id: str, form: str) -> FileResponse:

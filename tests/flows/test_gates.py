@@ -61,12 +61,6 @@ def wrong_click(match):
     return MovedPoint(camera="cam03", marking=name, xy=None)
 
 
-def test_without_gates_nothing_waits_and_nothing_is_asked(store):
-    record = run(store, "never")
-    assert (record.run_id, record.gates, record.waiting) == ("0001", "never", ())
-    assert store.blobs.entries("reviews") == []
-
-
 def test_a_setting_given_while_all_waits_is_that_of_the_run_after_the_review(store):
     run(store, "always")
     asked = RunRequest({"body_fitting": {"loss_scale": 3.0}}, gates="always")

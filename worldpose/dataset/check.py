@@ -49,10 +49,7 @@ _AS_SHIPPED: Final = "the camera's x, y, z"
 def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
     """Yield boxes without their skeletons, and whether another number order explains it.
 
-    Args:
-        boxes: (frames, persons, 4) boxes as in the file.
-        skel_2d: (frames, persons, points, 2) [px].
-        clip: its name.
+    Boxes are (frames, persons, 4) as in the file, skeletons (frames, persons, points, 2) [px].
     """
     shipped = _overlap(boxes, skel_2d)
     if shipped >= _OVERLAP:
@@ -91,14 +88,7 @@ def skeleton_findings(
 
     Every body is translated to minimize its 2D residual; the remaining residual indicates other
     axes. The residual does not depend on body size, so units are checked by thigh lengths.
-
-    Args:
-        skel_3d: (frames, persons, points, 3) points as in the file.
-        skel_2d: (frames, persons, points, 2) [px].
-        skeleton: names of the points.
-        rows: the clip's camera; a frame without a pose has K and k.
-        clip: its name.
-        settings: thresholds for an explanation.
+    Skeletons are (frames, persons, points, 3) as in the file, and their 2D [px].
     """
     where = (f"skel_3d of {clip}",)
     count = len(rows.intrinsics) if len(rows.intrinsics) > 1 else len(skel_3d)

@@ -69,11 +69,7 @@ def read_markers(path: Path) -> Markers:
 
 
 def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return people and joints from marker names of the form `joint` or `person:joint`.
-
-    Args:
-        names: markers; the function skips names outside COCO-17.
-    """
+    """Return people and joints from markers `joint` or `person:joint`; others are skipped."""
     people: dict[str, dict[str, tuple[str, ...]]] = {}
     for name in names:
         person, _, joint = name.rpartition(":")
@@ -260,12 +256,8 @@ def align_reference(
 def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:
     """Return joints (times, persons, 17, 3) at times on their own clock, interpolated linearly.
 
-    NaN outside the samples, and if either neighbour is missing.
-
-    Args:
-        joints: (samples, persons, 17, 3) [m].
-        rate: samples per second [1/s].
-        times: (times,) [s] since the first sample.
+    Joints are (samples, persons, 17, 3) [m] at a rate [1/s], times (times,) [s] since the first
+    sample. NaN outside the samples, and if either neighbour is missing.
     """
     place = np.round(times * rate, 9)
     before = np.floor(place).astype(np.int64)

@@ -41,10 +41,7 @@ mid-shoulder to the middle of the ears."""
 
 
 def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return both ends of every limb, NaN where a joint is missing.
-
-    Args:
-        joints: (..., 17, 3) [m].
+    """Return both ends of every limb of COCO-17 joints (..., 17, 3) [m]; NaN where one is missing.
 
     Returns:
         (..., 10, 2, 3) [m], in the order of `LIMBS`.
@@ -63,10 +60,7 @@ def correct_limbs(
 ) -> NDArray[np.bool_]:
     """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
 
-    Args:
-        predicted: (..., 17, 3) [m]; a limb with a missing joint is wrong.
-        true: (..., 17, 3) [m].
-        alpha: share of the true length.
+    Joints are (..., 17, 3) [m]; a limb with a missing joint is wrong.
 
     Note:
         Burenius et al., CVPR 2013, in the form used for Shelf and Campus: the mean of both errors
@@ -75,37 +69,23 @@ def correct_limbs(
     true_ends = limb_ends(true)
     error = np.linalg.norm(limb_ends(predicted) - true_ends, axis=-1).mean(axis=-1)
     length = np.linalg.norm(true_ends[..., 0, :] - true_ends[..., 1, :], axis=-1)
-    correct: NDArray[np.bool_] = error <= alpha * length
-    return correct
+    return np.asarray(error <= alpha * length)
 
 
 def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joints of E4 (..., 14, 3) [m], NaN where missing.
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
+    """Return the joints of E4 (..., 14, 3) [m] from COCO-17 (..., 17, 3), NaN where missing."""
     neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
     return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
 
 
 def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joints that the challenge and COCO-17 share (..., 13, 3) [m].
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
+    """Return the joints (..., 13, 3) [m] that the challenge shares with COCO-17 (..., 17, 3)."""
     return np.concatenate([joints[..., :1, :], joints[..., 5:, :]], axis=-2)
 
 
 def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle of the hips (..., 3) [m], NaN if one is missing.
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
-    middle: NDArray[np.float64] = joints[..., 11:13, :].mean(axis=-2)
-    return middle
+    """Return the middle of the hips (..., 3) [m] of COCO-17 joints, NaN if one is missing."""
+    return np.asarray(joints[..., 11:13, :].mean(axis=-2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +150,8 @@ def aligned_errors(
 def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the length of every true person's path (persons,) [m].
 
-    The path of the mid-hip through the compared frames, with straight lines across gaps.
-
-    Args:
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
-        compared: (frames, persons) whether both sides have the person.
+    The path of the mid-hip of joints (frames, persons, 17, 3) [m] through the compared frames
+    (frames, persons), with straight lines across gaps.
     """
     hips = mid_hip(true)
     used = compared & np.isfinite(hips[..., 0])
@@ -190,10 +167,7 @@ def drift_per_meter(
 ) -> float | None:
     """Return the mean over people of mean error over path length [1], None without long paths.
 
-    Args:
-        errors: (frames, persons, joints) [m]; NaN where missing.
-        lengths: (persons,) path lengths [m].
-        min_length: minimum path length per person [m].
+    Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m].
 
     Note:
         E1. The ratio of the published columns does not give the published drift, so that the drift
@@ -213,11 +187,8 @@ def challenge_errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return global and local joint errors (frames, persons, 13) [m], without any alignment.
 
-    Local errors are relative to the mid-hip of each side.
-
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
+    Local errors are relative to the mid-hip of each side. Joints are (frames, persons, 17, 3) [m],
+    those predicted in the order of the true people; NaN where missing.
     """
     offset = challenge_joints(predicted) - challenge_joints(true)
     roots = (mid_hip(predicted) - mid_hip(true))[..., None, :]
@@ -232,13 +203,8 @@ def acceleration_errors(
 ) -> NDArray[np.float64]:
     """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
 
-    Second differences of three successive frames at the minimum step, on the joints of E4.
-
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
-        frames: (frames,) match frames, rising.
-        fps: match frames per second [1/s].
+    Second differences of three successive frames at the minimum step, on the joints of E4. Joints
+    are (frames, persons, 17, 3) [m] as in `challenge_errors`; match frames (frames,) rise.
     """
     offset = paper_joints(predicted) - paper_joints(true)
     steps = np.diff(frames)

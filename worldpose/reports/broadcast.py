@@ -94,12 +94,7 @@ def _curves(camera: Camera) -> dict[str, Floats]:
 def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
     """Return the frame index and person index with the largest distance between two projections.
 
-    Only people well inside the image count; (0, 0) without any.
-
-    Args:
-        before: a batch (frames,).
-        after: another batch (frames,).
-        tracks: people in the same frames.
+    Cameras are batches (frames,). Only people well inside the image count; (0, 0) without any.
     """
     frames, persons = tracks.joints.shape[:2]
     one, two = (
@@ -169,14 +164,10 @@ def plot_flow(
     rejected: NDArray[np.bool_],
     predicted: Floats,
 ) -> bytes:
-    """Return a PNG of the optical flow from a frame to the next, with inliers and outliers.
+    """Return a PNG of the optical flow from a frame, RGB, to the next, with inliers and outliers.
 
-    Args:
-        still: the frame (height, width, 3), RGB.
-        start: (n, 2) points in it [px].
-        end: (n, 2) their positions in the next frame [px].
-        rejected: (n,) outliers.
-        predicted: (n, 2) positions predicted by the estimated camera [px].
+    Points (n, 2) [px] start in the frame, and end in the next one; the estimated camera predicts
+    their positions there. `rejected` (n,) are outliers.
     """
     height, width = still.shape[:2]
     longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))

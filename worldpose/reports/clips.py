@@ -254,15 +254,10 @@ def plot_detections(
     pitch: PitchSpec | None = None,
     part: tuple[Floats, Floats] | None = None,
 ) -> bytes:
-    """Return a PNG of a part of an image: detections on the left, reconstruction on the right.
+    """Return a PNG of a part of a single camera's image: detections, and the reconstruction.
 
-    Args:
-        camera: a single camera.
-        detections: its detections, on the left.
-        people: the reconstruction, on the right, with one colour per person.
-        still: background image (height, width, 3), RGB; None = plain ground.
-        pitch: draw its markings on the right; None without a pitch.
-        part: corner and side lengths (2,) [px] of the part; None = the part with most people.
+    The part has a corner and side lengths (2,) [px]; None = the part with most people. Without a
+    still, RGB, the ground is plain.
     """
     boxes, joints = detections.boxes, people.joints
     whole = joints[np.isfinite(joints).all((-1, -2))]

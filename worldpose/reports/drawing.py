@@ -374,13 +374,7 @@ def require_plot(path: Path) -> None:
 
 
 def draw_synchronization(found: Synchronization, names: Sequence[str], path: Path) -> None:
-    """Write a plot of each camera's matches by its clock offset, as SVG, PDF or PNG.
-
-    Args:
-        found: the offsets.
-        names: of the cameras.
-        path: file to write; its suffix is the form.
-    """
+    """Write a plot of each camera's matches by its clock offset; the suffix is the form."""
     figure = Figure(figsize=(7.0, 1.3 * len(names) + 0.8), layout="constrained")
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for panel, name, matches, late, std, reason in zip(
@@ -406,12 +400,7 @@ def draw_synchronization(found: Synchronization, names: Sequence[str], path: Pat
 
 
 def draw_lens_fits(fits: Mapping[str, LensFit], path: Path) -> None:
-    """Write a plot of board corners, their residuals, and residuals by radius, for each camera.
-
-    Args:
-        fits: lenses by camera.
-        path: file to write; its suffix is the form.
-    """
+    """Write a plot of board corners, their residuals, and residuals by radius, by camera."""
     figure = Figure(figsize=(8.0, 3.2 * len(fits)), layout="constrained")
     rows = figure.subplots(len(fits), 2, squeeze=False)
     for (seen, radial), (name, fit) in zip(rows, fits.items(), strict=True):

@@ -105,14 +105,9 @@ def whole_page(
     tiles: Sequence[tuple[str, str]] = (),
     last: Folded | None = None,
 ) -> str:
-    """Return a whole HTML page.
+    """Return a whole HTML page, without the sections that have no blocks.
 
-    Args:
-        title: heading of the page.
-        about: subtitle.
-        sections: sections of the page; those without blocks are left out.
-        tiles: key metrics at the top, each with its label.
-        last: folded tables after the sections.
+    Tiles are key metrics at the top, each with its label.
     """
     shown = [section for section in sections if section.blocks]
     allowed = " ".join(dict.fromkeys(map(_allow, _scripts(shown))))
@@ -254,11 +249,7 @@ SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 
 
 def compress_image(png: bytes) -> SmallImage:
-    """Return kind, content and size (width, height) [px] of an image: WebP if it is smaller.
-
-    Args:
-        png: a PNG.
-    """
+    """Return kind, content and size (width, height) [px] of a PNG: as WebP if it is smaller."""
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
     if len(png) < LARGE:
         return "png", png, size

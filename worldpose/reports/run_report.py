@@ -213,13 +213,8 @@ def report_page(
 ) -> str:
     """Return a self-contained HTML page without external resources.
 
-    Args:
-        title: heading of the page.
-        run: record of the run, with the quality metrics of its units.
-        seconds: computation time of each unit, by `stage/unit` [s].
-        scores: metrics against the truth, if there is a reference.
-        sections: sections of the page; those without blocks are left out.
-        tiles: key metrics at the top, each with its label.
+    `seconds` is the computation time of each unit, by `stage/unit` [s]; scores are metrics against
+    the truth, if there is a reference.
     """
     shown = list(sections)
     if run.warnings:

@@ -145,12 +145,9 @@ NEAR_PAINT_PX: Final = 12.0
 
 
 def detect_paint(still: Image) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of pixels that look like paint.
+    """Return the mask (height, width) of pixels of a still, RGB, that look like paint.
 
     They are colourless, bright, brighter than both sides, and part of a long region.
-
-    Args:
-        still: (height, width, 3), RGB.
     """
     grey = cv2.GaussianBlur(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), (3, 3), 0)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (MAX_WIDTH_PX, MAX_WIDTH_PX))
@@ -178,12 +175,8 @@ def marking_distances(
 ) -> NDArray[np.float64]:
     """Return distances of projected marking samples to paint (n,) [px].
 
-    The result omits samples without paint nearby, which are occluded or outside the image.
-
-    Args:
-        camera: a single camera.
-        pitch: pitch with the markings.
-        distance: result of `distance_to`.
+    The camera is single, the distance that of `distance_to`. The result omits samples without paint
+    nearby, which are occluded or outside the image.
     """
     height, width = distance.shape
     pixels = np.concatenate([camera.project(line) for line in markings(pitch)])
@@ -197,10 +190,7 @@ def marking_distances(
 def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
     """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
 
-    Args:
-        camera: a single camera; projects the markings over the distances.
-        still: its image (height, width, 3), RGB.
-        pitch: pitch with the markings.
+    The single camera projects the markings over the distances; its still is RGB.
     """
     paint = detect_paint(still)
     distance = distance_to(paint)

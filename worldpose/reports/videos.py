@@ -44,13 +44,8 @@ def overlay_frames(
 ) -> Iterator[Image]:
     """Yield frames at half size with projected markings and people.
 
-    Args:
-        pictures: (height, width, 3) RGB, one per entry of `frames`.
-        camera: a batch (frames,).
-        tracks: people, one colour each.
-        frames: (n,) match frames; the function draws people in frames of `tracks`.
-        pitch: draw its markings; None without a pitch.
-        bodies: surfaces to draw instead of bones, for people with bodies.
+    There is one image (height, width, 3) RGB, and one camera of a batch, per match frame; people
+    are drawn in frames of `tracks`, and as surfaces instead of bones if they have bodies.
     """
     lines = markings(pitch) if pitch is not None else []
     rows = {int(frame): row for row, frame in enumerate(tracks.frames)}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.conventions import COCO17
+from data_contracts.match import CameraSpec
 from data_contracts.review import (
     AddedDetection,
     Correction,
@@ -109,8 +110,9 @@ def _objection(
     place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
     if template is None:
         return "the match has no pitch"
-    size = (_static_size if edit.frame is None else _broadcast_size)(folder, edit.camera)
-    if size is None:
+    camera = folder.spec.filming_camera(edit.camera)
+    is_static = edit.camera in {each.id for each in folder.spec.static_cameras}
+    if camera is None or is_static != (edit.frame is None):
         return f"there is no image {place}"
     if edit.frame is None and edit.camera in folder.calibrations:
         return f"camera {edit.camera} is given, so that its clicks decide nothing"
@@ -118,7 +120,7 @@ def _objection(
     if edit.marking not in (template.points if is_point else template.marking_names):
         return f"the pitch has no {'point' if is_point else 'marking'} {edit.marking}"
     for pixel in _pixels(edit.xy):
-        if not _is_inside(pixel, size):
+        if not _is_inside(pixel, camera):
             return f"{list(pixel)} is outside of the image {place}"
     now = _now(pictures, edit)
     if now != edit.was:
@@ -129,8 +131,8 @@ def _objection(
 
 def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
     """Return why a correction of detections is invalid in the match; None if it is valid."""
-    size = _static_size(folder, edit.camera) or _broadcast_size(folder, edit.camera)
-    if size is None:
+    camera = folder.spec.filming_camera(edit.camera)
+    if camera is None:
         return f"there is no camera {edit.camera}"
     placed: tuple[Pixel | None, ...] = ()
     if isinstance(edit, MovedKeypoint):
@@ -139,33 +141,19 @@ def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
         placed = (edit.xy,)
     elif isinstance(edit, AddedDetection):
         x0, y0, x1, y1 = edit.box
-        if not (x0 < x1 and y0 < y1 and x0 < size[0] and y0 < size[1] and x1 > 0 and y1 > 0):
+        is_inside = x0 < camera.width and y0 < camera.height and x1 > 0 and y1 > 0
+        if not (x0 < x1 and y0 < y1 and is_inside):
             return f"{list(edit.box)} is not a box inside the image of {edit.camera}"
         placed = edit.keypoints
     for xy in placed:
-        if xy is not None and not _is_inside(xy, size):
+        if xy is not None and not _is_inside(xy, camera):
             return f"{list(xy)} is outside of the image of {edit.camera}"
     return None
 
 
-def _is_inside(pixel: Pixel, size: tuple[int, int]) -> bool:
-    return all(-0.5 <= value <= side - 0.5 for value, side in zip(pixel, size, strict=True))
-
-
-def _static_size(folder: MatchFolder, camera: str) -> tuple[int, int] | None:
-    """Return the size of a static camera's images [px], None if there is no such camera."""
-    sizes = {each.id: (each.width, each.height) for each in folder.spec.static_cameras}
-    return sizes.get(camera)
-
-
-def _broadcast_size(folder: MatchFolder, clip: str) -> tuple[int, int] | None:
-    """Return the size of a clip's broadcast images [px], None if there are none."""
-    owners = {each.id: each.broadcast for each in folder.spec.clips}
-    owner = owners.get(clip)
-    if owner is None:
-        return None
-    camera = folder.spec.camera(owner)
-    return camera.width, camera.height
+def _is_inside(pixel: Pixel, camera: CameraSpec) -> bool:
+    x, y = pixel
+    return -0.5 <= x <= camera.width - 0.5 and -0.5 <= y <= camera.height - 0.5
 
 
 def _pixels(xy: Pixel | tuple[Pixel, ...] | None) -> tuple[Pixel, ...]:

@@ -180,15 +180,3 @@ def test_a_ray_to_a_point_of_the_crowned_surface_meets_it(x, y, center):
         np.testing.assert_allclose(
             surface_points(true.unproject(pixels), CROWNED), point, atol=1e-7
         )
-
-
-@given(seed=st.integers(0, 999))
-def test_rotation_error_is_the_angle_of_the_turn_between_them(seed):
-    rng = np.random.default_rng(seed)
-    rotvec = rng.normal(size=3)
-    rotvec *= 10.0 ** rng.uniform(-8.0, 0.4) / np.linalg.norm(rotvec)
-    turn = Rigid.from_rotvec(rotvec, np.zeros(3)).rotation
-    found = errors(camera(turn @ DOWN), camera(), None)
-    # Rounding of the matrices is 1e-15 rad.
-    expected = np.degrees(np.linalg.norm(rotvec))
-    assert found.rotation_error_deg == pytest.approx(expected, abs=1e-12)

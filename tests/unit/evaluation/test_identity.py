@@ -70,25 +70,9 @@ def test_a_person_keeps_the_prediction_of_the_frame_before_though_another_is_nea
     assert scores(distances).switches == 1
 
 
-def test_false_people_lower_idf1_and_detection():
-    distances = np.full((4, 1, 2), np.inf)
-    distances[:, 0, 0] = 0.0
-    exists = np.ones((4, 2), dtype=bool)
-    found = identity_scores(distances, np.ones((4, 1), dtype=bool), exists, 1.0)
-    assert found.idf1 == pytest.approx(8 / 12, abs=1e-15)
-    assert (found.detection_accuracy, found.association_accuracy) == (0.5, 1.0)
-
-
 def test_nobody_anywhere_has_no_scores():
     empty = scores(np.empty((3, 0, 0)))
     assert (empty.idf1, empty.hota, empty.switches) == (None, None, None)
-
-
-def test_nobody_found_scores_zero():
-    missed = identity_scores(
-        np.empty((3, 1, 0)), np.ones((3, 1), dtype=bool), np.empty((3, 0), dtype=bool), 1.0
-    )
-    assert (missed.idf1, missed.hota, missed.switches) == (0.0, 0.0, 0)
 
 
 @given(seed=st.integers(0, 999), order=st.permutations(range(3)))

@@ -27,12 +27,6 @@ def test_nobody_on_either_side_matches_nothing():
     assert match_frame(people(0.0), nobody, 1.0).tolist() == []
 
 
-def test_people_without_a_common_joint_do_not_match():
-    head_only, feet_only = people(0.0), people(0.0)
-    head_only[0, 0], feet_only[0, 1] = np.nan, np.nan
-    assert match_frame(head_only, feet_only, 1.0).tolist() == [-1]
-
-
 def test_distance_is_over_common_joints_only():
     half = people(0.4)
     half[0, 1] = np.nan

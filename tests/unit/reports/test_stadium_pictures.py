@@ -88,6 +88,10 @@ def test_nobody_and_no_pitch_are_still_pictures():
     nobody = JointTracks(np.arange(1), np.arange(0), np.empty((1, 0, 17, 3)))
     assert decoded(plot_stadium({"a": looking(0.3)}, "", nobody)).shape[2] == 3
     assert decoded(plot_camera_view(looking(0.3), "", nobody, 0)).shape[2] == 3
+    nobody = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
+    assert decoded(plot_paths(nobody)).shape[2] == 3
+    gone = JointTracks(np.arange(3), np.arange(1), np.full((3, 1, 17, 3), np.nan))
+    assert decoded(plot_paths(gone, cameras={"south": looking(0.0)})).shape[2] == 3
 
 
 def test_wrong_clicks_are_marked_where_they_were_made():
@@ -136,10 +140,3 @@ def test_truth_is_drawn_beneath():
     tracks = walkers()
     alone, with_truth = (decoded(plot_paths(tracks, truth=t)) for t in (None, tracks))
     assert len(pixels_of(with_truth, "#cfcfcf")) > len(pixels_of(alone, "#cfcfcf")) + 100
-
-
-def test_nobody_at_all_is_still_a_picture():
-    nobody = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
-    assert decoded(plot_paths(nobody)).shape[2] == 3
-    gone = JointTracks(np.arange(3), np.arange(1), np.full((3, 1, 17, 3), np.nan))
-    assert decoded(plot_paths(gone, cameras={"south": looking(0.0)})).shape[2] == 3

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given as given_that
-from hypothesis import strategies as st
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
@@ -23,7 +21,7 @@ from data_contracts.review import (
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.ingest.match_folder import MatchFolder
-from worldpose.review.clicks import add_previous_value, replay_corrections
+from worldpose.review.clicks import replay_corrections
 from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
 from worldpose.store.store import Store
@@ -172,25 +170,6 @@ def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
     assert points(picked[1].markings) == {CORNER: (190.0, 90.0)}
     gone = moved(None, (150.0, 60.0), camera="clip", frame=3)
     assert replay_corrections(folder, made(gone)).folder.key_frames == {}
-
-
-places = st.tuples(st.integers(0, 99), st.integers(0, 49)).map(lambda xy: tuple(map(float, xy)))
-
-
-@given_that(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.none() | places), max_size=12))
-def test_edits_of_one_who_sees_the_present_all_apply(folder, moves):
-    """Against a plain model: the last move of a point is where it is."""
-    state, corrections = folder, []
-    model = {name: points(folder.clicked[name]) for name in "ab"}
-    for camera, xy in moves:
-        edit = add_previous_value(state, MovedPoint(camera=camera, marking=CORNER, xy=xy))
-        corrections += made(edit)
-        state = replay_corrections(folder, corrections).folder
-        model[camera].pop(CORNER, None)
-        if xy is not None:
-            model[camera][CORNER] = xy
-    assert replay_corrections(folder, corrections).stale == ()
-    assert {name: points(state.clicked[name]) for name in "ab"} == model
 
 
 class MemoryBlobs:

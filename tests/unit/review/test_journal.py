@@ -113,21 +113,6 @@ def test_an_entry_that_later_ones_build_on_is_missed(store, harm):
     assert "000003" in verify(store)[-1].path
 
 
-def test_only_what_is_new_is_read_again(store, monkeypatch):
-    for number in range(20):
-        say(store, "m", lambda _, number=number: [correction(str(number))])
-    one = Store.open(store.url)
-    read_journal(one, "m")
-    read = []
-    blobs_read = type(one.blobs).read
-    monkeypatch.setattr(
-        type(one.blobs), "read", lambda self, path: (read.append(path), blobs_read(self, path))[1]
-    )
-    monkeypatch.setattr(type(one.blobs), "entries", None)  # a list of all is not asked for either
-    assert len(said(read_journal(one, "m"))) == 20
-    assert read == ["reviews/m/000020.json", "reviews/m/000021.json"]
-
-
 def test_a_journal_that_was_restored_or_made_again_is_read_anew(store):
     for name in "abc":
         say(store, "m", lambda _, name=name: [correction(name)])
@@ -166,13 +151,6 @@ def test_an_entry_of_another_place_is_refused(store):
     first.rename(first.with_name("000002.json"))
     with pytest.raises(CorruptionError, match="is entry 1"):
         read_journal(store, "m")
-
-
-def test_a_writer_that_was_overtaken_writes_nothing(store):
-    stale = read_journal(store, "m")
-    assert append(store, stale, [correction("a")]) is not None
-    assert append(store, stale, [correction("b")]) is None
-    assert said(read_journal(store, "m")) == ["a"]
 
 
 def test_a_full_disk_is_told_and_leaves_the_journal_as_it_was(store, monkeypatch):
