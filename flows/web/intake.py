@@ -137,6 +137,22 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
             raise HTTPException(409, "another page saved this form first: load it again")
         return drafts.view(draft)
 
+    @router.post("/{draft}/removal")
+    def discard(draft: str) -> dict[str, Any]:
+        drafts.discard(draft)
+        return {"discarded": draft}
+
+    @router.post("/{draft}/finish")
+    def finish(draft: str, given: Finish) -> dict[str, Any]:
+        return {"arrived": drafts.finish(draft, given.priority)}
+
+    _add_files(router, drafts, intake)
+    return router
+
+
+def _add_files(router: APIRouter, drafts: Drafts, intake: Intake) -> None:
+    """Add the routes of the files of a draft."""
+
     @router.post("/{draft}/files")
     def begin_upload(draft: str, given: NewUpload) -> dict[str, Any]:
         file = DraftFile(title=given.name, size=given.size, modified_ms=given.modified_ms)
@@ -177,14 +193,3 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
     def remove(draft: str, file: str) -> dict[str, Any]:
         drafts.remove(draft, file)
         return drafts.view(draft)
-
-    @router.post("/{draft}/removal")
-    def discard(draft: str) -> dict[str, Any]:
-        drafts.discard(draft)
-        return {"discarded": draft}
-
-    @router.post("/{draft}/finish")
-    def finish(draft: str, given: Finish) -> dict[str, Any]:
-        return {"arrived": drafts.finish(draft, given.priority)}
-
-    return router

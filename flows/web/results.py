@@ -140,50 +140,11 @@ def routes(context: PageContext) -> APIRouter:
 
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
-        match, run = open_latest(match_id)
-        record = run.record
-        clips = find_clips(record)
-        lacking = {clip: why_without_joints(run, clip) for clip in clips}
-        is_3d = not clips or None in lacking.values()
-        formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
-        return {
-            "run": record.run_id,
-            "state": record.state,
-            "later": describe_later_run(context.store, record),
-            "formats": list(formats),
-            "purposes": EXPORT_PURPOSES,
-            "clips": [
-                {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
-                for clip in clips
-            ],
-        }
+        return _describe_results(context, *open_latest(match_id))
 
     @router.get("/metrics")
     def metrics(match_id: str) -> dict[str, Any]:
-        match, run = open_latest(match_id)
-        record, parent = run.record, run.record.parent
-        changes, problem = [], ""
-        if parent is not None:
-            try:
-                before = context.store.run(match_id, parent)
-                changes = compare_runs(context.store, before, record)
-            except WorldposeError as error:  # its results may be garbage collected
-                problem = f"Run {parent} cannot be compared: {describe_error(error)}"
-        return {
-            "metrics": [
-                {
-                    "kind": each.kind,
-                    "name": each.name,
-                    "values": {one.figure: one.after for one in each.figures},
-                }
-                for each in compare_runs(context.store, record, record)
-            ],
-            "names": _player_names(match, run),
-            "before": parent,
-            "problem": problem,
-            "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
-            "unchanged": sum(each.mark == "unchanged" for each in changes),
-        }
+        return _describe_metrics(context, *open_latest(match_id))
 
     @router.get("/scenes/{clip}")
     def scene(match_id: str, clip: str) -> Response:
@@ -237,3 +198,50 @@ def routes(context: PageContext) -> APIRouter:
         )
 
     return router
+
+
+def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
+    """Return clips and export formats of a run, and what came after it."""
+    record = run.record
+    clips = find_clips(record)
+    lacking = {clip: why_without_joints(run, clip) for clip in clips}
+    is_3d = not clips or None in lacking.values()
+    formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
+    return {
+        "run": record.run_id,
+        "state": record.state,
+        "later": describe_later_run(context.store, record),
+        "formats": list(formats),
+        "purposes": EXPORT_PURPOSES,
+        "clips": [
+            {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
+            for clip in clips
+        ],
+    }
+
+
+def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
+    """Return the metrics of a run, and their changes since the run before it."""
+    record, parent = run.record, run.record.parent
+    changes, problem = [], ""
+    if parent is not None:
+        try:
+            before = context.store.run(match.match_id, parent)
+            changes = compare_runs(context.store, before, record)
+        except WorldposeError as error:  # its results may be garbage collected
+            problem = f"Run {parent} cannot be compared: {describe_error(error)}"
+    return {
+        "metrics": [
+            {
+                "kind": each.kind,
+                "name": each.name,
+                "values": {one.figure: one.after for one in each.figures},
+            }
+            for each in compare_runs(context.store, record, record)
+        ],
+        "names": _player_names(match, run),
+        "before": parent,
+        "problem": problem,
+        "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
+        "unchanged": sum(each.mark == "unchanged" for each in changes),
+    }

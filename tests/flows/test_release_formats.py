@@ -176,16 +176,6 @@ def test_a_format_that_needs_the_broadcast_camera_says_so(match_folder, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_motion_file_is_named_after_person_and_first_frame(match_folder, tmp_path):
-    run = origin(match_folder, body_fitting__A_1=bodies())
-    names = [path.name for path in EXPORTS["bvh"](run, tmp_path / "out")]
-    assert names == [
-        "person_003_frame_000100.bvh",
-        "person_008_frame_000100.bvh",
-        "person_008_frame_000103.bvh",
-    ]
-
-
 def test_other_methods_get_our_boxes_as_mot_lines(match_folder, tmp_path):
     run = origin(match_folder, body_fitting__A_1=bodies(), broadcast_calibration__A_1=broadcast())
     written = EXPORTS["tracks"](run, tmp_path / "out")

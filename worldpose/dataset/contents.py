@@ -110,6 +110,11 @@ def convention(fault: str, says: str, *where: str, **figures: float) -> Finding:
     return Finding(fault=fault, kind="convention", where=where, says=says, figures=figures)
 
 
+def implausible(fault: str, says: str, *where: str, **figures: float) -> Finding:
+    """Return the finding of implausible data."""
+    return Finding(fault=fault, kind="plausibility", where=where, says=says, figures=figures)
+
+
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
     """Return a mask of missing persons and frames of a file, and findings on it.
 

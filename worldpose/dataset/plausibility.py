@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View, convention, sample_evenly
+from worldpose.dataset.contents import (
+    PointSource,
+    View,
+    convention,
+    implausible,
+    sample_evenly,
+)
 from worldpose.dataset.faults import (
     LATEST,
     CheckSettings,
@@ -83,20 +89,14 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
     if np.isnan(height) or settings.min_ground_m <= height <= settings.max_ground_m:
         return
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
-    fault, left = "feet_off_the_ground", height
+    fault, left, make = "feet_off_the_ground", height, implausible
     if source.pivot is not None:
         moved = source.with_points(source.points + source.pivot[:, :, None])
         left = foot_height(moved)
         if settings.min_ground_m <= left <= settings.max_ground_m and abs(left) < 0.5 * abs(height):
-            fault = "root_about_origin"
+            fault, make = "root_about_origin", convention
             says += "; on the ground if global_orient turned about the model's origin"
-    yield Finding(
-        fault=fault,
-        kind="plausibility" if fault == "feet_off_the_ground" else "convention",
-        where=(source.name,),
-        says=says,
-        figures={"foot_height_m": height, "explained_height_m": left},
-    )
+    yield make(fault, says, source.name, foot_height_m=height, explained_height_m=left)
 
 
 def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
@@ -115,13 +115,9 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         lengths = np.array([np.nanmedian(bone[:, person]) for person in seen])
         low, high = settings.bones_m
         if (wrong := (lengths < low) | (lengths > high)).any():
-            yield Finding(
-                fault="limb_length",
-                kind="plausibility",
-                where=(source.name,),
-                says=f"{name} of {int(wrong.sum())} people are not of human length",
-                figures={"least_m": float(lengths.min()), "greatest_m": float(lengths.max())},
-            )
+            says = f"{name} of {int(wrong.sum())} people are not of human length"
+            figures = {"least_m": float(lengths.min()), "greatest_m": float(lengths.max())}
+            yield implausible("limb_length", says, source.name, **figures)
     middle = _hips(source)
     speed = np.linalg.norm(np.diff(middle, axis=0), axis=-1) * fps
     speed = speed[np.isfinite(speed)]
@@ -129,13 +125,9 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         len(speed)
         and (share := float((speed > settings.max_speed_m_s).mean())) > settings.max_fast_share
     ):
-        yield Finding(
-            fault="speed",
-            kind="plausibility",
-            where=(source.name,),
-            says=f"people move faster than {settings.max_speed_m_s:g} m/s",
-            figures={"share_of_steps": share, "fastest_m_per_s": float(speed.max())},
-        )
+        says = f"people move faster than {settings.max_speed_m_s:g} m/s"
+        figures = {"share_of_steps": share, "fastest_m_per_s": float(speed.max())}
+        yield implausible("speed", says, source.name, **figures)
 
 
 def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
@@ -144,13 +136,8 @@ def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fin
     here = np.isfinite(middle).all(-1)
     away = np.abs(middle[here][:, :2]) > np.array(settings.bounds_m)
     if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.min_plausible_share:
-        yield Finding(
-            fault="off_the_pitch",
-            kind="plausibility",
-            where=(source.name,),
-            says="people are far off the pitch",
-            figures={"share_of_bodies": share},
-        )
+        says = "people are far off the pitch"
+        yield implausible("off_the_pitch", says, source.name, share_of_bodies=share)
 
 
 def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Iterator[Finding]:
@@ -175,13 +162,8 @@ def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Ite
         yield convention("mirrored_rotation", "R mirrors: its determinant is -1", *where)
     drift = float(np.linalg.norm(centers(rows) - camera_center(rows), axis=-1).max())
     if drift > settings.max_center_drift_m:
-        yield Finding(
-            fault="moving_center",
-            kind="plausibility",
-            where=where,
-            says="the camera's centre -R't is not in one place",
-            figures={"drift_m": drift},
-        )
+        says = "the camera's centre -R't is not in one place"
+        yield implausible("moving_center", says, *where, drift_m=drift)
 
 
 def centers(rows: CameraRows) -> Floats:
