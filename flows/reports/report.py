@@ -23,7 +23,7 @@ from data_contracts.review import (
     Withdrawal,
 )
 from data_contracts.run import RunRecord
-from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictures
+from flows.reports.cameras import camera_pictures, camera_table, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
 from flows.reports.clips import clip_pictures, detection_pictures, disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
@@ -45,7 +45,7 @@ from worldpose.formats.files import whole_file
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.drawing import keep_figures, write_figure
 from worldpose.reports.html_page import CaptionedImage, LinkedFile, Section, Table
-from worldpose.reports.run_report import camera_table, report_page
+from worldpose.reports.run_report import report_page
 from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Static cameras",
             (
-                camera_table(camera_summaries(run, match.folder.spec)),
+                camera_table(run, match.folder.spec),
                 *camera_pictures(store, run, match, cameras),
                 *paint_pictures(store, run, match, cameras),
             ),

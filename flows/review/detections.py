@@ -85,11 +85,7 @@ def results_of(
         InputError: there are no such results.
     """
     spec = match.folder.spec
-    clips = [
-        clip
-        for clip in spec.clips
-        if frame is None or 0 <= frame - clip.first_frame < clip.frame_count
-    ]
+    clips = spec.clips if frame is None else spec.clips_with(frame)
     names: list[str] = []
     if camera in {each.id for each in spec.static_cameras}:
         names = [seen_by(match, camera, clip.id) for clip in clips]

@@ -24,8 +24,6 @@ SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
 MAX_LISTED: Final = 200
 """Corrections of a group in one response, the last ones first."""
-
-
 MAX_EDITS: int = 200
 """Maximum number of edits per request."""
 Comment = Annotated[str, Field(max_length=2000)]

@@ -202,14 +202,7 @@ def _group(context: PageContext, match: Match, owner: str, frame: int, detection
     Raises:
         InputError: there is no such detection in the latest run.
     """
-    clip = next(
-        (
-            each
-            for each in match.folder.spec.clips
-            if 0 <= frame - each.first_frame < each.frame_count
-        ),
-        None,
-    )
+    clip = next(iter(match.folder.spec.clips_with(frame)), None)
     cameras = static_cameras(open_run(context.store.url, match.match_id), match.folder.spec)
     names = list(cameras)
     detections = [detection if name == owner else -1 for name in names]

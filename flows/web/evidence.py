@@ -290,11 +290,7 @@ def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
             int(result[f"outlier_{name}"].values[k])
             for name in ("frame", "camera", "person", "joint")
         )
-        clip = next(
-            clip.id
-            for clip in match.folder.spec.clips
-            if 0 <= frame - clip.first_frame < clip.frame_count
-        )
+        clip = match.folder.spec.clips_with(frame)[0].id
         tracks = run[f"tracking/{clip}"].sel(frame=frame, person=person)
         detection = int(tracks["detection_index"].values[c])
         seen = run[seen_by(match, names[c], clip)]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -38,29 +37,18 @@ ERROR_RANGE: Final = (0.005, 1.0)
 """Range of expected ground errors of the colour scale [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Click:
-    """A clicked point, as inlier or outlier of its camera.
-
-    Attributes:
-        name: name of the pitch template.
-        place: (2,) the click [px].
-        inlier: whether the fit includes the click.
-    """
+class Click(NamedTuple):
+    """A clicked point of the template at a place (2,) [px], and whether the fit includes it."""
 
     name: str
     place: NDArray[np.float64]
     inlier: bool
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorMap:
-    """Expected ground error over the pitch.
+class ErrorMap(NamedTuple):
+    """Expected ground error (rows, columns) at x (columns,) and y (rows,) of the world [m].
 
-    Attributes:
-        x: (columns,) [m], world.
-        y: (rows,) [m], world.
-        expected: (rows, columns) [m]; NaN outside the field of view.
+    NaN outside the field of view.
     """
 
     x: NDArray[np.float64]

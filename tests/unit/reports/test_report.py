@@ -20,8 +20,6 @@ from worldpose.reports.html_page import (
 from worldpose.reports.run_report import (
     CAMERA_MEANINGS,
     MEANINGS,
-    CameraSummary,
-    camera_table,
     report_page,
     score_rows,
 )
@@ -155,17 +153,6 @@ def test_an_embedded_page_brings_the_one_script_that_the_page_may_run():
     (frame,) = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)"></iframe>', text)
     assert [unescape(each) for each in frame] == [block.title, block.html]
     assert Page(text).open == []
-
-
-def test_static_cameras_are_listed_with_what_is_wrong_with_them():
-    cameras = [
-        CameraSummary("cam0", "given"),
-        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.128, 9, ("corner_left_far",), ("few",)),
-    ]
-    shown = [Section("Static cameras", (camera_table(cameras),))]
-    rows = Page(report_page("A run", run(), seconds={}, sections=shown)).rows
-    assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
-    assert ["cam1", "clicks", "21.3", "350.0", "1.13", "9", "corner_left_far", "few"] in rows
 
 
 def test_photographs_are_made_smaller_and_curves_stay_as_they_are():
