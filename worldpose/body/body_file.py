@@ -133,30 +133,24 @@ def read_pickled_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[
     Raises:
         InputError: the file cannot be read, names anything but arrays, or lacks a key.
     """
-    from worldpose.pickles import plain, read_notes  # late: they import scipy
+    from worldpose.pickles import read_pickle  # late: it imports scipy
 
     try:
-        content = read_notes(path)
-    except OSError as error:
+        content = read_pickle(path)
+    except (OSError, MemoryError) as error:
         raise _body_file_error(path, f"a file that cannot be read ({error})") from None
     except ValueError as error:
         raise _body_file_error(path, f"a file that cannot be read as a pickle ({error})") from error
     if not isinstance(content, dict):
-        raise _body_file_error(path, f"a pickled {type(content).__name__.strip('_').lower()}")
+        raise _body_file_error(path, f"a pickled {type(content).__name__.lower()}")
     lacking = [key for key in keys if key not in content]
     if lacking:
         raise _body_file_error(path, f"no array named {', '.join(lacking)}")
-    arrays = {}
     for key in keys:
-        try:
-            array = plain(content[key])
-        except (ValueError, MemoryError) as error:
-            reason = str(error) or type(error).__name__
-            raise _body_file_error(path, f"{key} that is not an array ({reason})") from None
+        array = content[key]
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise _body_file_error(path, f"{key} that is not an array of numbers")
-        arrays[key] = array
-    return arrays
+    return {key: content[key] for key in keys}
 
 
 def _body_file_error(path: Path, found: str) -> InputError:
