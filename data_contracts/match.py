@@ -153,6 +153,16 @@ class MatchSpec(Record):
         """
         return {camera.id: camera for camera in self.cameras}[camera_id]
 
+    def filming_camera(self, owner: str) -> CameraSpec | None:
+        """The static camera with this id, or the broadcast camera of the clip with this id."""
+        broadcast = {clip.id: clip.broadcast for clip in self.clips}.get(owner)
+        cameras = self.static_cameras if broadcast is None else self.cameras
+        return {camera.id: camera for camera in cameras}.get(broadcast or owner)
+
+    def clips_with(self, frame: int) -> tuple[ClipSpec, ...]:
+        """The clips that contain a match frame."""
+        return tuple(c for c in self.clips if 0 <= frame - c.first_frame < c.frame_count)
+
     def clip(self, clip_id: str) -> ClipSpec:
         """The clip with this id.
 

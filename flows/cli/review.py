@@ -34,7 +34,7 @@ from flows.cli.options import (
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import find_registration, open_for_review, open_match
 from flows.review import verdicts
-from flows.review.descriptions import correction_json, in_words, review_json, when
+from flows.review.descriptions import in_words, review_json, when
 from flows.review.metric_words import metric_words, reason_words
 from flows.review.verdicts import Review, reviews_of
 from flows.run_record import latest_run
@@ -134,8 +134,10 @@ def show(
         print_json(
             {
                 "match": match,
-                "corrections": [correction_json(each) for each in opened.corrections],
-                "stale": [correction_json(each) | {"reason": why} for each, why in opened.stale],
+                "corrections": [each.model_dump(mode="json") for each in opened.corrections],
+                "stale": [
+                    each.model_dump(mode="json") | {"reason": why} for each, why in opened.stale
+                ],
                 "origins": origins,
                 "damage": list(opened.journal.damage),
             }
@@ -201,7 +203,7 @@ def correct(
     store = Store.open(project)
     said = verdicts.correct(store, open_match(store, match), _read_edits(edits), who=who, why=why)
     if as_json:
-        print_json({"corrections": [correction_json(each) for each in said]})
+        print_json({"corrections": [each.model_dump(mode="json") for each in said]})
         return
     for each in said:
         line(f"corrected: {in_words(each)} ({each.id})")
@@ -265,8 +267,8 @@ def serve(
     """
     # Imported here: the server takes half a second to import, and no other command needs it.
     from flows.web.access import access_for
-    from flows.web.serving import address
-    from flows.web.serving import serve as serve_pages
+    from flows.web.app import address
+    from flows.web.app import serve as serve_pages
 
     tls = certificate_and_key(certificate, key)
     access = access_for(host, token=token, names=names or (), secure=tls is not None, users=users)
@@ -302,7 +304,7 @@ def _decide(
         edits=_read_edits(edits) if edits else (),
     )
     if as_json:
-        said = [correction_json(each) for each in corrections]
+        said = [each.model_dump(mode="json") for each in corrections]
         print_json({"verdict": verdict, "reviews": ids, "corrections": said})
         return
     for name in ids:

@@ -9,7 +9,7 @@ import typer
 
 from flows.cli.console import DEFAULT_PROJECT, JsonOption, ProjectOption, line, print_json
 from flows.registering import open_match
-from flows.review.descriptions import correction_json, in_words
+from flows.review.descriptions import in_words
 from flows.stage import Match
 from worldpose.errors import UsageError
 from worldpose.formats.annotations import FORMATS, Format
@@ -92,7 +92,7 @@ def import_annotations(
             {
                 "pictures": changes.pictures,
                 "boxes_passed_over": changes.boxes,
-                "corrections": [correction_json(each) for each in kept],
+                "corrections": [each.model_dump(mode="json") for each in kept],
             }
         )
         return

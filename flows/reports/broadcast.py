@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -11,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.broadcast_calibration import FRAME_STATUS
+from flows.reports.match_pictures import shown_pitch
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
     broadcast_unit,
     clip_title,
-    estimated_pitch,
     joint_tracks,
 )
 from flows.stage import Match
@@ -90,7 +89,7 @@ def broadcast_pictures(run: Run, match: Match) -> list[CaptionedImage]:
                         tracks,
                         int(np.searchsorted(tracks.frames, number)),
                         still=still,
-                        pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
+                        pitch=shown_pitch(run, match, clip),
                     ),
                 )
             )
@@ -133,69 +132,57 @@ def _before_and_after(
                 person,
                 still=still,
                 seen=run[detected].sel(frame=number)["keypoints"].values,
-                pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
+                pitch=shown_pitch(run, match, clip),
             ),
         )
     ]
 
 
-def write_broadcast_videos(
-    run: Run, match: Match, page: Path, *, clips: Collection[str] | None = None
-) -> list[Path]:
-    """Write each clip's broadcast video with markings and people overlaid; return the files.
+def write_broadcast_video(run: Run, match: Match, clip: str, file: Path) -> None:
+    """Write a clip's broadcast video with markings and people overlaid.
 
-    Videos have half the size and at most 25 frames per second. A clip of more than 30 s is cut to
+    The video has half the size and at most 25 frames per second. A clip of more than 30 s is cut to
     the 30 s around the frame with the largest camera uncertainty.
-
-    Args:
-        run: the run.
-        match: the match.
-        page: the videos are written next to this file, with names derived from its name.
-        clips: which clips; None = all.
     """
-    files = []
-    fps = match.folder.spec.fps
-    every = max(1, round(fps / FRAME_RATE))
-    for clip, camera in broadcast_cameras(run).items():
-        if clips is not None and clip not in clips:
-            continue
-        chosen = broadcast_video_frames(run, clip, fps)
-        frames = run[f"broadcast_calibration/{clip}"]["frame"].values[chosen]
-        start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
-        stop = start + int(chosen[-1] - chosen[0]) + 1
-        file = page.with_name(f"{page.stem}-{clip}.mp4")
-        with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
-            pictures = (
-                picture
-                for number, picture in video.frames(start, stop)
-                if (number - start) % every == 0
-            )
-            drawn = overlay_frames(
-                pictures,
-                camera[chosen],
-                joint_tracks(run, clip),
-                frames,
-                estimated_pitch(run, match.folder.pitch, match.folder.spec, clip),
-                body_tracks(run, clip),
-            )
-            write_video(draft, drawn, fps / every, quality=23)
-        files.append(file)
-    return files
+    every = video_step(match)
+    chosen = broadcast_video_frames(run, match, clip)
+    frames = run[f"broadcast_calibration/{clip}"]["frame"].values[chosen]
+    start = int(frames[0]) + unit_frames(match.folder.spec, clip).offset
+    stop = start + int(chosen[-1] - chosen[0]) + 1
+    with open_video(match.folder.videos[clip]) as video, whole_file(file) as draft:
+        pictures = (
+            picture
+            for number, picture in video.frames(start, stop)
+            if (number - start) % every == 0
+        )
+        drawn = overlay_frames(
+            pictures,
+            broadcast_cameras(run)[clip][chosen],
+            joint_tracks(run, clip),
+            frames,
+            shown_pitch(run, match, clip),
+            body_tracks(run, clip),
+        )
+        write_video(draft, drawn, match.folder.spec.fps / every, quality=23)
 
 
-def broadcast_video_frames(run: Run, clip: str, fps: float) -> NDArray[np.int64]:
+def video_step(match: Match) -> int:
+    """Return the step of the frames of an overlay video."""
+    return max(1, round(match.folder.spec.fps / FRAME_RATE))
+
+
+def broadcast_video_frames(run: Run, match: Match, clip: str) -> NDArray[np.int64]:
     """Return the indices of the frames of a clip's video: the part of the largest error."""
     expected = np.nan_to_num(run[f"broadcast_calibration/{clip}"]["reprojection_error"].values)
-    most = round(MAX_VIDEO_S * fps)
+    most = round(MAX_VIDEO_S * match.folder.spec.fps)
     begin = int(np.clip(int(expected.argmax()) - most // 2, 0, max(0, len(expected) - most)))
-    every = max(1, round(fps / FRAME_RATE))
-    return np.arange(begin, min(begin + most, len(expected)), every)
+    return np.arange(begin, min(begin + most, len(expected)), video_step(match))
 
 
 def broadcast_tables(run: Run, match: Match) -> list[Table]:
     """Tabulate the evidence of each clip's frames, and the warnings for a reviewer."""
     tables = []
-    for clip in broadcast_cameras(run):
+    for clip, camera in broadcast_cameras(run).items():
         result = run[f"broadcast_calibration/{clip}"]
         status = np.bincount(result["status"].values, minlength=len(FRAME_STATUS))
         rows = [
@@ -209,7 +196,7 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
                 (f"key frame {frame} is not used", why)
                 for frame, why in result.attrs["refused_key_frames"].items()
             ),
-            *_motion(run, clip, match.folder.spec.fps),
+            *_motion(camera, match.folder.spec.fps),
             *(
                 (f"{name} miss by, before and after players [px]", _numbers(result.attrs[key]))
                 for name, key in (("markings", "markings_off"), ("people", "players_off"))
@@ -225,9 +212,8 @@ def broadcast_tables(run: Run, match: Match) -> list[Table]:
     return tables
 
 
-def _motion(run: Run, clip: str, fps: float) -> list[tuple[str, str]]:
+def _motion(camera: Camera, fps: float) -> list[tuple[str, str]]:
     """Return the clip's duration and pan range as table rows."""
-    camera = broadcast_cameras(run)[clip]
     pan, _, _ = camera_angles(camera)
     return [
         ("length [s]", f"{len(pan) / fps:.1f}"),
@@ -254,13 +240,9 @@ def _numbers(values: list[float]) -> str:
 
 
 def flow_pictures(run: Run, match: Match, clip: str, camera: Camera) -> list[CaptionedImage]:
-    """Draw points tracked between the two frames with the largest camera rotation.
+    """Draw points tracked between the two frames with the largest rotation of the camera.
 
-    Args:
-        run: the run.
-        match: the match.
-        clip: a clip with a broadcast camera.
-        camera: the camera, a batch over its frames.
+    The camera is a batch over the frames of its clip.
     """
     frames = run[f"broadcast_calibration/{clip}"]["frame"].values
     rotation = camera.cam_from_world.rotation

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_contracts.match import MatchSpec
-from flows.reports.match_pictures import background_image
-from flows.results.best_results import estimated_pitch
+from flows.reports.match_pictures import background_image, shown_pitch
 from flows.stage import Match
 from worldpose.geometry.cameras import Camera, camera_from_arrays
-from worldpose.reports.html_page import CaptionedImage, Table
-from worldpose.reports.run_report import CameraSummary
+from worldpose.reports.html_page import CaptionedImage, Failure, Table
+from worldpose.reports.run_report import format_scaled
 from worldpose.reports.static_cameras import (
     NEAR_PAINT_PX,
     Click,
@@ -36,26 +35,35 @@ _ORIGINS = {
 }
 
 
-def camera_summaries(run: Run, spec: MatchSpec) -> list[CameraSummary]:
-    """Summarize each static camera, in the order of the match."""
-    summaries = []
+def camera_table(run: Run, spec: MatchSpec) -> Table:
+    """Tabulate origin, expected errors and clicks of each static camera."""
+    columns = (
+        "camera",
+        "from",
+        ">expected ground error mm",
+        ">95 % mm",
+        ">clicks rms px",
+        ">clicks",
+        "wrong clicks",
+        "weak because",
+    )
+    rows = []
     for camera in spec.static_cameras:
         unit = f"static_calibration/{camera.id}"
-        attributes, figures = run[unit].attrs, run.record.figures.get(unit, {})
-        used = figures.get("clicks_used")
-        summaries.append(
-            CameraSummary(
+        figures = run.record.figures.get(unit, {})
+        rows.append(
+            (
                 camera.id,
-                _origin(attributes),
-                figures.get("expected_ground_error_median_m"),
-                figures.get("expected_ground_error_p95_m"),
-                figures.get("reprojection_rms_px"),
-                None if used is None else int(used),
-                _wrong_clicks(run, unit),
-                _reasons(run, camera.id),
+                _origin(run[unit].attrs),
+                format_scaled(figures.get("expected_ground_error_median_m"), 1000.0, 1),
+                format_scaled(figures.get("expected_ground_error_p95_m"), 1000.0, 1),
+                format_scaled(figures.get("reprojection_rms_px"), 1.0, 2),
+                format_scaled(figures.get("clicks_used"), 1.0, 0),
+                ", ".join(_wrong_clicks(run, unit)),
+                Failure("; ".join(_reasons(run, camera.id))),
             )
         )
-    return summaries
+    return Table("", columns, tuple(rows))
 
 
 def _origin(attributes: Mapping[Any, Any]) -> str:
@@ -113,7 +121,7 @@ def paint_pictures(
     still = background_image(store, match, name)
     if still is None:  # no image of the video's clips can be read
         return []
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     assert pitch is not None  # of the match folder
     png, share = plot_paint(cameras[name], still, pitch)
     return [
@@ -129,10 +137,11 @@ def paint_pictures(
 
 def camera_evidence(store: Store, run: Run, match: Match, name: str, camera: Camera) -> bytes:
     """Return a PNG of one calibrated camera: clicks on its still, and the expected ground error."""
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     assert pitch is not None, "nothing is clicked without a pitch"
     result = run[f"static_calibration/{name}"]
-    inlier = dict(zip(_names(run, name), result["point_inlier"].values.tolist(), strict=True))
+    names = (str(point) for point in result["point"].values)
+    inlier = dict(zip(names, result["point_inlier"].values.tolist(), strict=True))
     return plot_calibration(
         camera,
         f"camera {name}",
@@ -177,11 +186,6 @@ def proposal_evidence(
     )
     columns = ("marking", ">length in the image [px]", ">on paint")
     return CaptionedImage(caption, png), Table("Markings that the proposal expects", columns, rows)
-
-
-def _names(run: Run, camera_id: str) -> list[str]:
-    """Return the clicked points in the order of the result's arrays."""
-    return [str(name) for name in run[f"static_calibration/{camera_id}"]["point"].values]
 
 
 def _wrong_clicks(run: Run, unit: str) -> tuple[str, ...]:

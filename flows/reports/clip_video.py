@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.reports.broadcast import broadcast_video_frames, write_broadcast_videos
-from flows.reports.match_pictures import frame_pictures
+from flows.reports.broadcast import (
+    MAX_VIDEO_S,
+    broadcast_video_frames,
+    video_step,
+    write_broadcast_video,
+)
+from flows.reports.match_pictures import frame_pictures, shown_pitch
 from flows.results.best_results import (
     body_tracks,
     broadcast_cameras,
-    estimated_pitch,
     joint_tracks,
     placed_joints,
     static_cameras,
@@ -24,11 +27,6 @@ from worldpose.geometry.cameras import Camera
 from worldpose.reports.videos import overlay_frames
 from worldpose.store.store import Run, Store
 from worldpose.video.files import write_video
-
-MAX_VIDEO_S: Final = 30.0
-"""Maximum duration [s]; a longer clip is cut to the middle part."""
-MAX_RATE: Final = 25.0
-"""Maximum frames per second."""
 
 
 def clip_view(run: Run, match: Match, clip: str) -> str | None:
@@ -53,15 +51,10 @@ def static_view(run: Run, match: Match, clip: str) -> str | None:
 def write_clip_video(
     store: Store, run: Run, match: Match, clip: str, file: Path, *, owner: str | None = None
 ) -> None:
-    """Write the video of a clip with markings and people overlaid.
+    """Write the video (mp4) of a clip with markings and people overlaid.
 
-    Args:
-        store: the project's store.
-        run: the run.
-        match: the match; `clip_view` returns a camera for the clip.
-        clip: id of the clip.
-        file: an mp4 file.
-        owner: the camera as `static_view` returns it; None = that of `clip_view`.
+    The owner is a camera as `static_view` returns it; None = that of `clip_view`, which has one.
+    A long clip is cut to its middle part.
 
     Raises:
         InputError: an image is damaged.
@@ -69,11 +62,8 @@ def write_clip_video(
     owner = owner or clip_view(run, match, clip)
     assert owner is not None  # the caller checks that there is one
     if owner == clip:
-        (made,) = write_broadcast_videos(run, match, file, clips=(clip,))
-        made.replace(file)
+        write_broadcast_video(run, match, clip, file)
         return
-    fps = match.folder.spec.fps
-    every = max(1, round(fps / MAX_RATE))
     tracks = joint_tracks(run, clip)
     frames = video_frames(run, match, clip, owner)
     camera = static_cameras(run, match.folder.spec)[owner]
@@ -86,18 +76,16 @@ def write_clip_video(
             yield dark if picture is None else picture
 
     bodies = body_tracks(run, clip)
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     drawn = overlay_frames(pictures(), cameras, tracks, frames, pitch, bodies)
-    write_video(file, drawn, fps / every, quality=23)
+    write_video(file, drawn, match.folder.spec.fps / video_step(match), quality=23)
 
 
 def video_frames(run: Run, match: Match, clip: str, owner: str) -> NDArray[np.int64]:
     """Return the match frames of a clip's video, as `write_clip_video` writes it for `owner`."""
-    fps = match.folder.spec.fps
     if owner == clip:
         frames = run[f"broadcast_calibration/{clip}"]["frame"].values
-        return np.asarray(frames[broadcast_video_frames(run, clip, fps)])
-    every = max(1, round(fps / MAX_RATE))
+        return np.asarray(frames[broadcast_video_frames(run, match, clip)])
     all_frames = joint_tracks(run, clip).frames
-    spare = max(0, len(all_frames) - round(MAX_VIDEO_S * fps)) // 2
-    return np.asarray(all_frames[spare : len(all_frames) - spare : every])
+    spare = max(0, len(all_frames) - round(MAX_VIDEO_S * match.folder.spec.fps)) // 2
+    return np.asarray(all_frames[spare : len(all_frames) - spare : video_step(match)])

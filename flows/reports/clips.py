@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
-from flows.reports.match_pictures import background_image, frame_picture
+from flows.reports.match_pictures import background_image, frame_picture, shown_pitch
 from flows.results.best_results import (
     body_tracks,
     clip_title,
-    estimated_pitch,
     joint_tracks,
     placed_joints,
     static_cameras,
 )
 from flows.stage import Match
 from flows.stages.filtering import seen_in
+from worldpose.dataset.contents import sample_evenly
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, plot_bodies
@@ -31,6 +34,15 @@ from worldpose.reports.clips import (
 from worldpose.reports.html_page import CaptionedImage
 from worldpose.store.store import Run, Store
 
+MAX_VIEWS: Final = 2
+"""Number of views shown with large residuals: the worst, each of another person."""
+EVALUATED_FRAMES: Final = 300
+"""Frames of a clip that are evaluated, evenly spaced."""
+MIN_JOINTS: Final = 8
+"""Minimum number of joints of a person in a view."""
+_CROP_HEIGHTS: Final = 2.5
+"""Side length of the crop [height of the person]."""
+
 
 def clip_pictures(
     store: Store, run: Run, match: Match, clip: str, truth: JointTracks | None = None
@@ -38,7 +50,7 @@ def clip_pictures(
     """Draw the stadium from a camera and from above, the bodies, and all trajectories."""
     cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
-    pitch = estimated_pitch(run, match.folder.pitch, match.folder.spec)
+    pitch = shown_pitch(run, match)
     seen = placed_joints(run, clip)["inliers"].any("joint").sum("person").values
     pictures = []
     if len(tracks.frames):
@@ -107,37 +119,110 @@ def _bodies(
 def detection_pictures(store: Store, run: Run, match: Match, clip: str) -> list[CaptionedImage]:
     """Draw the view with most people: its detections, and their track assignments."""
     placed = placed_joints(run, clip)
-    seen = placed["inliers"].any("joint").sum("person").values
+    inliers = placed["inliers"].any("joint")
+    seen = inliers.sum("person").values
     if not seen.any():
         return []
-    cameras = static_cameras(run, match.folder.spec)
     tracks = joint_tracks(run, clip)
-    frame, index = (int(n) for n in np.unravel_index(int(seen.argmax()), seen.shape))
-    name = list(cameras)[index]
-    number = int(tracks.frames[frame])
+    row, index = (int(n) for n in np.unravel_index(int(seen.argmax()), seen.shape))
+    name = list(static_cameras(run, match.folder.spec))[index]
+    png = _plot_view(store, run, match, clip, tracks, (row, index), inliers.values[row, index])
+    return [
+        CaptionedImage(
+            f"Camera {name}, frame {tracks.frames[row]}. Left: its detections; orange detections "
+            "belong to no track. Right: the people that all cameras reconstruct, projected into "
+            "this camera; a dashed box marks a person without a detection in this camera.",
+            png,
+        )
+    ]
+
+
+def _plot_view(
+    store: Store,
+    run: Run,
+    match: Match,
+    clip: str,
+    tracks: JointTracks,
+    place: tuple[int, int],
+    seen: NDArray[np.bool_] | None = None,
+    part: tuple[Floats, Floats] | None = None,
+) -> bytes:
+    """Return a PNG of detections and reconstruction in one view.
+
+    Its place is the indices of frame and static camera; `seen` are the people whom the camera
+    supports, None = those with a tracked detection.
+    """
+    row, index = place
+    name, camera = [*static_cameras(run, match.folder.spec).items()][index]
+    number = int(tracks.frames[row])
     detected = run[seen_in(run, match, name, clip)].sel(frame=number)
     tracked = run[f"tracking/{clip}"].sel(frame=number)["detection_index"].values[index]
-    image = frame_picture(store, match, name, number)
-    if image is None and frame == 0:
-        image = background_image(store, match, name)
-    png = plot_detections(
-        cameras[name],
+    still = frame_picture(store, match, name, number)
+    if still is None and row == 0:
+        still = background_image(store, match, name)
+    return plot_detections(
+        camera,
         ImageDetections(
             detected["boxes"].values, detected["keypoints"].values, tracked[tracked >= 0]
         ),
         ReconstructedPeople(
-            tracks.joints[frame],
-            tracks.person_ids,
-            placed["inliers"].values[frame, index].any(-1),
+            tracks.joints[row], tracks.person_ids, tracked >= 0 if seen is None else seen
         ),
-        still=image,
-        pitch=estimated_pitch(run, match.folder.pitch, match.folder.spec),
+        still=still,
+        pitch=shown_pitch(run, match),
+        part=part,
     )
-    return [
-        CaptionedImage(
-            f"Camera {name}, frame {number}. Left: its detections; orange detections belong to no "
-            "track. Right: the people that all cameras reconstruct, projected into this camera; a "
-            "dashed box marks a person without a detection in this camera.",
-            png,
+
+
+def worst_views(run: Run, match: Match, clip: str, tracks: JointTracks) -> list[tuple[int, ...]]:
+    """Return views with the largest median distance of keypoints to projected joints, worst first.
+
+    Distances are in heights of the person in the image, over the keypoints assigned to the person's
+    track; each person appears once.
+
+    Returns:
+        Frame index, camera and person of each, and the median distance in percent.
+    """
+    rows = sample_evenly(len(tracks.frames), EVALUATED_FRAMES)
+    numbers = tracks.frames[rows]
+    tracked = run[f"tracking/{clip}"]["detection_index"].sel(frame=numbers)
+    place = tracked.reindex(person=tracks.person_ids, fill_value=-1).values
+    away = np.full(place.shape, np.nan)
+    for c, (name, camera) in enumerate(static_cameras(run, match.folder.spec).items()):
+        seen = run[seen_in(run, match, name, clip)]["keypoints"].reindex(frame=numbers).values
+        own = np.take_along_axis(seen, np.maximum(place[:, c], 0)[..., None, None], axis=1)
+        found = camera.project(tracks.joints[rows].reshape(-1, 3)).reshape(own.shape)
+        off = np.linalg.norm(own - found, axis=-1)
+        height = np.ptp(found[..., 1], axis=-1)
+        enough = (np.isfinite(off).sum(-1) >= MIN_JOINTS) & (place[:, c] >= 0)
+        away[:, c][enough] = np.nanmedian(off[enough], axis=-1) / height[enough]
+    worst: list[tuple[int, ...]] = []
+    for _ in range(MAX_VIEWS):
+        if not np.isfinite(away).any():
+            break
+        row, camera_place, person = np.unravel_index(int(np.nanargmax(away)), away.shape)
+        percent = round(100.0 * float(away[row, camera_place, person]))
+        worst.append((int(rows[row]), int(camera_place), int(person), percent))
+        away[:, :, person] = np.nan
+    return worst
+
+
+def disagreement_pictures(store: Store, run: Run, match: Match, clip: str) -> list[CaptionedImage]:
+    """Crop the people whose detections and projected joints differ most, before and after."""
+    tracks = joint_tracks(run, clip)
+    cameras = static_cameras(run, match.folder.spec)
+    pictures = []
+    for row, index, person, percent in worst_views(run, match, clip, tracks):
+        name, camera = [*cameras.items()][index]
+        pixels = camera.project(tracks.joints[row, person])
+        side = _CROP_HEIGHTS * float(np.ptp(pixels[:, 1])) * np.array([1.6, 1.0])
+        part = pixels.mean(axis=0) - 0.5 * side, side
+        pictures.append(
+            CaptionedImage(
+                f"{clip_title(clip)}, frame {tracks.frames[row]}, camera {name}: person "
+                f"{tracks.person_ids[person]}, whose keypoints differ most from what all cameras "
+                f"together found: by {percent} % of the person's height in the median.",
+                _plot_view(store, run, match, clip, tracks, (row, index), part=part),
+            )
         )
-    ]
+    return pictures

@@ -7,22 +7,25 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.pitch import PitchSpec
+from flows.results.best_results import estimated_pitch
 from flows.stage import Match
 from worldpose.ingest.footage import read_still, unit_frames
-from worldpose.store.store import Store
+from worldpose.store.store import Run, Store
 from worldpose.video.folder import open_video
+
+
+def shown_pitch(run: Run, match: Match, clip: str | None = None) -> PitchSpec | None:
+    """Return the pitch as a run, or its camera of a clip, estimated it; None without a pitch."""
+    return estimated_pitch(run, match.folder.pitch, match.folder.spec, clip)
 
 
 def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.uint8] | None:
     """Return an image (height, width, 3) RGB that shows what a static camera sees.
 
     It is the still of the match folder or, without one, the first readable image of the camera's
-    video in the clips; None if the match has neither.
-
-    Args:
-        store: its latest run maps match frames to video frames.
-        match: the match, which names stills and videos.
-        camera_id: a static camera.
+    video in the clips; None if the match has neither. The latest run of the store maps match frames
+    to video frames; here and below.
 
     Raises:
         InputError: the still or an image of the video is damaged.
@@ -42,11 +45,7 @@ def background_image(store: Store, match: Match, camera_id: str) -> NDArray[np.u
 def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray[np.uint8] | None:
     """Return a camera's image (height, width, 3) RGB in a match frame; None if there is none.
 
-    Args:
-        store: its latest run maps match frames to video frames.
-        match: the match, which names the videos.
-        owner: a static camera, or the clip of a broadcast camera.
-        frame: match frame.
+    The owner is a static camera, or the clip of a broadcast camera; here and below.
 
     Raises:
         InputError: the image is damaged.
@@ -57,13 +56,7 @@ def frame_picture(store: Store, match: Match, owner: str, frame: int) -> NDArray
 def frame_pictures(
     store: Store, match: Match, owner: str, frames: Sequence[int]
 ) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the images of several match frames, decoded once and in order.
-
-    Args:
-        store: its latest run maps match frames to video frames.
-        match: the match, which names the videos.
-        owner: a static camera, or the clip of a broadcast camera.
-        frames: ascending match frames.
+    """Yield the images of ascending match frames, decoded once and in order.
 
     Raises:
         InputError: an image is damaged.

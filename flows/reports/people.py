@@ -17,7 +17,7 @@ from flows.results.best_results import (
 )
 from worldpose.formats.tables import people_table
 from worldpose.reports.html_page import Table
-from worldpose.reports.run_report import format_number
+from worldpose.reports.run_report import format_number, format_scaled
 from worldpose.store.store import Run
 
 MAX_ROWS = 20
@@ -140,7 +140,10 @@ def body_tables(run: Run, clips: tuple[str, ...]) -> list[Table]:
         rows = tuple(
             (
                 str(person),
-                *(_of_body(name, figures.get(f"{name}.person{person}")) for name in columns),
+                *(
+                    format_scaled(figures.get(f"{name}.person{person}"), *_BODIES[name][1:])
+                    for name in columns
+                ),
             )
             for person in run[unit]["person"].values.tolist()
         )
@@ -178,11 +181,6 @@ def _held_out_tables(clip: str, figures: Mapping[str, float]) -> list[Table]:
     )
     heading = f"{clip_title(clip)}: distance to the keypoints of cameras that were held out"
     return [Table(heading, columns, tuple(rows))]
-
-
-def _of_body(name: str, value: float | None) -> str:
-    _, scale, decimals = _BODIES[name]
-    return "-" if value is None else f"{scale * value:,.{decimals}f}"
 
 
 def _number(value: float) -> str:

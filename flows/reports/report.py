@@ -23,10 +23,9 @@ from data_contracts.review import (
     Withdrawal,
 )
 from data_contracts.run import RunRecord
-from flows.reports.cameras import camera_pictures, camera_summaries, paint_pictures
+from flows.reports.cameras import camera_pictures, camera_table, paint_pictures
 from flows.reports.clip_video import static_view, write_clip_video
-from flows.reports.clips import clip_pictures, detection_pictures
-from flows.reports.disagreements import disagreement_pictures
+from flows.reports.clips import clip_pictures, detection_pictures, disagreement_pictures
 from flows.reports.people import adjustment_tables, body_tables, people_tables
 from flows.reports.viewer import report_viewer
 from flows.results.best_results import (
@@ -46,7 +45,7 @@ from worldpose.formats.files import whole_file
 from worldpose.reports.data_set import counted_section
 from worldpose.reports.drawing import keep_figures, write_figure
 from worldpose.reports.html_page import CaptionedImage, LinkedFile, Section, Table
-from worldpose.reports.run_report import camera_table, report_page
+from worldpose.reports.run_report import report_page
 from worldpose.store.store import Run, Store
 
 if TYPE_CHECKING:
@@ -69,16 +68,9 @@ def write_report(
 ) -> list[Path]:
     """Write the HTML report of one run, and return the videos written next to it.
 
-    Args:
-        store: the project's store.
-        match: the match.
-        out: the file to write.
-        run_id: number of the run.
-        reference: ground truth; None = `reference/` of the match folder, if it exists.
-        videos: write each clip's broadcast video, and that of a static camera, with the results
-            overlaid.
-        camera: static camera of the video; None = the one with most people.
-        figures: folder for the page's figures as SVG and PDF, with what they show as JSON.
+    The reference is ground truth; None = `reference/` of the match folder, if it exists. Videos are
+    each clip's broadcast video, and that of a static camera (None = the one with most people), with
+    the results overlaid. `figures` is a folder for the page's figures as SVG, PDF and JSON.
 
     Raises:
         UsageError: there is no such static camera with a video.
@@ -160,9 +152,11 @@ def _write_videos(
 ) -> list[Path]:
     films = []
     if broadcast_cameras(run):
-        from flows.reports.broadcast import write_broadcast_videos  # late: it imports estimators
+        from flows.reports.broadcast import write_broadcast_video  # late: it imports estimators
 
-        films += write_broadcast_videos(run, match, out)
+        for clip in broadcast_cameras(run):
+            films.append(out.with_name(f"{out.stem}-{clip}.mp4"))
+            write_broadcast_video(run, match, clip, films[-1])
     for clip in clips_of(run.record):
         owner = camera or static_view(run, match, clip)
         if owner is not None:
@@ -197,7 +191,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
             "too few cameras see the person; a body of such a person comes from the poses of a "
             "monocular method. Mixed: both, in different frames.",
         ),
-        extent_section(run, match),
+        counted_section(extent_of(run, match)),
         Section(
             "Detections",
             tuple(p for clip in filmed for p in detection_pictures(store, run, match, clip)),
@@ -206,7 +200,7 @@ def _sections(store: Store, run: Run, match: Match, reference: str | None) -> li
         Section(
             "Static cameras",
             (
-                camera_table(camera_summaries(run, match.folder.spec)),
+                camera_table(run, match.folder.spec),
                 *camera_pictures(store, run, match, cameras),
                 *paint_pictures(store, run, match, cameras),
             ),
@@ -275,17 +269,13 @@ def _placed_extent(run: Run, match: Match) -> DataSetStatistics:
     return data_set_statistics(clips)
 
 
-def extent_section(run: Run, match: Match) -> Section:
-    """Return the data set table row, its histograms, and each clip's share."""
-    return counted_section(extent_of(run, match))
-
-
 def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[str, str]]:
     """Return the key metrics for the top of the report."""
     found, placed = extent_of(run, match), _placed_extent(run, match)
     in_3d, people = (sum(clip.persons for clip in each.clips.values()) for each in (found, placed))
+    clips = "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
     tiles = [
-        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {_count_text(found)}"),
+        (f"{60.0 * found.minutes:.1f} s", f"{found.frames:,} frames in {clips}"),
         (f"{people}", "people" if in_3d == people else f"people on the pitch, {in_3d} with joints"),
         (f"{found.poses:,}", "3D poses"),
         (f"{len(match.folder.spec.static_cameras)}", "static cameras"),
@@ -294,10 +284,6 @@ def tiles_of(run: Run, match: Match, scores: Evaluation | None) -> list[tuple[st
     if scores is not None and scores.mpjpe_mm is not None and np.isfinite(scores.mpjpe_mm):
         tiles.append((f"{scores.mpjpe_mm:.0f} mm", "mean error of a joint, against the truth"))
     return tiles
-
-
-def _count_text(found: DataSetStatistics) -> str:
-    return "1 clip" if len(found.clips) == 1 else f"{len(found.clips)} clips"
 
 
 MAX_ROWS = 200

@@ -139,13 +139,10 @@ def describe_video(run: Run, match: Match, clip: str) -> dict[str, Any] | None:
 def viewer_clip(
     origin: Origin, clip: str, pitch: PitchSpec | None, video: Mapping[str, Any] | None
 ) -> ViewerClip:
-    """Return a clip of a run as the viewer shows it.
+    """Return a clip of a run as the viewer shows it, with its video as `describe_video` returns it.
 
-    Args:
-        origin: the run; a `stage` before body fitting shows joints in place of bodies.
-        clip: id of the clip.
-        pitch: pitch of the match folder; the viewer draws the surface that the run estimated.
-        video: the clip's video as `describe_video` returns it.
+    A `stage` before body fitting shows joints in place of bodies. The pitch is that of the match
+    folder; the viewer draws the surface that the run estimated.
     """
     # Imported here: it loads matplotlib's colours, which takes 0.5 s.
     from worldpose.reports.drawing import markings, person_color

@@ -21,11 +21,8 @@ def click_advice(metrics: Mapping[str, Mapping[str, float]], stated: float) -> l
     """Return advice if the click noise is significantly larger than stated.
 
     The clicks of all cameras are pooled: a single camera with few clicks cannot determine its
-    noise.
-
-    Args:
-        metrics: those of a run, by unit and name.
-        stated: `static_calibration.click_noise_px` of that run [px].
+    noise. The metrics are those of a run, by unit and name; `stated` is its
+    `static_calibration.click_noise_px` [px].
     """
     told = [
         (each["click_noise_px"], each["click_freedom"])
@@ -58,9 +55,7 @@ MIN_OFFSET: Final = 0.5
 def clock_advice(metrics: Mapping[str, Mapping[str, float]], spec: MatchSpec) -> list[str]:
     """Return one line of advice per camera with a significant clock offset.
 
-    Args:
-        metrics: those of a run, by unit and name.
-        spec: match.yaml as of that run.
+    Metrics, by unit and name, and match.yaml are those of one run.
     """
     said = []
     for camera in spec.static_cameras:

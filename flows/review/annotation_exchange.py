@@ -52,14 +52,10 @@ def export_people(
     folder: Path,
     form: Format,
 ) -> Exported:
-    """Write a camera's detections and images for an annotation tool.
+    """Write detections and images for an annotation tool.
 
-    Args:
-        store: the project's store.
-        match: the match with all corrections.
-        places: camera (or clip of a broadcast camera) and match frame of each image.
-        folder: absent or empty; receives labels.json or labels.xml, pictures/ and exported.json.
-        form: format of the annotation tool.
+    Each place is a camera, or the clip of a broadcast camera, and a match frame. The folder is
+    absent or empty; it receives labels.json or labels.xml, pictures/ and exported.json.
 
     Raises:
         UsageError: the folder is not empty.
@@ -72,13 +68,17 @@ def export_people(
             found="files",
             todo="Choose another folder: annotations are never overwritten.",
         )
+    import cv2  # imported here: few commands write an image
+
     (folder / PICTURES).mkdir(parents=True)
     exported, unseen = [], 0
     for camera, frame in places:
         found = detections_now(store, match, camera, frame)
         name = f"{PICTURES}/{image_name(camera, frame)}"
         exported.append(_annotate_image(match, camera, found, name))
-        unseen += not _write_picture(store, match, camera, frame, folder / name)
+        picture = frame_picture(store, match, camera, frame)
+        if picture is None or not cv2.imwrite(str(folder / name), picture[..., ::-1]):
+            unseen += 1
     annotations = folder / f"labels{format_suffix(form)}"
     write_annotations(annotations, exported, form)
     write_annotations(folder / EXPORTED, exported)
@@ -97,13 +97,7 @@ def import_people(
 ) -> tuple[Changes, list[Correction]]:
     """Import an annotation tool's changes as corrections, all or none; a repeated import adds none.
 
-    Args:
-        store: the store that holds the journal.
-        open_match: returns the match with its current journal.
-        file: file of the annotation tool.
-        exported: record of the export.
-        form: format of the file; None = detect from its content.
-        who: name of the annotator.
+    `exported` is the record of the export; without a format, the content of the file tells it.
 
     Raises:
         StaleEditError: another person corrected the same detection in between.
@@ -124,8 +118,8 @@ def import_people(
 def _annotate_image(
     match: Match, camera: str, found: KeypointDetections, name: str
 ) -> AnnotatedImage:
-    broadcast = {clip.id: clip.broadcast for clip in match.folder.spec.clips}
-    spec = match.folder.spec.camera(broadcast.get(camera) or camera)
+    spec = match.folder.spec.filming_camera(camera)
+    assert spec is not None  # it has detections
     corrected = {
         (correction.edit.frame, correction.edit.detection)
         for correction in match.corrections
@@ -148,11 +142,3 @@ def _annotate_image(
             )
         )
     return AnnotatedImage(name, (spec.width, spec.height), tuple(people))
-
-
-def _write_picture(store: Store, match: Match, camera: str, frame: int, file: Path) -> bool:
-    """Write a camera's image of a frame; return False if there is none."""
-    import cv2  # imported here: few commands write an image
-
-    picture = frame_picture(store, match, camera, frame)
-    return picture is not None and cv2.imwrite(str(file), picture[..., ::-1])

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from weakref import WeakKeyDictionary
 
 from data_contracts.match import Registration
-from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking, Withdrawal
+from data_contracts.review import Correction, Edit, MovedPoint, RedrawnMarking
 from flows.review.detections import require_seen
 from flows.review.edit_conflicts import StaleEditError
 from flows.review.identities import require_fitting
@@ -61,16 +61,10 @@ def new_corrections(
     results: Mapping[str, str],
     ids: Sequence[str] = (),
 ) -> list[Correction]:
-    """Turn edits into corrections, each based on those before it.
+    """Turn edits, in the order of application, into corrections, each based on those before it.
 
-    Args:
-        match: match as it was opened; its folder has the corrections that were in force then.
-        journal: journal as it is now.
-        edits: edits in the order of application.
-        who: name of the reviewer.
-        note: the reviewer's comment.
-        results: `stage/unit` to key of the results that the reviewer saw.
-        ids: one per edit for the corrections; empty = new ids.
+    The match is as it was opened, the journal as it is now; `results` are those that the reviewer
+    saw. `ids` has one id per edit; empty = new ids.
 
     Raises:
         StaleEditError: the edited value differs from the edit's `was`.
@@ -95,7 +89,7 @@ def new_corrections(
             edit=edit,
             who=who,
             made_at=datetime.now(UTC),
-            based_on=_looked_at(edit, results),
+            based_on={n: key for n, key in results.items() if n.partition("/")[2] == _unit(edit)},
             note=note or None,
         )
         replay = replay_corrections(folder, [correction])
@@ -117,14 +111,8 @@ def keep_edits(
 ) -> list[Correction]:
     """Record edits as corrections in the journal, all or none; durable on return.
 
-    An edit with an id that is already recorded counts as resent, and is kept once.
-
-    Args:
-        store: the store that holds the journal.
-        open_match: returns the match with its current journal.
-        given: id to edit, in the order of application.
-        who: name of the reviewer.
-        note: the reviewer's comment.
+    `open_match` returns the match with its current journal; `given` has the edits by id in the
+    order of application. An id that is already recorded counts as resent, and is kept once.
 
     Raises:
         StaleEditError: the edited value differs from the edit's `was`.
@@ -181,30 +169,6 @@ def _require_unchanged(folder: MatchFolder, standing: Sequence[Correction], edit
     raise error
 
 
-def withdrawal(journal: Journal, correction: str, *, who: str, why: str) -> Withdrawal:
-    """Return the withdrawal of a correction, to be recorded.
-
-    Raises:
-        InputError: no such correction is in force.
-    """
-    if correction not in journal.standing:
-        last = [*journal.standing][-10:]
-        raise InputError(
-            f"correction {correction}",
-            expected=f"one that stands, such as the last: {', '.join(last) or '(none)'}",
-            found="no such correction",
-            todo="List them with `worldpose review show MATCH`.",
-        )
-    return Withdrawal(
-        match_id=journal.match_id,
-        correction=correction,
-        who=who,
-        why=why,
-        withdrawn_at=datetime.now(UTC),
-    )
-
-
-def _looked_at(edit: Edit, results: Mapping[str, str]) -> dict[str, str]:
-    """Return the results that an edit refers to."""
-    unit = getattr(edit, "camera", None) or getattr(edit, "clip", None)
-    return {name: key for name, key in results.items() if name.partition("/")[2] == unit}
+def _unit(edit: Edit) -> str | None:
+    """Return the unit of the results that an edit refers to."""
+    return getattr(edit, "camera", None) or getattr(edit, "clip", None)

@@ -30,11 +30,6 @@ def review_json(shown: Review) -> dict[str, Any]:
     }
 
 
-def correction_json(correction: Correction) -> dict[str, Any]:
-    """Return one correction as JSON."""
-    return correction.model_dump(mode="json")
-
-
 def in_words(correction: Correction) -> str:
     """Describe the change of a correction on one line."""
     edit = correction.edit

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pydantic import JsonValue
 
 from data_contracts.records import Record
 from worldpose.errors import InputError
+from worldpose.store.recipes import recipe_key
+from worldpose.store.store import Store
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 E = TypeVar("E", bound=Record)
 
@@ -22,6 +27,20 @@ class StaleEditError(InputError):
 
     difference: Mapping[str, Any] = {}
 
+    @classmethod
+    def of_edit(
+        cls, where: str, subject: str, place: str, objection: str, **difference: object
+    ) -> StaleEditError:
+        """Return the error of an edit that does not fit what a page showed."""
+        error = cls(
+            where,
+            expected=f"a correction that fits the current {subject}",
+            found=objection,
+            todo=f"Load the {place} again and repeat the correction if it is still needed.",
+        )
+        error.difference = {**difference, "now": objection}
+        return error
+
 
 class EditedMeanwhileError(InputError):
     """The match changed since the previous iteration was computed."""
@@ -30,13 +49,7 @@ class EditedMeanwhileError(InputError):
 def edits_since(
     said: Sequence[E], taken_in: Sequence[JsonValue], place: str, match_id: str
 ) -> Sequence[E]:
-    """Return the edits in force that a result does not contain yet.
-
-    Args:
-        said: all edits in force, in order.
-        taken_in: edits that the result contains, as its recipe lists them.
-        place: name of the result, for messages.
-        match_id: the match.
+    """Return those of the edits in force, `said`, that a result has not `taken_in` yet.
 
     Raises:
         InputError: the result contains an edit that was withdrawn since, so that the state without
@@ -51,3 +64,42 @@ def edits_since(
             todo=f"Run the match first: worldpose run {match_id}.",
         )
     return later
+
+
+class StoredResult(NamedTuple):
+    """A result of the latest run, without corrections if that version is stored.
+
+    Attributes:
+        result: the result.
+        plain: key of the result without corrections.
+        edits: the corrections that `result` contains, as its recipe lists them.
+    """
+
+    result: xr.Dataset
+    plain: str
+    edits: list[JsonValue]
+
+
+def open_stored(store: Store, match_id: str, name: str, source: str) -> StoredResult:
+    """Open a result of the latest run by `stage/unit`; `source` names its recipe's corrections."""
+    stage, _, unit = name.partition("/")
+    key = store.run(match_id).results[name]
+    recipe = store.manifest(match_id, stage, unit, key).recipe
+    sources = dict(recipe.sources)
+    taken_in = sources.pop(source, None) or []
+    assert isinstance(taken_in, list)
+    plain = recipe_key(recipe.model_copy(update={"sources": sources}))
+    if store.has(match_id, stage, unit, plain):
+        key, taken_in = plain, []
+    return StoredResult(store.open_result(match_id, stage, unit, key), plain, taken_in)
+
+
+def require_results(found: Sequence[str], place: str, subject: str, match_id: str) -> None:
+    """Raise InputError if the latest run has no results of a subject."""
+    if not found:
+        raise InputError(
+            f"{match_id}, {place}",
+            expected=f"{subject} in the latest run",
+            found="none",
+            todo=f"Run the match first: worldpose run {match_id}.",
+        )

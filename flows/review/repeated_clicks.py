@@ -7,9 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from data_contracts.arrays import Floats
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
+from worldpose.evaluation.cameras import surface_points
 from worldpose.ingest.annotations import clicked_file, read_clicked_markings
 from worldpose.ingest.clicks import RepeatedClick
 from worldpose.ingest.match_folder import read_spec
@@ -28,26 +27,19 @@ MIN_RATIO: Final = 3.0
 def explain_repeated(folder: Path, file: Path, repeated: list[RepeatedClick]) -> list[str]:
     """Return a sentence for each repeated label: both pixels, the wrong one, and what to do.
 
-    Args:
-        folder: the match folder into which the clicks were imported.
-        file: the annotation file, for the advice.
-        repeated: the labels.
+    The clicks were imported from `file` into the match folder.
     """
     return [
         f"{each.image}: {each.label!r} is clicked at {_pixel(each.pixels[0])} and at "
         f"{_pixel(each.pixels[1])}. Which one is meant? {_judge(folder, each)} Correct "
-        f"the label of the wrong one in {file.name}, remove {_clicks_path(folder, each)} and "
-        "import again; or leave both: calibration excludes a click that the others contradict."
+        f"the label of the wrong one in {file.name}, remove {folder / clicked_file(each.owner)} "
+        "and import again; or leave both: calibration excludes a click that the others contradict."
         for each in repeated
     ]
 
 
 def _pixel(pixel: tuple[float, float]) -> str:
     return f"({pixel[0]:.0f}, {pixel[1]:.0f})"
-
-
-def _clicks_path(folder: Path, each: RepeatedClick) -> str:
-    return str(folder / clicked_file(each.owner))
 
 
 def _judge(folder: Path, each: RepeatedClick) -> str:
@@ -64,7 +56,8 @@ def _judge(folder: Path, each: RepeatedClick) -> str:
         found = calibrate_camera(template, clicked, (camera.width, camera.height))
     except InputError:
         return undecided
-    places = [_ground(found.estimate.camera, template, np.array(pixel)) for pixel in each.pixels]
+    rays = found.estimate.camera.unproject(np.array(each.pixels))
+    places = surface_points(rays, template)[:, :2]
     off = [float(np.hypot(*(place - template.points[each.names[0]][:2]))) for place in places]
     meant, other = (0, 1) if off[0] <= off[1] else (1, 0)
     if not off[other] > max(MIN_DISTANCE_M, MIN_RATIO * off[meant]):
@@ -82,14 +75,3 @@ def _judge(folder: Path, each: RepeatedClick) -> str:
         f"By the other clicks the one at {_pixel(each.pixels[meant])} is {off[meant]:.1f} m from "
         f"the label's place, and the one at {_pixel(each.pixels[other])} shows {shown}."
     )
-
-
-def _ground(camera: Camera, pitch: PitchTemplate, pixel: Floats) -> Floats:
-    """Return where a pixel's ray meets the surface (2,) [m]."""
-    rays = camera.unproject(pixel[None])
-    origin, direction = rays.origins[0], rays.directions[0]
-    height, place = 0.0, origin[:2]
-    for _ in range(3):  # the crown is flat: the second step changes millimetres
-        place = origin[:2] + (height - origin[2]) / direction[2] * direction[:2]
-        height = float(pitch.height(place[0], place[1]))
-    return np.asarray(place)

@@ -16,13 +16,14 @@ from data_contracts.review import (
     RedrawnMarking,
     ReviewDecision,
     ReviewRequest,
+    Withdrawal,
 )
 from data_contracts.run import RunRecord, WaitingUnit
 from flows.gates import GATES
 from flows.left_out import left_out_cameras
 from flows.method import METHOD
 from flows.orchestration.prefect_environment import has_server
-from flows.review.corrections import new_corrections, withdrawal
+from flows.review.corrections import new_corrections
 from flows.review.edit_conflicts import StaleEditError
 from flows.run_record import latest_run
 from flows.stage import Match
@@ -73,13 +74,7 @@ class Review:
 
 
 def reviews_of(store: Store, match: Match, latest: RunRecord | None) -> list[Review]:
-    """Return all of a match's review requests, first to last.
-
-    Args:
-        store: store with the results that the requests refer to.
-        match: match with its journal.
-        latest: its latest run.
-    """
+    """Return all of a match's review requests, first to last."""
     return _reviews(match.journal, latest, corrected_units(store, match, latest))
 
 
@@ -88,11 +83,6 @@ def corrected_units(store: Store, match: Match, latest: RunRecord | None) -> fro
 
     A unit counts if the data of the match folder, with all corrections, differ from those that the
     unit or one of its inputs was computed from. Other code or libraries do not count.
-
-    Args:
-        store: store with the results.
-        match: match with all corrections applied.
-        latest: the match's latest run.
     """
     if latest is None or not latest.waiting:
         return frozenset()
@@ -154,21 +144,13 @@ def warnings_of(match: Match) -> list[str]:
 
 
 def still_waiting(store: Store, match: Match, latest: RunRecord | None) -> list[WaitingUnit]:
-    """Return the units for which the latest run waits, without those approved or corrected since.
-
-    Args:
-        store: store with the results.
-        match: match with its journal.
-        latest: its latest run.
-    """
+    """Return the units that the latest run waits for, without those approved or corrected since."""
     said = match.journal.questions
-    decisions = [each for each in said if isinstance(each, ReviewDecision)]
-    verdicts = {decision.request: decision.verdict for decision in decisions}
-    waiting = () if latest is None else latest.waiting
+    verdicts = {each.request: each.verdict for each in said if isinstance(each, ReviewDecision)}
     corrected = corrected_units(store, match, latest)
     return [
         unit
-        for unit in waiting
+        for unit in (() if latest is None else latest.waiting)
         if verdicts.get(unit.request) != "approve" and unit.unit not in corrected
     ]
 
@@ -186,15 +168,8 @@ def decide(
 ) -> tuple[list[str], list[Correction]]:
     """Record a verdict and its corrections at once; return decided ids and corrections.
 
-    Args:
-        store: the store that holds the journal.
-        match: match as it was opened.
-        requests: ids of the review requests; empty = all pending ones.
-        verdict: the verdict on each.
-        who: name of the reviewer.
-        why: the reviewer's comment.
-        edits: corrections of the reviewed results.
-        seen: review id to the state that the reviewer saw; None = any state.
+    Without `requests`, the verdict is on all pending ones. `edits` correct the reviewed results;
+    `seen` is the state of each review as the reviewer saw it, None = any state.
 
     Raises:
         StaleEditError: another person decided since the reviewer looked.
@@ -280,23 +255,29 @@ def correct(
 
 
 def withdraw(store: Store, match: Match, corrections: Sequence[str], *, who: str, why: str) -> None:
-    """Withdraw corrections, all or none.
-
-    Args:
-        store: the store that holds the journal.
-        match: the match.
-        corrections: their ids.
-        who: name of the reviewer.
-        why: the reviewer's comment.
+    """Withdraw corrections by their ids, all or none.
 
     Raises:
         InputError: one of the corrections is not in force.
     """
-    say(
-        store,
-        match.match_id,
-        lambda journal: [withdrawal(journal, each, who=who, why=why) for each in corrections],
-    )
+
+    def withdrawals(journal: Journal) -> list[Withdrawal]:
+        for each in corrections:
+            if each not in journal.standing:
+                last = [*journal.standing][-10:]
+                raise InputError(
+                    f"correction {each}",
+                    expected=f"one that stands, such as the last: {', '.join(last) or '(none)'}",
+                    found="no such correction",
+                    todo="List them with `worldpose review show MATCH`.",
+                )
+        now = datetime.now(UTC)
+        return [
+            Withdrawal(match_id=match.match_id, correction=each, who=who, why=why, withdrawn_at=now)
+            for each in corrections
+        ]
+
+    say(store, match.match_id, withdrawals)
 
 
 def origins_of(store: Store, match: Match, record: RunRecord) -> dict[str, Origin]:
@@ -321,12 +302,8 @@ def unit_origins(
     """Return the origin of each unit's result, by `stage/unit`.
 
     A rejection propagates to all units computed from the rejected one; a correction marks only the
-    unit with corrected evidence, and units computed from it are automatic.
-
-    Args:
-        made_from: input units of each unit.
-        applied: the corrections in the results.
-        rejected: units whose last verdict is a rejection.
+    unit with corrected evidence, and units computed from it are automatic. `made_from` has the
+    input units of each unit, `applied` the corrections in the results.
     """
     corrected = set()
     for edit in (correction.edit for correction in applied):
@@ -336,7 +313,9 @@ def unit_origins(
         elif isinstance(edit, IDENTITY_EDITS):
             corrected.add(f"tracking/{edit.clip}")
         elif isinstance(edit, DETECTION_EDITS):
-            corrected |= _seen_by(edit.camera, made_from)
+            found = f"detection/{edit.camera}"
+            detected = {u for u in made_from if u == found or u.startswith(f"{found}.")}
+            corrected |= detected or {f"ingest/{edit.camera}"}
     refused = set(rejected)
     while more := {
         unit for unit, sources in made_from.items() if unit not in refused and refused & {*sources}
@@ -346,13 +325,6 @@ def unit_origins(
         unit: "rejected" if unit in refused else "corrected" if unit in corrected else "automatic"
         for unit in made_from
     }
-
-
-def _seen_by(camera: str, units: Collection[str]) -> set[str]:
-    """Return the units of a camera's detections: its detection units, or else its ingest unit."""
-    found = f"detection/{camera}"
-    detected = {unit for unit in units if unit == found or unit.startswith(f"{found}.")}
-    return detected or {f"ingest/{camera}"}
 
 
 def resume(store: Store, match: Match) -> list[str]:

@@ -65,8 +65,8 @@ def watch(plan: ServePlan) -> None:
 def pages(plan: ServePlan) -> None:
     """Serve the review pages and the status page until this process ends."""
     from flows.web.access import access_for
+    from flows.web.app import serve
     from flows.web.intake import Intake
-    from flows.web.serving import serve
 
     access = access_for(
         plan.host,

@@ -223,12 +223,9 @@ def access_for(
 ) -> Access:
     """Create the access control of a server that listens at `host`.
 
-    Args:
-        host: address to listen at.
-        token: chosen token; None = a random one, printed when the server starts.
-        names: further names of the machine that browsers use.
-        secure: whether TLS is used.
-        users: file of the people who may log in; None = every user with the token.
+    Without a token, the server makes and prints a random one. `names` are further names of the
+    machine that browsers use, `users` is the file of the people who may log in; None = all with the
+    token.
 
     Raises:
         UsageError: the file or the token is not valid, or the server would listen to other

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
+from pathlib import Path
 from threading import Thread
 from typing import Final
 
@@ -22,22 +23,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from data_contracts.records import Record
 from flows.review.edit_conflicts import StaleEditError
 from flows.service import status_page
-from flows.web import (
-    calibration,
-    corrections,
-    decisions,
-    detections,
-    evidence,
-    identities,
-    outliers,
-    queue,
-    results,
-    views,
-)
-from flows.web.access import SESSION_SECONDS, Access
+from flows.web import calibration, corrections, detections, evidence, identities, queue, results
+from flows.web.access import LOOPBACK, SESSION_SECONDS, Access
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import describe_error
 from flows.web.host_guard import refusal, refuse_foreign
+from flows.web.http_server import serve_http
 from flows.web.intake import CHUNK_BYTES, CHUNK_SUFFIX, Intake
 from flows.web.intake import routes as routes_of_intake
 from flows.web.proxy import NAME_LENGTH, Role
@@ -71,12 +62,7 @@ class Login(Record):
 
 
 def create_app(project: str, access: Access, intake: Intake | None = None) -> FastAPI:
-    """Create the server of a project's pages.
-
-    Args:
-        project: folder or URL of the store.
-        access: access control.
-        intake: where people put new matches; None: they create none here.
+    """Create the server of a project's pages; without intake, people create no matches there.
 
     Raises:
         InputError: there is no such project.
@@ -98,24 +84,53 @@ def create_app(project: str, access: Access, intake: Intake | None = None) -> Fa
     )
     add_answers(app)
     app.include_router(_sessions(context))
-    for module in (
-        queue,
-        decisions,
-        corrections,
-        evidence,
-        outliers,
-        calibration,
-        detections,
-        views,
-        identities,
-        results,
-        status_page,
-    ):
+    pages = queue, corrections, evidence, calibration, detections, identities, results, status_page
+    for module in pages:
         app.include_router(module.routes(context))
     app.include_router(routes_of_intake(context, intake))
     app.include_router(_files())
     app.add_middleware(Guard, access=access)
     return app
+
+
+def serve(
+    project: str,
+    access: Access,
+    *,
+    host: str,
+    port: int,
+    tls: tuple[Path, Path] | None,
+    announce: Callable[[], None] = lambda: None,
+    intake: Intake | None = None,
+) -> None:
+    """Serve a project's pages; return when interrupted.
+
+    TLS has a certificate and a key file. Port 0 is any free one; `announce` is called when it is
+    ours. Without intake, people create no matches here.
+
+    Raises:
+        InputError: there is no such project, or the port is taken.
+    """
+    certificate, key = (None, None) if tls is None else map(str, tls)
+    serve_http(
+        create_app(project, access, intake),
+        host=host,
+        port=port,
+        announce=announce,
+        server_header=False,
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
+        timeout_graceful_shutdown=2,
+    )
+
+
+def address(access: Access, host: str, port: int) -> str:
+    """Return the pages' URL; the token is in the fragment, which browsers do not send."""
+    name = host
+    if host not in LOOPBACK:
+        name = sorted(access.hosts - LOOPBACK)[0]
+    name = f"[{name}]" if ":" in name else name
+    return f"{'https' if access.secure else 'http'}://{name}:{port}/login#token={access.token}"
 
 
 def _sessions(context: PageContext) -> APIRouter:

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 
+from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
 from flows.orchestration.prefect_environment import has_server
@@ -30,6 +31,7 @@ from flows.service.match_runs import (
 )
 from flows.stage import Match
 from flows.web.access import Access
+from worldpose.review.journal import requests_by_id
 from worldpose.store.store import Store
 
 
@@ -64,6 +66,18 @@ class PageContext:
         if name not in self.store.matches():
             raise HTTPException(404, "no such match")
         return open_for_review(self.store, name)
+
+    def review(self, name: str, request: str) -> tuple[Match, ReviewRequest]:
+        """Return a match and one of its review requests.
+
+        Raises:
+            HTTPException: 404, there is none.
+        """
+        match = self.match(name)
+        asked = requests_by_id(match.journal.questions).get(request)
+        if asked is None:
+            raise HTTPException(404, "no such review")
+        return match, asked
 
 
 def _person(request: Request) -> str:
@@ -109,10 +123,6 @@ class Continuing:
     def go_on(self, match_id: str, gates: str | None = None) -> dict[str, Any]:
         """Resume the match's suspended runs, or start one; return which of the two.
 
-        Args:
-            match_id: a registered match.
-            gates: gate policy of the run; None = the default.
-
         Raises:
             InputError: a suspended run has undecided reviews.
             UnreachablePrefectError: Prefect does not answer.
@@ -120,23 +130,23 @@ class Continuing:
         with self._lock:
             served = match_runs_of(self.store.url)
             if served is None:
-                if has_server():
-                    resumed = resume(self.store, open_for_review(self.store, match_id))
-                    if resumed:
-                        return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"}
-                return self._local.go_on(match_id, gates)
+                resumed = self._resume(match_id) if has_server() else None
+                return resumed or self._local.go_on(match_id, gates)
             states = {run.state for run in served.active() if run.match_id == match_id}
             self._seen = None
-            if "PAUSED" in states:
-                resumed = resume(self.store, open_for_review(self.store, match_id))
-                if resumed:
-                    return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"}
+            if "PAUSED" in states and (resumed := self._resume(match_id)):
+                return resumed
             if states & set(QUEUED):
                 return {"state": "running", "how": "a run of it waits for its turn already"}
             # A run at work may have missed what was decided or corrected a moment ago.
             run = served.start(match_id, gates=gates)
             how = "once more when the run at work has ended" if states else "the deployment"
             return {"state": "running", "how": how, "prefect": run.link}
+
+    def _resume(self, match_id: str) -> dict[str, Any] | None:
+        """Resume the match's suspended runs; return None if there are none."""
+        resumed = resume(self.store, open_for_review(self.store, match_id))
+        return {"state": "resumed", "how": f"resumed {', '.join(resumed)}"} if resumed else None
 
     def state(self, match_id: str) -> dict[str, Any] | None:
         """Return the state of the match's run, or of the last one if that failed; else None."""

@@ -15,6 +15,7 @@ from fastapi.responses import JSONResponse, Response
 from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.arrays import Image
 from data_contracts.match import Side
 from data_contracts.records import Name, Record
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking, Pixel
@@ -23,6 +24,7 @@ from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error
+from flows.web.images import encode_image
 from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
@@ -45,6 +47,14 @@ class Clicked(Record):
     """Line name to positions along it [px]."""
     refine: bool = False
     """Refine on the painted lines of the image: seconds, not milliseconds."""
+
+    def markings(self) -> ClickedMarkings:
+        """Return the clicks as a file of the match folder has them."""
+        drawn = ((name, xy) for name, xy in sorted(self.drawn.items()) if xy)
+        return ClickedMarkings(
+            points=tuple(ClickedPoint(name=n, xy=xy) for n, xy in sorted(self.points.items())),
+            drawn=tuple(DrawnMarking(name=name, xy=xy) for name, xy in drawn),
+        )
 
 
 class Wanted(Record):
@@ -70,10 +80,7 @@ class Pictures:
         still = match.folder.stills.get(owner)
         if frame is None and still is not None:
             return Path(still).read_bytes()
-        import cv2  # imported here: few pages decode an image
-
-        picture = cv2.cvtColor(self.decode_image(match, owner, frame), cv2.COLOR_RGB2BGR)
-        return bytes(cv2.imencode(".png", picture)[1])
+        return encode_image(self.decode_image(match, owner, frame), "png")
 
     def decode_image(self, match: Match, owner: str, frame: int | None) -> NDArray[np.uint8]:
         """Return one image (height, width, 3), RGB.
@@ -95,90 +102,44 @@ def routes(context: PageContext) -> APIRouter:
     """Create the routes of one image: of a static camera, or of a frame of a broadcast camera."""
     router = APIRouter(prefix="/api/matches/{match_id}/pictures/{owner}")
     pictures = Pictures()
-    drawings: dict[str, tuple[PitchDrawing, dict[str, tuple[int, int]]]] = {}
+    drawings: dict[str, PitchDrawing] = {}
 
-    def load_pitch(match_id: str) -> tuple[PitchDrawing, dict[str, tuple[int, int]]]:
-        """Return a match's pitch and image sizes; both are fixed per match."""
-        if match_id not in drawings:
-            folder = context.match(match_id).folder
-            pitch = folder.pitch
-            if pitch is None:
-                raise HTTPException(404, "the match has no pitch")
-            spec = folder.spec
-            owners = {camera.id: camera for camera in spec.static_cameras}
-            owners |= {
-                clip.id: spec.camera(clip.broadcast)
-                for clip in spec.clips
-                if clip.broadcast is not None
-            }
-            sizes = {name: (camera.width, camera.height) for name, camera in owners.items()}
-            drawings[match_id] = PitchDrawing(PitchTemplate.from_spec(pitch)), sizes
-        return drawings[match_id]
-
-    def size_of(match_id: str, owner: str) -> tuple[int, int]:
-        sizes = load_pitch(match_id)[1]
-        if owner not in sizes:
+    def open_picture(match_id: str, owner: str) -> tuple[Match, PitchDrawing, tuple[int, int]]:
+        """Return a match, its pitch, which is fixed, and the size of the camera's images."""
+        match = context.match(match_id)
+        pitch, camera = match.folder.pitch, match.folder.spec.filming_camera(owner)
+        if pitch is None:
+            raise HTTPException(404, "the match has no pitch")
+        if camera is None:
             raise HTTPException(404, "no such camera")
-        return sizes[owner]
+        if match_id not in drawings:
+            drawings[match_id] = PitchDrawing(PitchTemplate.from_spec(pitch))
+        return match, drawings[match_id], (camera.width, camera.height)
 
     @router.get("")
     def picture(match_id: str, owner: str, frame: int | None = None) -> dict[str, Any]:
-        match = context.match(match_id)
-        size = size_of(match_id, owner)
-        clicked = _read_clicks(match, owner, frame)
-        latest = latest_run(context.store, match_id)
-        stage = "static_calibration" if frame is None else "broadcast_calibration"
-        unit = f"{stage}/{owner}"
-        names = [camera.id for camera in match.folder.spec.static_cameras]
-        return {
-            "match": match_id,
-            "owner": owner,
-            "frame": frame,
-            "size": size,
-            "given": owner in match.folder.calibrations,
-            "side": _stated_side(match, owner),
-            "has_picture": owner in match.folder.stills or owner in match.folder.videos,
-            "points": {point.name: point.xy for point in clicked.points},
-            "drawn": {marking.name: marking.xy for marking in clicked.drawn},
-            "pitch": _pitch(load_pitch(match_id)[0]),
-            "figures": {} if latest is None else latest.figures.get(unit, {}),
-            "reviews": [
-                {"id": each.request.id, "state": each.state, "reasons": each.request.reasons}
-                for each in reviews_of(context.store, match, latest)
-                if unit in each.request.keys and each.is_current
-            ],
-            "cameras": names,
-            "key_frames": _key_frames(match, owner),
-        }
+        match, drawing, size = open_picture(match_id, owner)
+        return {"size": size, "pitch": _pitch(drawing), **_describe(context, match, owner, frame)}
 
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int | None = None) -> Response:
-        size_of(match_id, owner)
-        content = pictures.png(context.match(match_id), owner, frame)
+        content = pictures.png(open_picture(match_id, owner)[0], owner, frame)
         return Response(content, media_type="image/png")
 
     @router.post("/preview")
     def estimate(
         match_id: str, owner: str, clicked: Clicked, frame: int | None = None
     ) -> JSONResponse:
-        size = size_of(match_id, owner)
-        markings = ClickedMarkings(
-            points=tuple(ClickedPoint(name=n, xy=xy) for n, xy in sorted(clicked.points.items())),
-            drawn=tuple(
-                DrawnMarking(name=n, xy=xy) for n, xy in sorted(clicked.drawn.items()) if xy
-            ),
-        )
-        seen = (
-            pictures.decode_image(context.match(match_id), owner, frame) if clicked.refine else None
-        )
+        match, drawing, size = open_picture(match_id, owner)
+        markings = clicked.markings()
         try:
             found = preview(
-                load_pitch(match_id)[0],
+                drawing,
                 markings,
                 size,
-                picture=seen,
+                picture=pictures.decode_image(match, owner, frame) if clicked.refine else None,
                 settings=StaticCalibrationSettings() if clicked.refine else _POINTS_ALONE,
-                lens=context.match(match_id).folder.lenses.get(owner),
+                lens=match.folder.lenses.get(owner),
             )
         except InputError as error:
             advice = {"camera": None, "expected": error.expected, "todo": error.todo}
@@ -196,33 +157,63 @@ def routes(context: PageContext) -> APIRouter:
     def propose(
         match_id: str, owner: str, wanted: Wanted, frame: int | None = None
     ) -> dict[str, Any]:
-        """Propose the camera from its image alone; a few seconds."""
-        size_of(match_id, owner)
-        match = context.match(match_id)
-        drawing, where = load_pitch(match_id)[0], f"image of {owner}"
-        try:
-            found = propose_camera(
-                pictures.decode_image(match, owner, frame),
-                drawing.template,
-                side=wanted.side,
-                lens=match.folder.lenses.get(owner),
-                where=where,
-            )
-        except InputError as error:
-            reason = describe_error(error)
-            return {"drawn": {}, "markings": {}, "reason": reason}
-        reason = ""
-        try:
-            found.require_clear(where, drawing.template)
-        except InputError as error:
-            reason = describe_error(error)
-        return {
-            "drawn": {each.name: each.xy for each in found.drawn.drawn},
-            "markings": _round_pieces(drawing.project_markings(found.camera)),
-            "reason": reason,
-        }
+        match, drawing, _ = open_picture(match_id, owner)
+        return _propose(match, drawing, owner, pictures.decode_image(match, owner, frame), wanted)
 
     return router
+
+
+def _describe(context: PageContext, match: Match, owner: str, frame: int | None) -> dict[str, Any]:
+    """Return clicks, metrics and review requests of one image."""
+    clicked = _read_clicks(match, owner, frame)
+    latest = latest_run(context.store, match.match_id)
+    stage = "static_calibration" if frame is None else "broadcast_calibration"
+    unit = f"{stage}/{owner}"
+    return {
+        "match": match.match_id,
+        "owner": owner,
+        "frame": frame,
+        "given": owner in match.folder.calibrations,
+        "side": _stated_side(match, owner),
+        "has_picture": owner in match.folder.stills or owner in match.folder.videos,
+        "points": {point.name: point.xy for point in clicked.points},
+        "drawn": {marking.name: marking.xy for marking in clicked.drawn},
+        "figures": {} if latest is None else latest.figures.get(unit, {}),
+        "reviews": [
+            {"id": each.request.id, "state": each.state, "reasons": each.request.reasons}
+            for each in reviews_of(context.store, match, latest)
+            if unit in each.request.keys and each.is_current
+        ],
+        "cameras": [camera.id for camera in match.folder.spec.static_cameras],
+        "key_frames": key_frames(match, owner),
+    }
+
+
+def _propose(
+    match: Match, drawing: PitchDrawing, owner: str, image: Image, wanted: Wanted
+) -> dict[str, Any]:
+    """Propose the camera from its image alone; a few seconds."""
+    where = f"image of {owner}"
+    try:
+        found = propose_camera(
+            image,
+            drawing.template,
+            side=wanted.side,
+            lens=match.folder.lenses.get(owner),
+            where=where,
+        )
+    except InputError as error:
+        return {"drawn": {}, "markings": {}, "reason": describe_error(error)}
+    answer = {
+        "drawn": {each.name: each.xy for each in found.drawn.drawn},
+        "markings": _round_pieces(drawing.project_markings(found.camera)),
+        "reason": "",
+    }
+    try:
+        found.require_clear(where, drawing.template)
+    except InputError as error:
+        answer["reason"] = describe_error(error)
+    return answer
 
 
 def warm_up(context: PageContext) -> None:
@@ -269,7 +260,8 @@ def _read_clicks(match: Match, owner: str, frame: int | None) -> ClickedMarkings
     return frames.get(frame, ClickedMarkings())
 
 
-def _key_frames(match: Match, owner: str) -> list[int]:
+def key_frames(match: Match, owner: str) -> list[int]:
+    """Return the frames of a clip's video that a person clicked."""
     picked = match.folder.key_frames.get(owner)
     return [] if picked is None else [each.frame for each in picked.key_frames]
 

@@ -1,28 +1,71 @@
-"""Corrections of a match in groups: one person at one camera or clip in one session."""
+"""Decisions and corrections of a match, these in groups of one person, camera and session."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, HTTPException, Query
 from pydantic import Field
 
 from data_contracts.records import Count, Name, Record
-from data_contracts.review import Correction
+from data_contracts.review import Correction, Edit
+from data_contracts.run import GatePolicy
 from flows.review.corrections import keep_edits
-from flows.review.descriptions import correction_json, in_words, is_first_click
-from flows.review.verdicts import withdraw
+from flows.review.descriptions import in_words, is_first_click
+from flows.review.verdicts import decide, still_waiting, withdraw
+from flows.run_record import latest_run
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
-from flows.web.decisions import Edits
 
 SESSION_GAP: Final = timedelta(minutes=30)
 """A longer pause of a person begins a new session."""
 MAX_LISTED: Final = 200
 """Corrections of a group in one response, the last ones first."""
+MAX_EDITS: int = 200
+"""Maximum number of edits per request."""
+Comment = Annotated[str, Field(max_length=2000)]
+"""A person's comment."""
+
+
+class Verdict(Record):
+    """A verdict on pending reviews."""
+
+    reviews: tuple[Name, ...] = Field(min_length=1)
+    """Ids of the review requests."""
+    verdict: Literal["approve", "reject"]
+    """Required: there is no default."""
+    why: Comment = ""
+    seen: dict[str, str]
+    """Review id to the state that the person saw: another person can have decided in between."""
+    go_on: bool = True
+    """Continue the run when no review is pending."""
+
+
+class GivenEdit(Record):
+    """One edit of a page."""
+
+    id: Name
+    """Created by the page: sent again, it is the same edit."""
+    edit: Edit
+    """With `was` as the page showed it."""
+
+
+class Edits(Record):
+    """Edits that are kept all or none."""
+
+    edits: tuple[GivenEdit, ...] = Field(min_length=1, max_length=MAX_EDITS)
+    """Edits in the order of application."""
+    note: Comment = ""
+
+
+class GoingOn(Record):
+    """Options for continuing a run."""
+
+    gates: GatePolicy | None = None
+    """When results need review; None = the default of `worldpose run`."""
 
 
 class Withdrawing(Record):
@@ -30,8 +73,7 @@ class Withdrawing(Record):
 
     correction: Name
     """Its id."""
-    why: str = Field(default="", max_length=2000)
-    """The person's comment."""
+    why: Comment = ""
 
 
 class WithdrawingGroup(Record):
@@ -39,8 +81,7 @@ class WithdrawingGroup(Record):
 
     count: Count
     """Corrections of the group that the person saw."""
-    why: str = Field(default="", max_length=2000)
-    """The person's comment."""
+    why: Comment = ""
 
 
 @dataclass
@@ -106,8 +147,23 @@ def describe_groups(match: Match) -> list[dict[str, Any]]:
 
 
 def routes(context: PageContext) -> APIRouter:
-    """Create the routes of corrections: keep, list by group, withdraw one or a whole group."""
+    """Create the routes of all requests that change the journal or start a run."""
     router = APIRouter(prefix="/api/matches/{match_id}")
+
+    @router.post("/decisions")
+    def take_verdict(match_id: str, given: Verdict, who: Person) -> dict[str, Any]:
+        match = context.match(match_id)
+        latest = latest_run(context.store, match_id)
+        why, seen = given.why, given.seen
+        decide(context.store, match, given.reviews, given.verdict, who=who, why=why, seen=seen)
+        waiting = still_waiting(context.store, context.match(match_id), latest)
+        run = context.continuing.go_on(match_id) if given.go_on and not waiting else None
+        return {"waiting": len(waiting), "run": run}
+
+    @router.post("/runs")
+    def go_on(match_id: str, given: GoingOn) -> dict[str, Any]:
+        context.match(match_id)
+        return context.continuing.go_on(match_id, given.gates)
 
     @router.post("/corrections")
     def correct(match_id: str, given: Edits, who: Person) -> dict[str, Any]:
@@ -115,7 +171,7 @@ def routes(context: PageContext) -> APIRouter:
         kept = keep_edits(
             context.store, lambda: context.match(match_id), edits, who=who, note=given.note
         )
-        return {"kept": [correction_json(each) for each in kept]}
+        return {"kept": [each.model_dump(mode="json") for each in kept]}
 
     @router.get("/corrections/{group}")
     def list_group(
@@ -124,7 +180,7 @@ def routes(context: PageContext) -> APIRouter:
         found = _find(context.match(match_id), group).corrections[::-1]
         return {
             "corrections": [
-                {**correction_json(each), "words": in_words(each), "objection": why}
+                {**each.model_dump(mode="json"), "words": in_words(each), "objection": why}
                 for each, why in found[skip : skip + MAX_LISTED]
             ],
             "count": len(found),

@@ -1,7 +1,9 @@
-"""Detections of a camera in one frame: boxes and keypoints for review and correction (D4, D6)."""
+"""Detections of a camera in one frame: review, correction, and other cameras' views (D4, D6)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from threading import Lock
 from typing import Any, Final
 
 import numpy as np
@@ -14,11 +16,16 @@ from data_contracts.conventions import COCO17, COCO17_BONES
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.records import DetectionIndex, Frame, Record
 from flows.reports.match_pictures import frame_picture
+from flows.results.best_results import static_cameras
 from flows.review.detections import accept, detections_now, left_to_look_at
+from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext, Person
+from flows.web.images import image_response
 from worldpose.errors import InputError
-from worldpose.store.store import Store
+from worldpose.geometry.cameras import Camera
+from worldpose.review.evidence import check_views, epipolar_curves
+from worldpose.store.store import Store, open_run
 
 MAX_LISTED: Final = 60
 """Maximum number of listed detections to review."""
@@ -48,32 +55,30 @@ def routes(context: PageContext) -> APIRouter:
             for clip in spec.clips
             if owner in (clip.id, *(camera.id for camera in spec.static_cameras))
         ]
-        if not frames:
+        camera = spec.filming_camera(owner)
+        if not frames or camera is None:
             raise HTTPException(404, "no such camera")
         frame = frames[0][0] if frame is None else frame
         return {
             "frame": frame,
             "frames": frames,
-            "size": _size(match, owner),
+            "size": (camera.width, camera.height),
             "has_picture": owner in match.folder.videos,
             "joints": COCO17,
             "bones": COCO17_BONES,
-            **_describe_detections(detections_now(context.store, match, owner, frame)),
+            **_describe_frame(detections_now(context.store, match, owner, frame)),
             "cameras": [camera.id for camera in spec.static_cameras],
         }
 
     @router.get("/image")
     def image(match_id: str, owner: str, frame: int) -> Response:
-        import cv2  # imported here: few pages decode an image
-
         try:
             picture = frame_picture(context.store, context.match(match_id), owner, frame)
         except InputError as error:
             raise HTTPException(404, error.found) from error
         if picture is None:
             raise HTTPException(404, "there is no image of this frame")
-        content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
-        return Response(bytes(content), media_type="image/jpeg")
+        return image_response(picture, "jpeg")
 
     @router.get("/queue")
     def queue(match_id: str, owner: str) -> dict[str, Any]:
@@ -86,6 +91,7 @@ def routes(context: PageContext) -> APIRouter:
         accept(context.store, match, owner, at_least=at_least, people=people, who=who)
         return _queue(context.store, context.match(match_id), owner)
 
+    _add_views(router, context)
     return router
 
 
@@ -112,38 +118,166 @@ def _queue(store: Store, match: Match, owner: str) -> dict[str, Any]:
     }
 
 
-def _size(match: Match, owner: str) -> tuple[int, int]:
-    spec = match.folder.spec
-    broadcast = {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
-    camera = spec.camera(broadcast.get(owner, owner))
-    return camera.width, camera.height
-
-
-def _describe_detections(found: KeypointDetections) -> dict[str, Any]:
-    """Return all detections of the first row, and the index for an added person."""
-    there = np.isfinite(found.score[:1]).any(axis=0)
-    occupied = np.flatnonzero(there)
-    free = int(occupied[-1]) + 1 if len(occupied) else 0
-    return {"people": _people(found), "free": free}
-
-
-def _people(found: KeypointDetections) -> list[dict[str, Any]]:
-    """Return all detections of the first row, the least certain first."""
-    if not len(found.frame):
-        return []
-    there = np.flatnonzero(np.isfinite(found.score[0]))
-    return [
+def _describe_frame(found: KeypointDetections) -> dict[str, Any]:
+    """Return all detections of the first row, the least certain first; index of an added one."""
+    score = found.score[0] if len(found.frame) else np.empty(0)
+    there = np.flatnonzero(np.isfinite(score))
+    people = [
         {
             "detection": int(k),
-            "score": round(float(found.score[0, k]), 3),
+            "score": round(float(score[k]), 3),
             "box": _numbers(found.boxes[0, k]),
             "keypoints": [_numbers(place) for place in found.keypoints[0, k]],
-            "confidence": [None if np.isnan(c) else round(float(c), 3) for c in confidence],
+            "confidence": [
+                None if np.isnan(c) else round(float(c), 3) for c in found.confidence[0, k]
+            ],
         }
-        for k in there[np.argsort(found.score[0, there], kind="stable")]
-        for confidence in (found.confidence[0, k],)
+        for k in there[np.argsort(score[there], kind="stable")]
     ]
+    return {"people": people, "free": int(there[-1]) + 1 if len(there) else 0}
 
 
 def _numbers(values: NDArray[np.float32]) -> list[float] | None:
     return None if np.isnan(values).any() else [round(float(value), 3) for value in values]
+
+
+CACHED_PEOPLE: Final = 8
+"""People whose views are kept in memory while a keypoint is dragged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """One person in one frame, as all static cameras see the person.
+
+    Attributes:
+        person: the tracker's id; None if there is none.
+        names: ids of the cameras.
+        cameras: the cameras.
+        detections: index in each camera's frame; -1 = not detected.
+        keypoints: (cameras, 17, 2) [px].
+    """
+
+    person: int | None
+    names: list[str]
+    cameras: list[Camera]
+    detections: list[int]
+    keypoints: NDArray[np.float64]
+
+
+def _add_views(router: APIRouter, context: PageContext) -> None:
+    """Add the route of the other cameras' views."""
+    known: dict[tuple[Any, ...], Group] = {}
+    lock = Lock()
+
+    @router.get("/views")
+    def views(
+        match_id: str,
+        owner: str,
+        frame: int,
+        detection: int,
+        joint: int | None = None,
+        x: float | None = None,
+        y: float | None = None,
+    ) -> dict[str, Any]:
+        match = context.match(match_id)
+        if owner not in {camera.id for camera in match.folder.spec.static_cameras}:
+            return {"person": None, "views": [], "here": None}
+        runs = context.store.runs(match_id)
+        said = len(match.journal.entries)
+        place = (match_id, runs[-1:], said, owner, frame, detection)
+        with lock:
+            while len(known) >= CACHED_PEOPLE:
+                known.pop(next(iter(known)))
+            group = known.get(place) or _group(context, match, owner, frame, detection)
+            known[place] = group
+        at = None if x is None or y is None or joint is None else (x, y)
+        if owner not in group.names or (joint is not None and not 0 <= joint < len(COCO17)):
+            return {"person": None, "views": [], "here": None}
+        return _describe_view(match, group, owner, joint, at)
+
+
+def _group(context: PageContext, match: Match, owner: str, frame: int, detection: int) -> Group:
+    """Return a detection's person by tracks and corrections, with its detections in all cameras.
+
+    Raises:
+        InputError: there is no such detection in the latest run.
+    """
+    clip = next(iter(match.folder.spec.clips_with(frame)), None)
+    cameras = static_cameras(open_run(context.store.url, match.match_id), match.folder.spec)
+    names = list(cameras)
+    detections = [detection if name == owner else -1 for name in names]
+    person = None
+    try:
+        found = None if clip is None else identities_now(context.store, match, clip.id).identities
+    except InputError:
+        found = None  # no tracks yet
+    if found is not None and owner in found.cameras and frame in found.frame:
+        here = found.detection_index[int(np.searchsorted(found.frame, frame))]
+        (who,) = np.nonzero(here[found.cameras.index(owner)] == detection)
+        if len(who):
+            person = int(found.person[who[0]])
+            for c, name in enumerate(found.cameras):
+                if name in names:
+                    detections[names.index(name)] = int(here[c, who[0]])
+    keypoints = np.full((len(names), len(COCO17), 2), np.nan)
+    for c, (name, k) in enumerate(zip(names, detections, strict=True)):
+        if k >= 0:
+            seen = detections_now(context.store, match, name, frame)
+            if len(seen.frame) and k < seen.keypoints.shape[1]:
+                keypoints[c] = seen.keypoints[0, k]
+    return Group(person, names, list(cameras.values()), detections, keypoints)
+
+
+def _describe_view(
+    match: Match,
+    group: Group,
+    owner: str,
+    joint: int | None,
+    at: tuple[float, float] | None,
+) -> dict[str, Any]:
+    own = group.names.index(owner)
+    keypoints = group.keypoints.copy()
+    if at is not None and joint is not None:
+        keypoints[own, joint] = at
+    check = check_views(Camera.stack(group.cameras), keypoints)
+    place = None if joint is None else keypoints[own, joint]
+    views = []
+    for c, name in enumerate(group.names):
+        if c == own:
+            continue
+        curves = (
+            []
+            if place is None or np.isnan(place).any()
+            else epipolar_curves(group.cameras[own], group.cameras[c], place)
+        )
+        theirs = None if joint is None else keypoints[c, joint]
+        if group.detections[c] < 0 and not curves:
+            continue
+        views.append(
+            {
+                "camera": name,
+                "detection": group.detections[c],
+                "size": group.cameras[c].image_size.tolist(),
+                "has_picture": name in match.folder.videos,
+                "keypoints": _places(keypoints[c]),
+                "expected": _places(check.expected[c]),
+                "error": _errors(check.error[c]),
+                "curves": [_places(curve) for curve in curves],
+                "curves_here": []
+                if theirs is None or np.isnan(theirs).any()
+                else [
+                    _places(curve)
+                    for curve in epipolar_curves(group.cameras[c], group.cameras[own], theirs)
+                ],
+            }
+        )
+    here = {"expected": _places(check.expected[own]), "error": _errors(check.error[own])}
+    return {"person": group.person, "views": views, "here": here}
+
+
+def _places(values: NDArray[np.float64]) -> list[list[float] | None]:
+    return [None if np.isnan(xy).any() else np.round(xy, 2).tolist() for xy in values]
+
+
+def _errors(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 2) for value in values]

@@ -12,8 +12,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -29,13 +29,21 @@ from pydantic import Field, JsonValue
 from data_contracts.match import MatchSpec
 from data_contracts.operations import Priority
 from data_contracts.records import CONTRACT_VERSION, Count, Name, Record
-from flows.web.browser_words import in_browser
+from flows.web.draft_problems import (
+    Index,
+    Problem,
+    describe,
+    describe_broken,
+    footage_problems,
+    form_problems,
+    is_footage,
+)
 from flows.web.video_folders import open_video
 from worldpose.errors import InputError, WorldposeError
 from worldpose.formats.files import whole_file
-from worldpose.ingest.footage import read_still, require_footage
-from worldpose.ingest.match_folder import MatchFolder, read_match
-from worldpose.ingest.validation import list_problems, validate_record
+from worldpose.ingest.footage import read_still
+from worldpose.ingest.match_folder import read_match
+from worldpose.ingest.validation import validate_record
 from worldpose.store.store import Store
 from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.folder import HEADER_BYTES, declared_size
@@ -61,8 +69,8 @@ LOG: Final = logging.getLogger("worldpose.pages")
 class DraftFile(Record):
     """A file of a draft: on its way, or whole."""
 
-    id: Name
-    name: str
+    id: Name = "new"
+    name: str = ""
     """Path in the match folder."""
     title: str
     """Its name where it comes from."""
@@ -107,9 +115,7 @@ class Drafts:
     store: Store
     _lock: Lock = field(default_factory=Lock)
     _locks: dict[str, Lock] = field(default_factory=dict)
-    _indexes: dict[str, FrameIndex | tuple[int, int] | InputError] = field(default_factory=dict)
-    _jobs: set[str] = field(default_factory=set)
-    _copying: dict[str, str] = field(default_factory=dict)
+    _jobs: dict[str, Future[Index | str]] = field(default_factory=dict)
     _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
 
     def all(self) -> list[Draft]:
@@ -145,11 +151,10 @@ class Drafts:
         """Return a draft.
 
         Raises:
-            InputError: there is no draft with this id.
+            InputError: there is no draft with this id; here and below.
         """
-        file = self._folder(draft_id) / "draft.json"
         try:
-            content = file.read_bytes()
+            content = (self._folder(draft_id) / "draft.json").read_bytes()
         except FileNotFoundError:
             raise _refusal(
                 "draft", "a match being created", "none: finished or discarded", "See the queue."
@@ -176,9 +181,7 @@ class Drafts:
     def add(self, draft_id: str, file: DraftFile) -> DraftFile:
         """Begin a file, or return the same one that was begun before: its transfer continues.
 
-        Args:
-            draft_id: id of the draft.
-            file: its id and name in the match folder are chosen here.
+        The id of the file and its name in the match folder are chosen here.
 
         Raises:
             InputError: the file is no video, still or file of a match folder, the file is empty,
@@ -186,7 +189,7 @@ class Drafts:
         """
         title = PurePosixPath(file.title.replace("\\", "/")).name
         title = title.lower() if title.lower() in MATCH_FILES else title
-        if title not in MATCH_FILES and not _is_footage(title):
+        if title not in MATCH_FILES and not is_footage(title):
             known = f"a video ({' '.join(VIDEO_SUFFIXES)}), a still ({' '.join(IMAGE_SUFFIXES)})"
             raise _refusal(
                 title,
@@ -196,9 +199,8 @@ class Drafts:
             )
         with self._hold(draft_id):
             draft = self.read(draft_id)
-            same = {"id", "name"}
             for each in draft.files:
-                if each.model_dump(exclude=same) == file.model_dump(exclude=same):
+                if each == file.model_copy(update={"id": each.id, "name": each.name}):
                     return each
             if len(draft.files) >= MAX_FILES or file.size == 0:
                 raise _refusal(
@@ -206,10 +208,11 @@ class Drafts:
                 )
             free = shutil.disk_usage(self.inbox).free
             underway = sum(each.size - self._count_received(draft_id, each) for each in draft.files)
-            if file.size + underway + SPARE_BYTES > free:
+            needed = file.size + underway + SPARE_BYTES
+            if needed > free:
                 raise _refusal(
                     title,
-                    f"{(file.size + underway + SPARE_BYTES) / 1e9:.1f} GB of free disk space",
+                    f"{needed / 1e9:.1f} GB of free disk space",
                     f"{free / 1e9:.1f} GB at the inbox",
                     "Free some, or ask the operator.",
                 )
@@ -254,7 +257,8 @@ class Drafts:
             InputError: there is no such video or frame, or the frame is damaged.
         """
         _, file = self._find(draft_id, file_id)
-        index = self._indexes.get(f"{draft_id} {file_id}")
+        is_whole = self._whole(draft_id, file).exists()
+        index = self._index(draft_id, file) if is_whole else None
         if not isinstance(index, FrameIndex) or not 0 <= number < len(index):
             raise _refusal(file.title, f"a video with frame {number}", "none", "Choose another.")
         with VideoReader(self._whole(draft_id, file), index) as video:
@@ -264,23 +268,15 @@ class Drafts:
         raise _refusal(file.title, f"frame {number}", "a damaged one", "Choose another frame.")
 
     def view(self, draft_id: str) -> dict[str, Any]:
-        """Return a draft for the pages, with all that is wrong or missing.
-
-        Raises:
-            InputError: there is no draft with this id.
-        """
+        """Return a draft for the pages, with all that is wrong or missing."""
         with self._hold(draft_id):  # it writes match.yaml
             return self._view(self.read(draft_id))
 
     def _view(self, draft: Draft) -> dict[str, Any]:
         files = [self._describe_file(draft.id, file) for file in draft.files]
-        problems = self._problems(draft, files)
+        problems = form_problems(draft.content, files) or self._folder_problems(draft)
         return {
-            "id": draft.id,
-            "who": draft.who,
-            "created_at": draft.created_at,
-            "revision": draft.revision,
-            "content": draft.content,
+            **draft.model_dump(include={"id", "who", "created_at", "revision", "content"}),
             "files": files,
             "problems": problems,
             "is_ready": not problems,
@@ -384,61 +380,62 @@ class Drafts:
         """Return the state of a file; begin what is to be done with it in the background."""
         received = self._count_received(draft_id, file)
         content = {**file.model_dump(), "received": received, "problem": ""}
-        key = f"{draft_id} {file.id}"
         if received < file.size:
             if file.folder is None:
                 return {**content, "state": "uploading"}
-            problem = self._copying.get(key, "")
-            if not problem:
-                self._begin(key, self._copy, draft_id, file)
+            problem = str(self._work(self._copy, draft_id, file) or "")
             return {**content, "state": "broken" if problem else "copying", "problem": problem}
-        if not _is_footage(file.name):
+        if not is_footage(file.name):
             return {**content, "state": "ready"}
-        index = self._indexes.get(key)
+        index = self._index(draft_id, file)
         if index is None:
-            self._begin(key, self._read_index, draft_id, file)
             return {**content, "state": "reading"}
         if isinstance(index, InputError):
-            problem = f"expected {index.expected}, found {_shorten(index.found)}. {index.todo}"
-            return {**content, "state": "broken", "problem": problem}
+            return {**content, "state": "broken", "problem": describe_broken(index)}
         size = index.size if isinstance(index, FrameIndex) else index
         shape: dict[str, Any] = dict(zip(("width", "height"), size, strict=True))
         if isinstance(index, FrameIndex):
             shape |= {"fps": index.fps, "frames": len(index)}
         return {**content, "state": "ready", **shape}
 
-    def _begin(self, key: str, job: Any, draft_id: str, file: DraftFile) -> None:  # noqa: ANN401
-        with self._lock:
-            if key in self._jobs:
-                return
-            self._jobs.add(key)
+    def _work(
+        self, job: Callable[[str, DraftFile], Index | str], draft_id: str, file: DraftFile
+    ) -> Index | str | None:
+        """Do a job with a file once in the background; return None until it has ended."""
 
-        def work() -> None:
+        def work() -> Index | str:
             try:
-                job(key, draft_id, file)
+                return job(draft_id, file)
             except Exception as error:  # a bug: the page shows it, and polling does not repeat it
                 LOG.exception("%s of a match being created", file.title)
-                failure = InputError(
+                return _refusal(
                     file.title,
-                    expected="a file that can be taken in",
-                    found=type(error).__name__,
-                    todo="The service's log has the details. Remove the file and add it again.",
+                    "a file that can be taken in",
+                    type(error).__name__,
+                    "The service's log has the details. Remove the file and add it again.",
                 )
-                self._copying[key], self._indexes[key] = str(failure), failure
-            finally:
-                self._jobs.discard(key)
 
-        self._pool.submit(work)
+        key = f"{draft_id} {file.id} {job.__name__}"
+        with self._lock:
+            if key not in self._jobs:
+                self._jobs[key] = self._pool.submit(work)
+        return self._jobs[key].result() if self._jobs[key].done() else None
 
-    def _read_index(self, key: str, draft_id: str, file: DraftFile) -> None:
+    def _index(self, draft_id: str, file: DraftFile) -> Index | None:
+        """Return the index of a whole file; None until it is read."""
+        found = self._work(self._read_index, draft_id, file)
+        assert not isinstance(found, str)  # only copies have text
+        return found
+
+    def _read_index(self, draft_id: str, file: DraftFile) -> Index:
         path = self._whole(draft_id, file)
         try:
-            self._indexes[key] = index_frames(path) if is_video(file.name) else _still_size(path)
+            return index_frames(path) if is_video(file.name) else _still_size(path)
         except InputError as error:
-            self._indexes[key] = error
+            return error
 
-    def _copy(self, key: str, draft_id: str, file: DraftFile) -> None:
-        """Copy a video from a named folder, from where an earlier copy ended."""
+    def _copy(self, draft_id: str, file: DraftFile) -> str:
+        """Copy a video from a named folder, from where an earlier copy ended; return a problem."""
         assert file.folder is not None  # the caller asks for a copy only of such files
         try:
             with open_video(self.folders, file.folder, file.source) as source:
@@ -446,52 +443,20 @@ class Drafts:
                     status = os.fstat(source)
                     is_same = status.st_mtime_ns // 1_000_000 == file.modified_ms
                     if not is_same or status.st_size != file.size:
-                        self._copying[key] = (
-                            "It changed while it was copied. Remove it, pick it again."
-                        )
-                        return
+                        return "It changed while it was copied. Remove it, pick it again."
                     with self._hold(draft_id):
                         self._find(draft_id, file.id)
                         received = self._count_received(draft_id, file)
-                        piece = os.pread(source, PIECE_BYTES, received)
-                        if received < file.size and piece:
-                            self._write_piece(draft_id, file, piece)
-                    if received + len(piece) >= file.size or not piece:
-                        return
+                        if received == file.size:
+                            return ""
+                        self._write_piece(draft_id, file, os.pread(source, PIECE_BYTES, received))
         except InputError as error:
-            self._copying[key] = str(error)
+            return str(error)
         except OSError as error:
-            self._copying[key] = error.strerror or str(error)
+            return error.strerror or str(error)
 
-    def _problems(self, draft: Draft, files: list[dict[str, Any]]) -> list[dict[str, str]]:
-        """Return what is wrong or missing, each with its place in match.yaml or a file's name."""
-        found = [
-            _describe(error) for error in list_problems(MatchSpec, draft.content, "match.yaml")
-        ]
-        cameras = draft.content.get("cameras")
-        used = {
-            str(camera.get(key))
-            for camera in (cameras if isinstance(cameras, list) else [])
-            if isinstance(camera, dict)
-            for key in ("video", "still")
-        }
-        for file in files:
-            title, state = str(file["title"]), file["state"]
-            share = f"{100 * file['received'] // file['size']} % of it are there"
-            said = {
-                "uploading": f"{title}: {share}",
-                "copying": f"{title}: {share}",
-                "reading": f"{title} is being read",
-                "broken": f"{title}: {file['problem']}",
-            }.get(state)
-            if said is None and _is_footage(title) and file["name"] not in used:
-                said = f"{title} belongs to no camera: choose it at its camera, or remove it"
-            if said is not None:
-                found.append({"place": f"file {file['id']}", "message": said})
-        return found or self._folder_problems(draft)
-
-    def _folder_problems(self, draft: Draft) -> list[dict[str, str]]:
-        """Return the errors that ingest finds in the match folder."""
+    def _folder_problems(self, draft: Draft) -> list[Problem]:
+        """Write match.yaml, and return the errors that ingest finds in the match folder."""
         folder = self._folder(draft.id) / "match"
         with whole_file(folder / "match.yaml") as file:
             file.write_text(
@@ -499,54 +464,17 @@ class Drafts:
             )
         spec = validate_record(MatchSpec, draft.content, "match.yaml")
         is_taken = spec.match_id in self.store.matches()
-        if is_taken or any((self.inbox / at / spec.match_id).exists() for at in (".", *_QUEUES)):
+        places = (self.inbox / at / spec.match_id for at in (".", "urgent", "background"))
+        if is_taken or any(place.exists() for place in places):
             message = "expected an id of its own, found that of another match. Choose another one."
             return [{"place": "match_id", "message": message}]
         try:
             match = read_match(folder)
         except InputError as error:
-            return [_describe(error, folder)]
-        return list(self._footage_problems(draft, match))
-
-    def _footage_problems(self, draft: Draft, match: MatchFolder) -> Iterator[dict[str, str]]:
-        by_name = {file.name: file for file in draft.files}
-        owners = {clip.id: clip.broadcast for clip in match.spec.clips}
-        numbers = {camera.id: number for number, camera in enumerate(match.spec.cameras)}
-        for unit, path in match.videos.items():
-            file = by_name[path.relative_to(match.folder).as_posix()]
-            index = self._indexes.get(f"{draft.id} {file.id}")
-            assert isinstance(index, FrameIndex)  # all files are whole and read
-            try:
-                require_footage(match.spec, unit, path, index)
-            except InputError as error:
-                number = numbers[owners.get(unit) or unit]
-                yield {**_describe(error, match.folder), "place": f"cameras[{number}].video"}
-        for camera, path in match.stills.items():
-            size = (match.spec.camera(camera).width, match.spec.camera(camera).height)
-            file = by_name[path.relative_to(match.folder).as_posix()]
-            if self._indexes.get(f"{draft.id} {file.id}") == size:
-                continue
-            try:
-                read_still(path, size)
-            except InputError as error:
-                place = f"cameras[{numbers[camera]}].still"
-                yield {**_describe(error, match.folder), "place": place}
-
-
-_QUEUES: Final = ("urgent", "background")
-
-
-def _describe(error: InputError, folder: Path | None = None) -> dict[str, str]:
-    """Return an error's place in match.yaml, and its message without paths of this machine."""
-    where, todo = error.where, in_browser(error.todo)
-    message = f"expected {error.expected}, found {error.found}. {todo}"
-    if folder is not None:
-        where = where.replace(f"{folder}/", "").replace(str(folder), "the match")
-        message = message.replace(f"{folder}/", "")
-    file, _, place = where.partition(": ")
-    if file != "match.yaml":
-        return {"place": "", "message": f"{where}: {message}"}
-    return {"place": place, "message": message}
+            return [describe(error, folder)]
+        footage = (file for file in draft.files if is_footage(file.name))
+        indexes = {file.name: self._index(draft.id, file) for file in footage}
+        return list(footage_problems(match, indexes))
 
 
 def _choose_name(title: str, taken: set[str]) -> str:
@@ -562,11 +490,6 @@ def _choose_name(title: str, taken: set[str]) -> str:
     return next(name for name in names if name not in taken)
 
 
-def _is_footage(name: str) -> bool:
-    """Return whether a file is a video or a still, which belongs to a camera."""
-    return is_video(name) or PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
-
-
 def _still_size(path: Path) -> tuple[int, int]:
     """Return width and height [px] of a still.
 
@@ -576,11 +499,6 @@ def _still_size(path: Path) -> tuple[int, int]:
     size = declared_size(np.fromfile(path, dtype=np.uint8, count=HEADER_BYTES)) or (0, 0)
     read_still(path, size)
     return size
-
-
-def _shorten(text: str) -> str:
-    """Return a message without the path of the file that it names."""
-    return re.sub(r"'?/[^ ']*/", "", text)
 
 
 def _refusal(where: str, expected: str, found: str, todo: str) -> InputError:

@@ -1,12 +1,10 @@
-"""Evidence for a review request: images and tables of the result."""
+"""Evidence for a review request: images and tables of the result, and its outliers."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any, Final
 
@@ -15,20 +13,23 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import FileResponse, Response
 from numpy.typing import NDArray
 
-from data_contracts.review import ReviewRequest
+from data_contracts.conventions import COCO17
+from data_contracts.review import DeletedDetection, MovedKeypoint, MovedPoint, ReviewRequest
 from flows.reports.broadcast import broadcast_pictures, broadcast_tables
 from flows.reports.cameras import camera_evidence, proposal_evidence
-from flows.reports.clip_video import clip_view, write_clip_video
+from flows.reports.clip_video import clip_view
 from flows.reports.clips import clip_pictures, detection_pictures
 from flows.reports.people import adjustment_tables, body_tables
-from flows.results.best_results import placed_joints, static_cameras
+from flows.results.best_results import ADJUSTED, placed_joints, static_cameras
 from flows.stage import Match
+from flows.stages.detection import seen_by
 from flows.web.app_context import PageContext
+from flows.web.results import DrawnFiles
 from worldpose.formats.joints_file import JointTracks
 from worldpose.reports.clips import plot_paths
 from worldpose.reports.html_page import CaptionedImage, Table
+from worldpose.review.clicks import current_value
 from worldpose.review.evidence import Curve, clip_curves
-from worldpose.review.journal import requests_by_id
 from worldpose.store.store import Run, Store, open_run
 
 CACHED_REVIEWS: Final = 16
@@ -56,14 +57,10 @@ def routes(context: PageContext) -> APIRouter:
     """Create the routes of the evidence for one review request."""
     router = APIRouter(prefix="/api/matches/{match_id}/reviews/{request}")
     drawn: dict[tuple[str, str], Evidence] = {}
-    lock, filming = Lock(), Lock()
-    videos = TemporaryDirectory(prefix="worldpose-pages-")
+    lock, videos = Lock(), DrawnFiles()
 
     def evidence_of(match_id: str, request: str) -> Evidence:
-        match = context.match(match_id)
-        asked = requests_by_id(match.journal.questions).get(request)
-        if asked is None:
-            raise HTTPException(404, "no such review")
+        match, asked = context.review(match_id, request)
         with lock:  # one at a time: drawing needs memory for all images
             if (match_id, request) not in drawn:
                 while len(drawn) >= CACHED_REVIEWS:
@@ -99,19 +96,12 @@ def routes(context: PageContext) -> APIRouter:
     def video(match_id: str, request: str) -> FileResponse:
         if evidence_of(match_id, request).video is None:
             raise HTTPException(404, "no camera of this clip has a video")
-        match = context.match(match_id)
-        asked = requests_by_id(match.journal.questions)[request]
-        name = hashlib.sha256(f"{match_id} {request}".encode()).hexdigest()
-        file = Path(videos.name) / f"{name}.mp4"
-        with filming:
-            if not file.is_file():
-                run = open_run(context.store.url, match_id, asked.run_id)
-                (unit,) = asked.keys
-                draft = file.with_suffix(".draft.mp4")
-                write_clip_video(context.store, run, match, unit.partition("/")[2], draft)
-                draft.replace(file)
-        return FileResponse(file, media_type="video/mp4")
+        match, asked = context.review(match_id, request)
+        run = open_run(context.store.url, match_id, asked.run_id)
+        (unit,) = asked.keys
+        return videos.clip_video(context.store, run, match, unit.partition("/")[2])
 
+    _add_outliers(router, context)
     return router
 
 
@@ -121,9 +111,12 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 def draw_evidence(store: Store, match: Match, request: ReviewRequest) -> Evidence:
     """Draw the evidence for a review request, from the run that created it."""
+    draw = _DRAWN.get(request.gate)
+    if draw is None:
+        return Evidence()
     run = open_run(store.url, match.match_id, request.run_id)
     (unit,) = request.keys
-    return _DRAWN.get(request.gate, _no_evidence)(store, run, match, unit.partition("/")[2])
+    return draw(store, run, match, unit.partition("/")[2])
 
 
 def _camera(store: Store, run: Run, match: Match, camera: str) -> Evidence:
@@ -236,10 +229,6 @@ def _broadcast(store: Store, run: Run, match: Match, clip: str) -> Evidence:
     return Evidence(tuple(broadcast_pictures(run, match)), tuple(broadcast_tables(run, match)))
 
 
-def _no_evidence(store: Store, run: Run, match: Match, unit: str) -> Evidence:
-    return Evidence()
-
-
 _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "static_calibration": _camera,
     "camera_consistency": _consistency,
@@ -249,3 +238,78 @@ _DRAWN: Final[dict[str, Callable[[Store, Run, Match, str], Evidence]]] = {
     "body_fitting": _acceptance,
     "broadcast_calibration": _broadcast,
 }
+
+
+MAX_LISTED: Final = 60
+"""Maximum number of listed keypoints, by largest Mahalanobis distance."""
+Outlier = tuple[float, str, MovedPoint | MovedKeypoint | DeletedDetection, bool]
+"""Mahalanobis distance [standard deviations], subject, edit that removes it, and whether it is
+already removed."""
+
+
+def _add_outliers(router: APIRouter, context: PageContext) -> None:
+    """Add the route of the adjustment's outliers, each with the edit that removes it (B3)."""
+
+    @router.get("/outliers")
+    def outliers(match_id: str, request: str) -> list[dict[str, Any]]:
+        match, asked = context.review(match_id, request)
+        run = open_run(context.store.url, match_id, asked.run_id)
+        if ADJUSTED not in asked.keys or ADJUSTED not in run:
+            return []
+        return [
+            {
+                "surprise": round(surprise, 1) if math.isfinite(surprise) else None,
+                "of": of,
+                "edit": edit.model_dump(mode="json"),
+                "out": out,
+            }
+            for surprise, of, edit, out in (*_clicks(run, match), *_keypoints(run, match))
+        ]
+
+
+def _clicks(run: Run, match: Match) -> Iterator[Outlier]:
+    """Yield clicked points proposed for removal."""
+    result = run[ADJUSTED]
+    names = [str(name) for name in result["camera"].values]
+    for k in np.flatnonzero(result["click_wrong"].values):
+        camera = names[int(result["click_camera"].values[k])]
+        marking = str(result["click"].values[k])
+        edit = MovedPoint(camera=camera, marking=marking, xy=None)
+        was = current_value(match.folder, edit)
+        surprise = float(result["click_surprise"].values[k])
+        yield surprise, "click", edit.model_copy(update={"was": was}), was is None
+
+
+def _keypoints(run: Run, match: Match) -> Iterator[Outlier]:
+    """Yield keypoints, and people in one image, that are outliers to the other cameras."""
+    result = run[ADJUSTED]
+    names = [str(name) for name in result["camera"].values]
+    said = {_place(correction.edit) for correction in match.corrections}
+    for k in range(min(MAX_LISTED, result.sizes["outlier"])):
+        frame, c, person, joint = (
+            int(result[f"outlier_{name}"].values[k])
+            for name in ("frame", "camera", "person", "joint")
+        )
+        clip = match.folder.spec.clips_with(frame)[0].id
+        tracks = run[f"tracking/{clip}"].sel(frame=frame, person=person)
+        detection = int(tracks["detection_index"].values[c])
+        seen = run[seen_by(match, names[c], clip)]
+        # The next iteration repeats redetection: these people need no correction.
+        if not 0 <= detection < seen.sizes["detection"]:
+            continue
+        place = {"camera": names[c], "frame": frame, "detection": detection}
+        edit: MovedKeypoint | DeletedDetection
+        if joint < 0:
+            edit = DeletedDetection(**place)
+        else:
+            pixel = seen["keypoints"].sel(frame=frame).values[detection, joint]
+            x, y = (float(value) for value in pixel)
+            edit = MovedKeypoint(**place, joint=COCO17[joint], was=(x, y), xy=None)
+        surprise = float(result["outlier_surprise"].values[k])
+        yield surprise, f"person {person}", edit, _place(edit) in said
+
+
+def _place(edit: object) -> tuple[object, ...]:
+    """Return the target of a detection edit."""
+    names = ("kind", "camera", "frame", "detection", "joint")
+    return tuple(getattr(edit, name, None) for name in names)

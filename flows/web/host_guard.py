@@ -32,10 +32,7 @@ def host_name(host: str) -> str:
 def refuse_foreign(scope: Scope, headers: Headers, names: Iterable[str]) -> Response | None:
     """Refuse a request that names another server or comes from another site's page.
 
-    Args:
-        scope: ASGI scope of an HTTP request or a WebSocket.
-        headers: its headers.
-        names: lower-case names under which this server is known.
+    The scope is that of an HTTP request or a WebSocket; this server has lower-case names.
 
     Returns:
         421 for another name in Host, 403 for a foreign Origin or Sec-Fetch-Site; None if the

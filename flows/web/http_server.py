@@ -81,17 +81,12 @@ class Connections:
             if len(self._open) > self.limit:
                 self._close(next(waiting, address))
 
-    def wait(self, address: object, seconds: float) -> None:
-        """Start a deadline for the client of a connection [s]."""
+    def expect(self, address: object, seconds: float | None) -> None:
+        """Start a deadline for the client of a connection [s]; None while the server computes."""
         with self._lock:
             if address in self._open:
-                self._open[address].deadline = time.monotonic() + seconds
-
-    def work(self, address: object) -> None:
-        """Remove the deadline while the server computes a response."""
-        with self._lock:
-            if address in self._open:
-                self._open[address].deadline = None
+                deadline = None if seconds is None else time.monotonic() + seconds
+                self._open[address].deadline = deadline
 
     def sweep(self) -> None:
         """Close the connections whose deadline has passed; called every second."""
@@ -152,7 +147,7 @@ class _Protocol(H11Protocol):
         """Pass the connection on without a deadline: a WebSocket can be silent for any time."""
         super().handle_websocket_upgrade(event)
         self._is_upgraded = True
-        self.connections_open.work(self._address)
+        self.connections_open.expect(self._address, None)
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -161,7 +156,7 @@ class _Protocol(H11Protocol):
     def pause_writing(self) -> None:
         super().pause_writing()
         self._phase = None
-        self.connections_open.wait(self._address, ANSWER_SECONDS)
+        self.connections_open.expect(self._address, ANSWER_SECONDS)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -177,10 +172,7 @@ class _Protocol(H11Protocol):
         phase = (cycle, is_answering, is_working)
         if phase != self._phase:
             self._phase = phase
-            if is_working:
-                self.connections_open.work(self._address)
-            else:
-                self.connections_open.wait(self._address, REQUEST_SECONDS)
+            self.connections_open.expect(self._address, None if is_working else REQUEST_SECONDS)
 
 
 class _Server(uvicorn.Server):
@@ -214,14 +206,9 @@ def serve_http(
 ) -> None:
     """Serve an ASGI application until this process receives a signal to end.
 
-    Args:
-        app: the application.
-        host: name or address to listen at.
-        port: port; 0 = any free one.
-        max_connections: open connections, limited to a quarter of the files that this process can
-            open.
-        announce: called when the port is ours, and before it is served.
-        options: further options of `uvicorn.Config`.
+    Port 0 is any free one; `announce` is called when it is ours, and before it is served. Open
+    connections are also limited to a quarter of the files that this process can open; options are
+    further ones of `uvicorn.Config`.
 
     Raises:
         InputError: the port is taken, or the host is not an address of this machine.
@@ -260,10 +247,7 @@ def _listeners(host: str, port: int, connections: Connections) -> list[_Listener
 
 
 def require_free_ports(wanted: Mapping[str, tuple[str, int]]) -> None:
-    """Raise an error unless a process can listen at all ports at once.
-
-    Args:
-        wanted: option to the host and the port that it names; port 0 = any free one.
+    """Raise an error unless a process can listen at all ports, by the option that names them.
 
     Raises:
         InputError: a port is taken or wanted twice, or a host is not an address of this machine.
@@ -294,9 +278,8 @@ def _listen(opened: ExitStack, host: str, port: int) -> list[_Listener]:
 
 def _port_error(option: str, host: str, port: int, error: OSError) -> InputError:
     """Return the error about a port that cannot be listened at, with the next free one."""
-    is_taken = error.errno == errno.EADDRINUSE
     free = next((each for each in range(port + 1, 65536) if _is_free(host, each)), None)
-    if not is_taken or free is None:
+    if error.errno != errno.EADDRINUSE or free is None:
         return InputError(
             f"{option} {port}",
             expected=f"an address of this machine and a port that this user may open at {host}",

@@ -9,11 +9,13 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from flows.reports.match_pictures import frame_picture
 from flows.review.detections import detections_now
 from flows.review.identities import identities_now
 from flows.stage import Match
 from flows.web.app_context import PageContext
+from flows.web.images import image_response
 from worldpose.review.identities import Identities, find_sighting
 from worldpose.store.store import Store, open_run
 
@@ -71,7 +73,7 @@ def routes(context: PageContext) -> APIRouter:
         match, found = open_identities(match_id, clip)
         if person not in found.person or frame not in found.frame:
             raise HTTPException(404, "the person is not present")
-        return Response(_crop(context.store, match, found, person, frame), media_type="image/png")
+        return image_response(_crop(context.store, match, found, person, frame), "png")
 
     return router
 
@@ -122,8 +124,8 @@ def _ways(found: Identities, tracked: xr.Dataset) -> NDArray[np.float64]:
     return ways
 
 
-def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> bytes:
-    """Return a PNG of one person from the view with the largest image of the person.
+def _crop(store: Store, match: Match, found: Identities, person: int, frame: int) -> Image:
+    """Return one person from the view with the largest image of the person.
 
     Raises:
         HTTPException: 404, no camera with a video shows the person.
@@ -152,4 +154,4 @@ def _crop(store: Store, match: Match, found: Identities, person: int, frame: int
     if not piece.size:
         raise HTTPException(404, "the person is out of the picture")
     sized = cv2.resize(piece, None, fx=200 / (2 * half), fy=200 / (2 * half))
-    return bytes(cv2.imencode(".png", cv2.cvtColor(sized, cv2.COLOR_RGB2BGR))[1])
+    return np.asarray(sized, dtype=np.uint8)

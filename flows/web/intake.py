@@ -9,7 +9,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Annotated, Any, Final
 
-import cv2
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import JSONResponse, Response
 from pydantic import Field, JsonValue
@@ -22,6 +21,7 @@ from flows.service.layout import served_state
 from flows.web.app_context import PageContext, Person
 from flows.web.browser_words import in_browser
 from flows.web.drafts import DraftFile, Drafts
+from flows.web.images import image_response
 from flows.web.video_folders import list_videos, open_video
 
 CHUNK_BYTES: Final = 1 << 23
@@ -80,12 +80,7 @@ class Finish(Record):
 
 
 def routes(context: PageContext, intake: Intake | None) -> APIRouter:
-    """Create the routes of arrivals and of matches being created.
-
-    Args:
-        context: shared context of all pages.
-        intake: inbox and folders; None: this server creates no matches.
-    """
+    """Create the routes of arrivals and of matches being created; without intake, of arrivals."""
     router = APIRouter()
 
     @router.get("/api/inbox")
@@ -116,10 +111,8 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
         return {
             "drafts": [
                 {
-                    "id": draft.id,
+                    **draft.model_dump(include={"id", "who", "created_at"}),
                     "match_id": draft.content.get("match_id"),
-                    "who": draft.who,
-                    "created_at": draft.created_at,
                     "files": len(draft.files),
                 }
                 for draft in drafts.all()
@@ -144,11 +137,25 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
             raise HTTPException(409, "another page saved this form first: load it again")
         return drafts.view(draft)
 
+    @router.post("/{draft}/removal")
+    def discard(draft: str) -> dict[str, Any]:
+        drafts.discard(draft)
+        return {"discarded": draft}
+
+    @router.post("/{draft}/finish")
+    def finish(draft: str, given: Finish) -> dict[str, Any]:
+        return {"arrived": drafts.finish(draft, given.priority)}
+
+    _add_files(router, drafts, intake)
+    return router
+
+
+def _add_files(router: APIRouter, drafts: Drafts, intake: Intake) -> None:
+    """Add the routes of the files of a draft."""
+
     @router.post("/{draft}/files")
     def begin_upload(draft: str, given: NewUpload) -> dict[str, Any]:
-        file = DraftFile(
-            id="new", name="", title=given.name, size=given.size, modified_ms=given.modified_ms
-        )
+        file = DraftFile(title=given.name, size=given.size, modified_ms=given.modified_ms)
         return {"file": drafts.add(draft, file).id}
 
     @router.post("/{draft}/picks")
@@ -156,8 +163,6 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
         with open_video(intake.folders, given.folder, given.path) as video:
             status = os.fstat(video)
         file = DraftFile(
-            id="new",
-            name="",
             title=given.path.rpartition("/")[2],
             size=status.st_size,
             modified_ms=max(0, status.st_mtime_ns // 1_000_000),
@@ -182,22 +187,9 @@ def _draft_routes(drafts: Drafts, intake: Intake) -> APIRouter:
 
     @router.get("/{draft}/files/{file}/frames/{number}")
     def frame(draft: str, file: str, number: int) -> Response:
-        image = drafts.frame(draft, file, number, FRAME_PX)
-        content = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-        return Response(bytes(content), media_type="image/jpeg")
+        return image_response(drafts.frame(draft, file, number, FRAME_PX), "jpeg")
 
     @router.post("/{draft}/files/{file}/removal")
     def remove(draft: str, file: str) -> dict[str, Any]:
         drafts.remove(draft, file)
         return drafts.view(draft)
-
-    @router.post("/{draft}/removal")
-    def discard(draft: str) -> dict[str, Any]:
-        drafts.discard(draft)
-        return {"discarded": draft}
-
-    @router.post("/{draft}/finish")
-    def finish(draft: str, given: Finish) -> dict[str, Any]:
-        return {"arrived": drafts.finish(draft, given.priority)}
-
-    return router

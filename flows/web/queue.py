@@ -23,6 +23,7 @@ from flows.run_status import list_unit_states
 from flows.stage import Match
 from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
+from flows.web.calibration import key_frames
 from flows.web.corrections import count_corrections, describe_groups
 from worldpose.errors import WorldposeError
 from worldpose.review.journal import read_journal
@@ -121,14 +122,17 @@ class _Glances:
         if stamp is not None and not is_old and self._known[name][0] == stamp:
             return
         self._opened[name] = time.monotonic()
-        glance = _at_a_glance(self.context, name)
-        if glance["problem"] is None:
-            registration = self.context.store.registration(name)
-            assert registration is not None  # the match was opened
-            self._folders[name] = Path(registration.folder)
+        try:
+            match = self.context.match(name)
+            glance = _glance(self.context, match)
+        except (OSError, WorldposeError) as error:
+            glance = {"match": name, "problem": describe_error(error), "waiting": [], "run": None}
+            stamp = None
+        else:
+            self._folders[name] = match.folder.folder
+            stamp = stamp or self._stamp(name)
         glance["elsewhere"] = _elsewhere(self.context.store, name)
-        has_problem = glance["problem"] is not None
-        self._known[name] = (None if has_problem else stamp or self._stamp(name), glance)
+        self._known[name] = (stamp, glance)
 
     def _stamp(self, name: str) -> Hashable:
         """Return what a summary depends on; None if it must be read again."""
@@ -161,14 +165,6 @@ def describe_review(review: Review) -> dict[str, Any]:
     """Return one review request as JSON for the pages."""
     (unit,) = review.request.keys
     return {**review_json(review), "unit": unit, "excess": _excess(review.request)}
-
-
-def _at_a_glance(context: PageContext, name: str) -> dict[str, Any]:
-    """Return one match of the queue; a match that cannot be opened has its error instead."""
-    try:
-        return _glance(context, context.match(name))
-    except (OSError, WorldposeError) as error:
-        return {"match": name, "problem": describe_error(error), "waiting": [], "run": None}
 
 
 def _glance(context: PageContext, match: Match) -> dict[str, Any]:
@@ -209,7 +205,7 @@ def _glance(context: PageContext, match: Match) -> dict[str, Any]:
         "first_clicks": first_clicks,
         "stale": len(match.stale),
         **_units(store, match, latest),
-        "at_work": _at_work(store, context, match.match_id),
+        "at_work": _local_run(context, match.match_id) or _elsewhere(store, match.match_id),
     }
 
 
@@ -223,11 +219,6 @@ def _units(store: Store, match: Match, latest: RunRecord | None) -> dict[str, An
         return {"units": None, "units_problem": describe_error(error)}
     counts = {state.value: len(names) for state, names in found.items()}
     return {"units": counts, "units_problem": None}
-
-
-def _at_work(store: Store, context: PageContext, match_id: str) -> dict[str, Any] | None:
-    """Return the run of the service or of a page, or else one elsewhere that has not ended."""
-    return _local_run(context, match_id) or _elsewhere(store, match_id)
 
 
 def _local_run(context: PageContext, match_id: str) -> dict[str, Any] | None:
@@ -247,7 +238,6 @@ def _elsewhere(store: Store, match_id: str) -> dict[str, Any] | None:
 
 def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     """Return a clip with its broadcast key frames: the clicked ones, and those to click next."""
-    picked = match.folder.key_frames.get(clip)
     latest = latest_run(context.store, match.match_id)
     key = None if latest is None else latest.results.get(f"broadcast_calibration/{clip}")
     pick_next = []
@@ -257,16 +247,14 @@ def _clip(context: PageContext, match: Match, clip: str) -> dict[str, Any]:
     return {
         "id": clip,
         "has_video": clip in match.folder.videos,
-        "key_frames": [] if picked is None else [each.frame for each in picked.key_frames],
+        "key_frames": key_frames(match, clip),
         "pick_next": pick_next,
         "has_tracks": latest is not None and f"tracking/{clip}" in latest.results,
     }
 
 
 def _excess(request: ReviewRequest) -> float:
-    gates = {gate.stage: gate for gate in GATES}
-    gate = gates.get(request.gate)
-    return 0.0 if gate is None else gate.excess(request.figures)
+    return next((g.excess(request.figures) for g in GATES if g.stage == request.gate), 0.0)
 
 
 def _clicks(match: Match, camera: str) -> int:

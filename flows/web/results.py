@@ -36,13 +36,13 @@ from flows.web.app_context import PageContext
 from flows.web.browser_words import describe_error, in_browser
 from worldpose.errors import WorldposeError
 from worldpose.formats.viewer_file import ViewerClip, encode_frames, encode_scene
-from worldpose.store.store import Run
+from worldpose.store.store import Run, Store
 
 BINARY: Final = "application/octet-stream"
 POSITION_FORMATS: Final = ("positions", "minimap", "csv", "parquet", "viewer")
 """Export formats that hold people without joints, whom only their feet place on the pitch."""
 CACHED_FILES: Final = 12
-"""Files that the server keeps; the oldest is removed for a new one."""
+"""Files that are kept; the oldest is removed for a new one."""
 REPORT_POLICY: Final = (
     "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'none'"
@@ -50,14 +50,14 @@ REPORT_POLICY: Final = (
 """The report carries its own scripts: the browser gives it no session and no requests."""
 
 
-class _Files:
+class DrawnFiles:
     """Files that were drawn on request, each once per run."""
 
     def __init__(self) -> None:
-        self._folder = TemporaryDirectory(prefix="worldpose-results-")
+        self._folder = TemporaryDirectory(prefix="worldpose-pages-")
         self._lock = Lock()  # one at a time: drawing needs memory for all images
 
-    def get(self, run: Run, name: str, draw: Callable[[Path], None]) -> Path:
+    def get(self, run: Run, name: str, draw: Callable[[Path], object]) -> Path:
         """Return the file `name` of a run, drawn by `draw` if it is not there."""
         record = run.record
         unique = hashlib.sha256(f"{record.match_id} {record.run_id} {name}".encode()).hexdigest()
@@ -72,6 +72,13 @@ class _Files:
                     draw(made)
                     shutil.move(made, file)
         return file
+
+    def clip_video(self, store: Store, run: Run, match: Match, clip: str) -> FileResponse:
+        """Return the response with the overlay video of a clip."""
+        file = self.get(
+            run, f"{clip}.mp4", lambda file: write_clip_video(store, run, match, clip, file)
+        )
+        return FileResponse(file, media_type="video/mp4")
 
 
 class _Clips:
@@ -91,11 +98,6 @@ class _Clips:
                 self._clip = viewer_clip(origin, clip, match.folder.pitch, video)
                 self._key = key
             return self._clip
-
-
-def _require_clip(run: Run, clip: str) -> None:
-    if clip not in clips_of(run.record):
-        raise HTTPException(404, "the run has no such clip")
 
 
 def _player_names(match: Match, run: Run) -> dict[str, str]:
@@ -124,64 +126,29 @@ def why_without_joints(run: Run, clip: str) -> str | None:
 def routes(context: PageContext) -> APIRouter:
     """Create the routes of the results of a match's latest run that has people."""
     router = APIRouter(prefix="/api/matches/{match_id}/results")
-    files, shown = _Files(), _Clips()
+    files, shown = DrawnFiles(), _Clips()
 
     def open_latest(match_id: str) -> tuple[Match, Run]:
         match = context.match(match_id)
         return match, open_results(context.store, match_id)
 
+    def open_clip(match_id: str, clip: str) -> ViewerClip:
+        match, run = open_latest(match_id)
+        if clip not in clips_of(run.record):
+            raise HTTPException(404, "the run has no such clip")
+        return shown.get(run, match, clip)
+
     @router.get("")
     def results(match_id: str) -> dict[str, Any]:
-        match, run = open_latest(match_id)
-        record = run.record
-        clips = find_clips(record)
-        lacking = {clip: why_without_joints(run, clip) for clip in clips}
-        is_3d = not clips or None in lacking.values()
-        formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
-        return {
-            "run": record.run_id,
-            "state": record.state,
-            "later": describe_later_run(context.store, record),
-            "formats": list(formats),
-            "purposes": EXPORT_PURPOSES,
-            "clips": [
-                {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
-                for clip in clips
-            ],
-        }
+        return _describe_results(context, *open_latest(match_id))
 
     @router.get("/metrics")
     def metrics(match_id: str) -> dict[str, Any]:
-        match, run = open_latest(match_id)
-        record, parent = run.record, run.record.parent
-        changes, problem = [], ""
-        if parent is not None:
-            try:
-                before = context.store.run(match_id, parent)
-                changes = compare_runs(context.store, before, record)
-            except WorldposeError as error:  # its results may be garbage collected
-                problem = f"Run {parent} cannot be compared: {describe_error(error)}"
-        return {
-            "metrics": [
-                {
-                    "kind": each.kind,
-                    "name": each.name,
-                    "values": {one.figure: one.after for one in each.figures},
-                }
-                for each in compare_runs(context.store, record, record)
-            ],
-            "names": _player_names(match, run),
-            "before": parent,
-            "problem": problem,
-            "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
-            "unchanged": sum(each.mark == "unchanged" for each in changes),
-        }
+        return _describe_metrics(context, *open_latest(match_id))
 
     @router.get("/scenes/{clip}")
     def scene(match_id: str, clip: str) -> Response:
-        match, run = open_latest(match_id)
-        _require_clip(run, clip)
-        return Response(encode_scene(shown.get(run, match, clip)), media_type=BINARY)
+        return Response(encode_scene(open_clip(match_id, clip)), media_type=BINARY)
 
     @router.get("/scenes/{clip}/frames")
     def frames(
@@ -190,9 +157,7 @@ def routes(context: PageContext) -> APIRouter:
         first: Annotated[int, Query(ge=0)],
         count: Annotated[int, Query(ge=1, le=10_000)],
     ) -> Response:
-        match, run = open_latest(match_id)
-        _require_clip(run, clip)
-        return Response(encode_frames(shown.get(run, match, clip), first, count), media_type=BINARY)
+        return Response(encode_frames(open_clip(match_id, clip), first, count), media_type=BINARY)
 
     @router.get("/report")
     def report(match_id: str) -> FileResponse:
@@ -213,11 +178,7 @@ def routes(context: PageContext) -> APIRouter:
         match, run = open_latest(match_id)
         if clip not in clips_of(run.record) or clip_view(run, match, clip) is None:
             raise HTTPException(404, "no camera of such a clip has a video")
-
-        def draw(file: Path) -> None:
-            write_clip_video(context.store, run, match, clip, file)
-
-        return FileResponse(files.get(run, f"{clip}.mp4", draw), media_type="video/mp4")
+        return files.clip_video(context.store, run, match, clip)
 
     @router.get("/exports/{form}")
     def export_zip(match_id: str, form: str) -> FileResponse:
@@ -237,3 +198,50 @@ def routes(context: PageContext) -> APIRouter:
         )
 
     return router
+
+
+def _describe_results(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
+    """Return clips and export formats of a run, and what came after it."""
+    record = run.record
+    clips = find_clips(record)
+    lacking = {clip: why_without_joints(run, clip) for clip in clips}
+    is_3d = not clips or None in lacking.values()
+    formats = (EXPORT_FORMATS if is_3d else POSITION_FORMATS) if clips else ()
+    return {
+        "run": record.run_id,
+        "state": record.state,
+        "later": describe_later_run(context.store, record),
+        "formats": list(formats),
+        "purposes": EXPORT_PURPOSES,
+        "clips": [
+            {"id": clip, "video": clip_view(run, match, clip), "without_joints": lacking[clip]}
+            for clip in clips
+        ],
+    }
+
+
+def _describe_metrics(context: PageContext, match: Match, run: Run) -> dict[str, Any]:
+    """Return the metrics of a run, and their changes since the run before it."""
+    record, parent = run.record, run.record.parent
+    changes, problem = [], ""
+    if parent is not None:
+        try:
+            before = context.store.run(match.match_id, parent)
+            changes = compare_runs(context.store, before, record)
+        except WorldposeError as error:  # its results may be garbage collected
+            problem = f"Run {parent} cannot be compared: {describe_error(error)}"
+    return {
+        "metrics": [
+            {
+                "kind": each.kind,
+                "name": each.name,
+                "values": {one.figure: one.after for one in each.figures},
+            }
+            for each in compare_runs(context.store, record, record)
+        ],
+        "names": _player_names(match, run),
+        "before": parent,
+        "problem": problem,
+        "changes": [asdict(each) for each in changes if each.mark != "unchanged"],
+        "unchanged": sum(each.mark == "unchanged" for each in changes),
+    }

@@ -22,10 +22,7 @@ MAX_ENTRIES: Final = 2000
 def list_videos(folders: Sequence[Path], number: int, path: str) -> dict[str, Any]:
     """Return the folders and videos inside a folder: names, and sizes of videos [byte].
 
-    Args:
-        folders: folders as the operator named them.
-        number: index of one of them.
-        path: path of a folder inside it, with forward slashes; empty for itself.
+    The path, with forward slashes, leads on from one of the folders that the operator named.
 
     Raises:
         InputError: there is no such folder, or the path is unsafe.

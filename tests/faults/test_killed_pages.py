@@ -96,7 +96,7 @@ def forgetful(keep):
 def serve_and_die(project, port, last, spoiled):
     from flows.web import calibration, decisions
     from flows.web.access import access_for
-    from flows.web.serving import serve
+    from flows.web.app import serve
 
     Disk(last, syncs=spoiled != "unsynced").install()
     if spoiled in ("early", "forgetful"):

@@ -10,6 +10,14 @@ def app(project_copy):
     return page_client.served(project_copy)
 
 
+@pytest.fixture(scope="session")
+def reader(tiny_run):
+    """A browser of a project that tests only read."""
+    import page_client
+
+    return page_client.log_in(page_client.served(tiny_run), "Ada")
+
+
 @pytest.fixture
 def stranger(app):
     import page_client

@@ -57,62 +57,60 @@ await saved();
 
 // The run, from its beginning; whatever it asks is approved until it is complete.
 await page.click(`nav a >> text=${task.match}`);
-if (task.run) {
-  // Whether the adjustment exceeds its limit depends on noise: here every result is asked about.
-  await page.route(/\/runs$/, (route) => route.continue({ postData: { ...route.request().postDataJSON(), gates: "always" } }));
-  await page.click("button >> text=Run it");
-  const end = Date.now() + 1000 * task.patience;
-  const now = async () => (await page.request.get(`${task.base}/api/matches/${match}`)).json();
-  const asked = (state) => state.waiting.map((each) => each.unit).join();
-  while (Date.now() < end) {
-    const state = await now();
-    const at = state.at_work?.state === "running" ? "running" : (state.run?.state ?? "not run");
-    if (seen.states.at(-1) !== at) seen.states.push(at);
-    if (at === "complete" || at === "failed" || at === "partial") break;
-    if (at === "waiting" && state.waiting.length) {
-      const approve = page.locator("button.first >> text=Approve").first();
-      await approve.waitFor({ timeout: 30000 });
-      if (seen.states.filter((each) => each === "waiting").length === 1) {
-        await page.waitForSelector("figure img, .evidence p", { timeout: 60000 });
-        await page.waitForLoadState("networkidle", { timeout: 5000 }).catch(() => {});
-        await shot("question");
-      }
-      // What contradicts the adjustment the most is taken out with one key.
-      if (!seen.out && state.waiting.some((each) => each.unit.startsWith("bundle_adjustment/"))) {
-        await page.waitForSelector("[data-outlier]", { timeout: 60000 });
-        await page.locator("body").press("x");
-        await page.waitForSelector('[data-outlier="0"] >> text=✕ removed', { timeout: 60000 });
-        seen.out = await page.locator('[data-outlier="0"] td').allTextContents();
-        await shot("outliers");
-        // The question needs no verdict now, and stays open for more corrections.
-        await page.locator("article.open button >> text=Continue the run").click();
-        while (Date.now() < end && (await now()).at_work?.state !== "running") await page.waitForTimeout(250);
-        continue;
-      }
-      await page.locator("body").press("a");
-      // Until it is taken: one more would answer the next question unseen.
-      while (Date.now() < end && asked(await now()) === asked(state)) {
-        await page.waitForTimeout(250);
-      }
+// Whether the adjustment exceeds its limit depends on noise: here every result is asked about.
+await page.route(/\/runs$/, (route) => route.continue({ postData: { ...route.request().postDataJSON(), gates: "always" } }));
+await page.click("button >> text=Run it");
+const end = Date.now() + 1000 * task.patience;
+const now = async () => (await page.request.get(`${task.base}/api/matches/${match}`)).json();
+const asked = (state) => state.waiting.map((each) => each.unit).join();
+while (Date.now() < end) {
+  const state = await now();
+  const at = state.at_work?.state === "running" ? "running" : (state.run?.state ?? "not run");
+  if (seen.states.at(-1) !== at) seen.states.push(at);
+  if (at === "complete" || at === "failed" || at === "partial") break;
+  if (at === "waiting" && state.waiting.length) {
+    const approve = page.locator("button.first >> text=Approve").first();
+    await approve.waitFor({ timeout: 30000 });
+    if (seen.states.filter((each) => each === "waiting").length === 1) {
+      await page.waitForSelector("figure img, .evidence p", { timeout: 60000 });
+      await page.waitForLoadState("networkidle", { timeout: 5000 }).catch(() => {});
+      await shot("question");
     }
-    await page.waitForTimeout(1500);
+    // What contradicts the adjustment the most is taken out with one key.
+    if (!seen.out && state.waiting.some((each) => each.unit.startsWith("bundle_adjustment/"))) {
+      await page.waitForSelector("[data-outlier]", { timeout: 60000 });
+      await page.locator("body").press("x");
+      await page.waitForSelector('[data-outlier="0"] >> text=✕ removed', { timeout: 60000 });
+      seen.out = await page.locator('[data-outlier="0"] td').allTextContents();
+      await shot("outliers");
+      // The question needs no verdict now, and stays open for more corrections.
+      await page.locator("article.open button >> text=Continue the run").click();
+      while (Date.now() < end && (await now()).at_work?.state !== "running") await page.waitForTimeout(250);
+      continue;
+    }
+    await page.locator("body").press("a");
+    // Until it is taken: one more would answer the next question unseen.
+    while (Date.now() < end && asked(await now()) === asked(state)) {
+      await page.waitForTimeout(250);
+    }
   }
-  await shot("complete");
-  // A keypoint is put elsewhere, taken out, and that is taken back.
-  await page.goto(`${task.base}/#/detections/${match}/${encodeURIComponent(task.camera)}`);
-  await page.waitForSelector("[data-keypoint]", { timeout: 60000 });
-  await page.keyboard.press("n");
-  const keypoint = page.locator("g.on [data-keypoint]").first();
-  const at = await keypoint.boundingBox();
-  seen.fixed = await keypoint.getAttribute("data-keypoint");
-  await page.mouse.move(at.x + at.width / 2, at.y + at.height / 2);
-  await page.mouse.down();
-  await page.mouse.move(at.x + 20, at.y + 12, { steps: 3 });
-  await page.mouse.up();
-  for (const [key, kept] of [[null, 1], ["Delete", 2], ["Control+z", 1]]) {
-    if (key) await page.keyboard.press(key);
-    await page.waitForSelector(`[data-kept="${kept}"]`, { timeout: 60000 });
-  }
-  await shot("detections");
+  await page.waitForTimeout(1500);
 }
+await shot("complete");
+// A keypoint is put elsewhere, taken out, and that is taken back.
+await page.goto(`${task.base}/#/detections/${match}/${encodeURIComponent(task.camera)}`);
+await page.waitForSelector("[data-keypoint]", { timeout: 60000 });
+await page.keyboard.press("n");
+const keypoint = page.locator("g.on [data-keypoint]").first();
+const at = await keypoint.boundingBox();
+seen.fixed = await keypoint.getAttribute("data-keypoint");
+await page.mouse.move(at.x + at.width / 2, at.y + at.height / 2);
+await page.mouse.down();
+await page.mouse.move(at.x + 20, at.y + 12, { steps: 3 });
+await page.mouse.up();
+for (const [key, kept] of [[null, 1], ["Delete", 2], ["Control+z", 1]]) {
+  if (key) await page.keyboard.press(key);
+  await page.waitForSelector(`[data-kept="${kept}"]`, { timeout: 60000 });
+}
+await shot("detections");
 await tell(seen);

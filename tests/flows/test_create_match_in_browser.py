@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 from flows.web.access import access_for
 from flows.web.intake import Intake
-from flows.web.serving import serve
+from flows.web.app import serve
 place, port, token = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 access = access_for("127.0.0.1", token=token, names=(), secure=False)
 intake = Intake(place / "inbox", (place / "videos",))

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.reports.disagreements import worst_views
+from flows.reports.clips import worst_views
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.simulation.scene import look_at

@@ -21,7 +21,6 @@ PAGES = Path(__file__).parents[2] / "infra" / "review_pages" / "src" / "words.js
             "held out certain excess: 0.03 m (knee, ankle), limit 0.01 m",
         ),
         ("residual_px could not be computed", "residual could not be computed"),
-        ("every result is asked about", "every result is asked about"),
         ("Ada rejected it: the_click is 1", "Ada rejected it: the_click is 1"),
         ("camera a is 3, at most wrong", "camera a is 3, at most wrong"),
     ],

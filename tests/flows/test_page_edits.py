@@ -69,14 +69,14 @@ def test_edits_are_kept_all_or_none(ada, project_copy):
     assert read_journal(Store.open(str(project_copy)), TINY).entries == ()
 
 
-def test_the_preview_is_a_camera_or_says_what_to_click(ada):
-    clicked = ada.get(f"{MATCH}/pictures/cam00").json()["points"]
+def test_the_preview_is_a_camera_or_says_what_to_click(reader):
+    clicked = reader.get(f"{MATCH}/pictures/cam00").json()["points"]
     few = dict(list(clicked.items())[:2])
     path = f"{MATCH}/pictures/cam00/preview"
-    advice = ada.post(path, json={"points": few}).json()
+    advice = reader.post(path, json={"points": few}).json()
     assert advice["camera"] is None
     assert advice["todo"]
-    found = ada.post(path, json={"points": clicked}).json()
+    found = reader.post(path, json={"points": clicked}).json()
     assert {each["name"] for each in found["residuals"]} == set(clicked)
     # Where the camera puts a click that it rests on is where it was clicked, less its residual.
     for each in found["residuals"]:

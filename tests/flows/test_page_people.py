@@ -54,14 +54,14 @@ def seen_by_two(project):
     return int(tracks["frame"].values[row]), int(tracks["person"].values[person]), seen
 
 
-def test_other_cameras_say_where_they_expect_a_keypoint(ada, project_copy):
-    frame, person, seen = seen_by_two(project_copy)
+def test_other_cameras_say_where_they_expect_a_keypoint(reader, tiny_run):
+    frame, person, seen = seen_by_two(tiny_run)
     camera, *others = seen
-    run = open_run(str(project_copy), TINY)
-    cameras = static_cameras(run, open_match(Store.open(str(project_copy)), TINY).folder.spec)
+    run = open_run(str(tiny_run), TINY)
+    cameras = static_cameras(run, open_match(Store.open(str(tiny_run)), TINY).folder.spec)
     where = {"frame": frame, "detection": seen[camera]}
     path = f"{MATCH}/detections/{camera}/views"
-    found = ada.get(path, params=where).json()
+    found = reader.get(path, params=where).json()
     assert found["person"] == person
     assert {each["camera"]: each["detection"] for each in found["views"]} == {
         name: seen[name] for name in others
@@ -74,7 +74,7 @@ def test_other_cameras_say_where_they_expect_a_keypoint(ada, project_copy):
     x, y = expected
     for place, least, most in (((x, y), 0.0, 8.0), ((x + 60.0, y + 45.0), 12.0, np.inf)):
         given = {**where, "joint": joint, "x": place[0], "y": place[1]}
-        answer = ada.get(path, params=given).json()
+        answer = reader.get(path, params=given).json()
         distances = []
         for each in answer["views"]:
             theirs = each["keypoints"][joint]
@@ -95,18 +95,18 @@ def test_other_cameras_say_where_they_expect_a_keypoint(ada, project_copy):
         assert (answer["here"]["error"][joint] > 5.0) == (least > 0)
 
 
-def test_of_a_person_whom_nobody_follows_the_other_cameras_show_only_the_ray(ada, project_copy):
-    frame, _, seen = seen_by_two(project_copy)
+def test_of_a_person_whom_nobody_follows_the_other_cameras_show_only_the_ray(reader, tiny_run):
+    frame, _, seen = seen_by_two(tiny_run)
     camera = next(iter(seen))
     nobody = {"frame": frame, "detection": 999}
     path = f"{MATCH}/detections/{camera}/views"
-    assert ada.get(path, params=nobody).json()["views"] == []
-    found = ada.get(path, params={**nobody, "joint": 0, "x": 960.0, "y": 600.0}).json()
+    assert reader.get(path, params=nobody).json()["views"] == []
+    found = reader.get(path, params={**nobody, "joint": 0, "x": 960.0, "y": 600.0}).json()
     assert found["person"] is None
     assert found["views"]
     assert all(each["curves"] and each["detection"] == -1 for each in found["views"])
-    assert ada.get(path, params={**nobody, "joint": 17}).json()["views"] == []
-    assert ada.get(f"{MATCH}/detections/nowhere/views", params=nobody).json()["views"] == []
+    assert reader.get(path, params={**nobody, "joint": 17}).json()["views"] == []
+    assert reader.get(f"{MATCH}/detections/nowhere/views", params=nobody).json()["views"] == []
 
 
 def test_an_added_person_is_in_all_that_follows(ada, bob, project_copy):

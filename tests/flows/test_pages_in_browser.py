@@ -24,11 +24,10 @@ SCRIPT = Path(__file__).with_name("pages_in_browser.mjs")
 
 
 @pytest.fixture
-def rendered(request, tmp_path):
+def rendered(tmp_path):
     """A match with stills: its folder, its id, a camera without a click, and its truth."""
     folder = tmp_path / "match"
-    seed = ("--seed", request.param)
-    succeed("simulate", "--scenario", "tiny", *seed, "--duration", 0.6, "--out", folder)
+    succeed("simulate", "--scenario", "tiny", "--seed", 5, "--duration", 0.6, "--out", folder)
     truth = {
         name: Camera.from_calibration(each)
         for name, each in read_calibration(folder / "reference" / "calibration.toml").items()
@@ -39,7 +38,7 @@ def rendered(request, tmp_path):
     seen = {name: len(in_picture(camera, pitch)) for name, camera in truth.items()}
     name = max(seen, key=seen.get)
     (folder / "annotations" / "static_calibration" / f"{name}.json").unlink()
-    return folder, f"tiny-{request.param}-0.6s", name, truth[name], pitch
+    return folder, "tiny-5-0.6s", name, truth[name], pitch
 
 
 def in_picture(camera, pitch, margin=15.0):
@@ -82,8 +81,8 @@ def ground_errors(found, truth, pitch):
     return np.linalg.norm(np.linalg.solve(slope, off[..., None])[..., 0], axis=1)
 
 
-def calibrate_in_browser(rendered, base, tmp_path, *, then_run):
-    """Return the browser's observations during up to 20 clicks and 10 drawn markings."""
+def calibrate_in_browser(rendered, base, tmp_path):
+    """Return the browser's observations during up to 20 clicks and 10 drawn markings, and a run."""
     _, match, camera, truth, pitch = rendered
     rng = np.random.default_rng(5)
     points = {
@@ -103,7 +102,6 @@ def calibrate_in_browser(rendered, base, tmp_path, *, then_run):
         "points": {name: place.tolist() for name, place in points.items()},
         "lines": {name: places.tolist() for name, places in lines.items()},
         "dragged": next(iter(points)),
-        "run": then_run,
         "patience": 840,
     }
     seen = drive(SCRIPT, task, tmp_path, 1000)
@@ -116,22 +114,15 @@ def calibrate_in_browser(rendered, base, tmp_path, *, then_run):
     print(json.dumps(figures))
     # On a machine of its own a preview takes a twentieth of a second; other tests may share it.
     assert figures["median preview [ms]"] < 1000.0
-    return seen, figures
+    return seen
 
 
-@pytest.mark.parametrize("rendered", [15], indirect=True)
-def test_the_pitch_follows_a_mark_with_twenty_points_and_ten_markings(rendered, served, tmp_path):
-    _, figures = calibrate_in_browser(rendered, served[0], tmp_path, then_run=False)
-    assert (figures["points"], figures["lines"]) == (20, 10)
-
-
-@pytest.mark.parametrize("rendered", [5], indirect=True)
 def test_a_camera_is_calibrated_from_nothing_and_the_run_goes_on_by_itself(
     rendered, served, tmp_path
 ):
     _, match, camera, truth, pitch = rendered
     base, project = served
-    seen, _ = calibrate_in_browser(rendered, base, tmp_path, then_run=True)
+    seen = calibrate_in_browser(rendered, base, tmp_path)
     assert seen["states"][-1] == "complete", seen["states"]
     assert "waiting" in seen["states"]
     # A planted wrong click, seen at the adjustment, was taken out: nothing contradicts it now.

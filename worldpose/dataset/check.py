@@ -9,12 +9,16 @@ import numpy as np
 
 from data_contracts.arrays import Floats
 from data_contracts.release import ClipFigures, Finding
-from worldpose.dataset.contents import PointSource, ShippedClip, View
+from worldpose.dataset.contents import (
+    PointSource,
+    ShippedClip,
+    convention,
+    sample_evenly,
+)
 from worldpose.dataset.faults import (
     SOUND,
     Agreement,
     CheckSettings,
-    Fault,
     agreement_findings,
     axis_orders,
     compare_view,
@@ -45,10 +49,7 @@ _AS_SHIPPED: Final = "the camera's x, y, z"
 def box_findings(boxes: Floats, skel_2d: Floats, clip: str) -> Iterator[Finding]:
     """Yield boxes without their skeletons, and whether another number order explains it.
 
-    Args:
-        boxes: (frames, persons, 4) boxes as in the file.
-        skel_2d: (frames, persons, points, 2) [px].
-        clip: its name.
+    Boxes are (frames, persons, 4) as in the file, skeletons (frames, persons, points, 2) [px].
     """
     shipped = _overlap(boxes, skel_2d)
     if shipped >= _OVERLAP:
@@ -87,14 +88,7 @@ def skeleton_findings(
 
     Every body is translated to minimize its 2D residual; the remaining residual indicates other
     axes. The residual does not depend on body size, so units are checked by thigh lengths.
-
-    Args:
-        skel_3d: (frames, persons, points, 3) points as in the file.
-        skel_2d: (frames, persons, points, 2) [px].
-        skeleton: names of the points.
-        rows: the clip's camera; a frame without a pose has K and k.
-        clip: its name.
-        settings: thresholds for an explanation.
+    Skeletons are (frames, persons, points, 3) as in the file, and their 2D [px].
     """
     where = (f"skel_3d of {clip}",)
     count = len(rows.intrinsics) if len(rows.intrinsics) > 1 else len(skel_3d)
@@ -102,20 +96,15 @@ def skeleton_findings(
     frame, person = np.nonzero(known)
     if not len(frame):
         return
-    picked = np.unique(np.linspace(0, len(frame) - 1, _BODIES).round().astype(np.int64))
+    picked = sample_evenly(len(frame), _BODIES)
     frame, person = frame[picked], person[picked]
     bodies, pixels = skel_3d[frame, person], skel_2d[frame, person]
     upper, lower = (skeleton.index(f"left_{name}") for name in BONES["thighs"])
     thigh = float(np.median(np.linalg.norm(bodies[:, upper] - bodies[:, lower], axis=-1)))
     for unit, size in (("millimetres", 1000.0), ("centimetres", 100.0)):
         if settings.bones_m[0] <= thigh / size <= settings.bones_m[1]:
-            yield Finding(
-                fault=unit,
-                kind="convention",
-                where=where,
-                says=f"skeletons are in {unit} and not in metres",
-                figures={"thigh": thigh},
-            )
+            says = f"skeletons are in {unit} and not in metres"
+            yield convention(unit, says, *where, thigh=thigh)
             bodies = bodies / size
     row = frame if len(rows.intrinsics) > 1 else np.zeros_like(frame)
     lens = rows.lens()[row]
@@ -136,13 +125,9 @@ def skeleton_findings(
     best = min(left, key=lambda name: left[name])
     shipped, least = left[_AS_SHIPPED], left[best]
     if shipped - least > settings.min_gain_px and least < settings.max_share_left * shipped:
-        yield Finding(
-            fault="skeleton_axes",
-            kind="convention",
-            where=where,
-            says=f"x, y, z of the skeletons are {best} and not the camera's",
-            figures={"shipped_median_px": min(shipped, 1e6), "explained_median_px": least},
-        )
+        says = f"x, y, z of the skeletons are {best} and not the camera's"
+        figures = {"shipped_median_px": min(shipped, 1e6), "explained_median_px": least}
+        yield convention("skeleton_axes", says, *where, **figures)
 
 
 def _overlap(boxes: Floats, skel_2d: Floats) -> float:
@@ -224,7 +209,9 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
         fault, before, after = world_fault(repaired, settings)
         shares.append(plausible_share(repaired, settings))
         if fault is not None and fault.points is not None:
-            findings.append(_world_finding(source, fault, before, after))
+            repair = {"shipped_plausible_share": before, "explained_plausible_share": after}
+            says = f"{fault.says}: so people stand on the pitch"
+            findings.append(convention(fault.name, says, source.name, **repair))
             points = fault.points(repaired)
             repaired = repaired if points is None else repaired.with_points(points)
         if repaired is source and source.name not in {one.source for one in agreements}:
@@ -237,7 +224,9 @@ def check_clip(clip: ShippedClip, settings: CheckSettings) -> tuple[ClipFigures,
             if reason is not None:
                 faults |= {place.removeprefix("cameras/"): reason for place in finding.where}
     for view in clip.views:
-        findings += camera_findings(_repair_view(view, faults.get(view.name, SOUND)), settings)
+        fault = faults.get(view.name, SOUND)
+        rows = view.rows if fault.camera is None else fault.camera(view.rows)
+        findings += camera_findings(view.name, rows, settings)
     seen = [one.median_px for one in agreements]
     worst = max(seen) if seen and max(seen) < float("inf") else None
     figures = ClipFigures(
@@ -277,22 +266,6 @@ def _repair_source(source: PointSource, agreements: Iterable[Agreement]) -> Poin
     fault = max(faults, key=faults.count)
     points = None if fault.points is None else fault.points(source)
     return source if points is None else source.with_points(points)
-
-
-def _repair_view(view: View, fault: Fault) -> View:
-    if fault.camera is None:
-        return view
-    return View(view.name, fault.camera(view.rows), view.pixels, view.skeleton)
-
-
-def _world_finding(source: PointSource, fault: Fault, before: float, after: float) -> Finding:
-    return Finding(
-        fault=fault.name,
-        kind="convention",
-        where=(source.name,),
-        says=f"{fault.says}: so people stand on the pitch",
-        figures={"shipped_plausible_share": before, "explained_plausible_share": after},
-    )
 
 
 def _merge_findings(findings: Iterable[Finding]) -> Iterator[Finding]:

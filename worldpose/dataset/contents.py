@@ -52,6 +52,10 @@ class PointSource:
         """Return the same source with other points."""
         return PointSource(self.name, self.skeleton, points)
 
+    def point(self, name: str) -> Floats:
+        """Return one point of all people (frames, persons, 3) [m], world."""
+        return self.points[:, :, self.skeleton.index(name)]
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -62,6 +66,27 @@ class View:
     pixels: Floats | None = None
     """(frames, persons, points, 2) [px]; None if the data set has no 2D."""
     skeleton: tuple[str, ...] = ()
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the camera has a row per frame."""
+        return len(self.rows.rotation) > 1
+
+    def shared_points(self, source: PointSource) -> tuple[Floats, NDArray[np.int64]] | None:
+        """Return the 2D of the points that a source also has, and their indices in the source.
+
+        None without 2D, or if the numbers of people differ.
+        """
+        if self.pixels is None or self.pixels.shape[1] != source.points.shape[1]:
+            return None
+        shared = [name for name in self.skeleton if name in source.skeleton]
+        pixels = self.pixels[:, :, [self.skeleton.index(name) for name in shared]]
+        return pixels, np.array([source.skeleton.index(name) for name in shared], dtype=np.int64)
+
+
+def sample_evenly(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most so many of the indices from 0 to `count` - 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +103,16 @@ class ShippedClip:
     """Findings of the reader."""
     given: ChallengeClip | None = None
     """Boxes and skeletons of the challenge's layout."""
+
+
+def convention(fault: str, says: str, *where: str, **figures: float) -> Finding:
+    """Return the finding of a broken convention."""
+    return Finding(fault=fault, kind="convention", where=where, says=says, figures=figures)
+
+
+def implausible(fault: str, says: str, *where: str, **figures: float) -> Finding:
+    """Return the finding of implausible data."""
+    return Finding(fault=fault, kind="plausibility", where=where, says=says, figures=figures)
 
 
 def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, list[Finding]]:
@@ -106,16 +141,11 @@ def absent_rows(name: str, arrays: Mapping[str, NDArray[Any]]) -> tuple[Floats, 
         )
     zeros = np.all([(array == 0.0).all(-1) for array in flat.values()], axis=0)
     if zeros.any():
-        findings.append(
-            Finding(
-                fault="zeros_for_missing",
-                kind="convention",
-                where=(name,),
-                says=f"{', '.join(flat)} are exactly zero where a person is missing; "
-                "missing values are NaN",
-                figures={"share_of_rows": float(zeros.mean())},
-            )
+        said = (
+            f"{', '.join(flat)} are exactly zero where a person is missing; missing values are NaN"
         )
+        share = float(zeros.mean())
+        findings.append(convention("zeros_for_missing", said, name, share_of_rows=share))
     gone: Floats = missing | zeros
     return gone, findings
 
@@ -162,16 +192,10 @@ def read_clip(
     fps: float,
     pitch: bool = True,
 ) -> ShippedClip:
-    """Read all data of one clip.
+    """Read all data of one of the `clips` of a data set; other cameras are static.
 
-    Args:
-        folder: the data set.
-        clip: one of `clips`.
-        clips: all of the data set; a camera with none of their names is static.
-        body: returns the body model for a name, or for a file without one.
-        manifest: manifest of the release, if it is one.
-        fps: frames per second.
-        pitch: whether the ground is z = 0.
+    `body` returns the body model for a name, or for a file without one; `pitch` says whether the
+    ground is z = 0.
 
     Raises:
         InputError: a file is damaged.
@@ -193,7 +217,7 @@ def read_clip(
         pixels = read_coco(file, ids, frames) if file.is_file() else None
         views.append(View(name, camera, pixels, COCO17))
     given = None
-    if _has_challenge(folder):
+    if (folder / "boxes.npz").is_file() or (folder / "boxes").is_dir():
         given = read_challenge(folder, clip).get(clip)
         if given is not None:
             arrays = {"boxes": given.boxes, "skel_2d": given.skel_2d, "skel_3d": given.skel_3d}
@@ -213,10 +237,7 @@ def read_clip(
 def read_coco(path: Path, ids: tuple[int, ...], frames: int) -> Floats:
     """Read 2D points (frames, persons, 17, 2) [px] of a COCO file; NaN if v is 0.
 
-    Args:
-        path: the file.
-        ids: people in the order of the person dimension; others are left out.
-        frames: number of frames; the first image is frame 0.
+    The first image is frame 0; people who are not in `ids` are left out.
 
     Raises:
         InputError: the file is not a COCO keypoints file.
@@ -319,27 +340,15 @@ def _points(model: BodyModel, poses: BodyParameters) -> Floats:
     return points
 
 
-def _has_challenge(folder: Path) -> bool:
-    return (folder / "boxes.npz").is_file() or (folder / "boxes").is_dir()
-
-
 def _rows_of_boxes(
     sources: list[PointSource], clip: str, shape: tuple[int, ...]
 ) -> tuple[list[PointSource], list[Finding]]:
     """Return sources with the boxes' frames and persons, and findings on swapped dimensions."""
     kept, findings = [], []
     for source in sources:
-        swapped = source.points.shape[:2] == shape[::-1] and shape[0] != shape[1]
-        if not swapped:
-            kept.append(source)
-            continue
-        kept.append(source.with_points(source.points.swapaxes(0, 1)))
-        findings.append(
-            Finding(
-                fault="frames_before_persons",
-                kind="convention",
-                where=(source.name,),
-                says="the first dimension is the frames; a submission has persons first",
-            )
-        )
+        if source.points.shape[:2] == shape[::-1] and shape[0] != shape[1]:
+            said = "the first dimension is the frames; a submission has persons first"
+            findings.append(convention("frames_before_persons", said, source.name))
+            source = source.with_points(source.points.swapaxes(0, 1))
+        kept.append(source)
     return kept, findings

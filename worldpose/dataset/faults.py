@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,7 @@ from pydantic import Field
 from data_contracts.arrays import Floats
 from data_contracts.records import Positive, Record, Share
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View
+from worldpose.dataset.contents import PointSource, View, sample_evenly
 from worldpose.formats.challenge import CameraRows
 from worldpose.geometry.cameras import Camera
 
@@ -97,57 +97,52 @@ def point_faults() -> Iterator[Fault]:
 
 def camera_faults() -> Iterator[Fault]:
     """Yield faults of the camera format."""
-    yield Fault(
+
+    def posed(
+        name: str, says: str, pose: Callable[[Floats, Floats], tuple[Floats, Floats]]
+    ) -> Fault:
+        def repair(rows: CameraRows) -> CameraRows:
+            rotation, translation = pose(rows.rotation, rows.translation)
+            return replace(rows, rotation=rotation, translation=translation)
+
+        return Fault(name, says, camera=repair)
+
+    yield posed(
         "transposed_rotation",
         "R is world_from_cam, the transpose of what x_cam = R x_world + t has",
-        camera=lambda c: _pose_rows(c, _transpose(c.rotation), c.translation),
+        lambda r, t: (_transpose(r), t),
     )
-    yield Fault(
+    yield posed(
         "translation_is_center",
         "t is the camera's centre C and not -R C",
-        camera=lambda c: _pose_rows(c, c.rotation, -_turn_vectors(c.rotation, c.translation)),
+        lambda r, t: (r, -_turn_vectors(r, t)),
     )
-    yield Fault(
+    yield posed(
         "camera_to_world",
         "R and t are world_from_cam: the transpose of R, and the centre for t",
-        camera=lambda c: _pose_rows(
-            c, _transpose(c.rotation), -_turn_vectors(_transpose(c.rotation), c.translation)
-        ),
+        lambda r, t: (_transpose(r), -_turn_vectors(_transpose(r), t)),
     )
-    yield Fault(
-        "negated_translation",
-        "t has the wrong sign",
-        camera=lambda c: _pose_rows(c, c.rotation, -c.translation),
-    )
-    yield Fault(
+    yield posed("negated_translation", "t has the wrong sign", lambda r, t: (r, -t))
+    yield posed(
         "camera_in_millimetres",
         "t is in millimetres and not in metres",
-        camera=lambda c: _pose_rows(c, c.rotation, c.translation / 1000.0),
+        lambda r, t: (r, t / 1000.0),
     )
     for order in ("k1 k2 k3 p1 p2", "p1 p2 k1 k2 k3", "k1 k2 p2 p1 k3"):
-        yield Fault(
-            "distortion_order",
-            f"k is {order} and not OpenCV's {_LENS}",
-            camera=_lens_in(order),
-        )
+        says = f"k is {order} and not OpenCV's {_LENS}"
+        yield Fault("distortion_order", says, camera=_lens_in(order))
 
 
 def frame_faults(moving: bool) -> Iterator[Fault]:
     """Yield faults of frame alignment; only a moving camera has its own clock."""
+    name = "frame_offset"
     for late in sorted({*range(-LATEST, LATEST + 1)} - {0}, key=abs):
-        frames = f"{abs(late)} frame{'s' if abs(late) > 1 else ''}"
-        order = "late" if late > 0 else "early"
-        yield Fault("frame_offset", f"the 3D is {frames} {order} against the 2D", None, None, late)
+        said = f"{abs(late)} frame{'s' if abs(late) > 1 else ''} {'late' if late > 0 else 'early'}"
+        yield Fault(name, f"the 3D is {said} against the 2D", later_points=late)
         if moving:
-            yield Fault(
-                "frame_offset", f"the camera is {frames} {order}", None, None, later_camera=late
-            )
-            yield Fault(
-                "frame_offset",
-                f"the 3D and the camera are {frames} {order} against the 2D",
-                later_points=late,
-                later_camera=late,
-            )
+            yield Fault(name, f"the camera is {said}", later_camera=late)
+            says = f"the 3D and the camera are {said} against the 2D"
+            yield Fault(name, says, later_points=late, later_camera=late)
 
 
 def axis_orders() -> Iterator[tuple[str, Floats]]:
@@ -170,12 +165,10 @@ def _shrink(size: float) -> Callable[[PointSource], Floats]:
 
 def _axis_faults() -> Iterator[Fault]:
     """Yield all other orders and signs of the axes, for whole points, then for `transl` alone."""
-    for _, shipped_from_world in axis_orders():
-        name, says = _axis_name(shipped_from_world)
-        yield Fault(name, says, _turn(shipped_from_world, whole=True))
-    for _, shipped_from_world in axis_orders():
-        name, says = _axis_name(shipped_from_world)
-        yield Fault(name, f"{says}, in transl alone", _turn(shipped_from_world, whole=False))
+    for whole, suffix in ((True, ""), (False, ", in transl alone")):
+        for _, shipped_from_world in axis_orders():
+            name, says = _axis_name(shipped_from_world)
+            yield Fault(name, f"{says}{suffix}", _turn(shipped_from_world, whole))
 
 
 def _turn(shipped_from_world: Floats, whole: bool) -> Callable[[PointSource], Floats | None]:
@@ -215,16 +208,7 @@ def _axis_words(axes: Floats) -> list[str]:
 def _lens_in(order: str) -> Callable[[CameraRows], CameraRows]:
     """Return a repair for a camera whose coefficients were written in another order."""
     place = [order.split().index(name) for name in _LENS.split()]
-
-    def repair(camera: CameraRows) -> CameraRows:
-        lens = camera.distortion[:, place]
-        return CameraRows(camera.intrinsics, lens, camera.rotation, camera.translation)
-
-    return repair
-
-
-def _pose_rows(camera: CameraRows, rotation: Floats, translation: Floats) -> CameraRows:
-    return CameraRows(camera.intrinsics, camera.distortion, rotation, translation)
+    return lambda rows: replace(rows, distortion=rows.distortion[:, place])
 
 
 def _transpose(rotation: Floats) -> Floats:
@@ -271,15 +255,8 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
     """Return the residuals between a source and a view, and the fault that explains them best.
 
     A fault is named if its repair removes most of the error; a 2D point that the camera cannot see
-    has infinite error. Frame offsets are also searched with whole bodies.
-
-    Args:
-        source: 3D points.
-        view: a camera with 2D.
-        settings: thresholds for an explanation.
-
-    Returns:
-        None if they have no points in common.
+    has infinite error. Frame offsets are also searched with whole bodies. None if source and view
+    have no points in common.
     """
     sample = _sample(source, view, settings.max_sample)
     if sample is None:
@@ -287,7 +264,7 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
     errors = _errors(source.points, view.rows, sample, SOUND)
     shipped = _median(errors)
     best, least = SOUND, shipped
-    for fault in _candidates(moving=len(view.rows.rotation) > 1):
+    for fault in (*camera_faults(), *frame_faults(view.is_moving), *point_faults()):
         if shipped < settings.min_gain_px:
             break
         points = source.points if fault.points is None else fault.points(source)
@@ -305,7 +282,7 @@ def compare_view(source: PointSource, view: View, settings: CheckSettings) -> Ag
     if not explains and np.isfinite(shipped) and shipped > settings.min_gain_px:
         found = find_frame_offset(source, view, settings)
         if found is not None:
-            explains, best = True, found[0]
+            explains, best = True, found
             least = _median(_errors(source.points, view.rows, sample, best))
     return Agreement(
         view=view.name,
@@ -344,50 +321,51 @@ _UNEXPLAINED = (
 )
 
 
-def _candidates(moving: bool) -> Iterator[Fault]:
-    yield from camera_faults()
-    yield from frame_faults(moving)
-    yield from point_faults()
-
-
 def _sample(source: PointSource, view: View, size: int) -> _Sample | None:
     """Sample 2D points evenly from those that the source also has."""
-    if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
+    shared = view.shared_points(source)
+    if shared is None:
         return None
-    shared = [name for name in view.skeleton if name in source.skeleton]
-    in_view = [view.skeleton.index(name) for name in shared]
-    in_source = np.array([source.skeleton.index(name) for name in shared], dtype=np.int64)
-    count = min(len(view.pixels), len(source.points))
-    pixels = view.pixels[:count][:, :, in_view]
+    pixels, in_source = shared
+    count = min(len(pixels), len(source.points))
+    pixels = pixels[:count]
     known = np.all(np.isfinite(pixels), axis=-1)
     known &= np.all(np.isfinite(source.points[:count][:, :, in_source]), axis=-1)
-    if len(view.rows.rotation) > 1:
+    if view.is_moving:
         rows = np.all(np.isfinite(view.rows.rotation), axis=(-1, -2))[:count]
         known[: len(rows)] &= rows[:, None, None]
         known[len(rows) :] = False
     frame, person, joint = np.nonzero(known)
     if not len(frame):
         return None
-    picked = np.unique(np.linspace(0, len(frame) - 1, size).round().astype(np.int64))
+    picked = sample_evenly(len(frame), size)
     frame, person, joint = frame[picked], person[picked], joint[picked]
     return _Sample(frame, person, in_source[joint], pixels[frame, person, joint])
 
 
-def _errors(points: Floats, rows: CameraRows, sample: _Sample, fault: Fault) -> Floats:
-    """Return residuals (n,) [px] between projected points and 2D; infinite for invisible points."""
-    frame = sample.frame + fault.later_points
-    row = sample.frame + fault.later_camera
+def _later(
+    frame: Ints, count: int, rows: CameraRows, fault: Fault
+) -> tuple[NDArray[np.bool_], Ints, Camera]:
+    """Return which frames remain when a fault shifts them, their 3D frames, and the camera there.
+
+    The camera is a batch if it moves.
+    """
+    there, row = frame + fault.later_points, frame + fault.later_camera
     moving = len(rows.rotation) > 1
-    within = (frame >= 0) & (frame < len(points))
+    within = (there >= 0) & (there < count)
     if moving:
         within &= (row >= 0) & (row < len(rows.rotation))
+    camera: Camera = rows.camera()
+    return within, there[within], camera[row[within]] if moving else camera[0]
+
+
+def _errors(points: Floats, rows: CameraRows, sample: _Sample, fault: Fault) -> Floats:
+    """Return residuals (n,) [px] between projected points and 2D; infinite for invisible points."""
+    within, frame, camera = _later(sample.frame, len(points), rows, fault)
     if not within.any():
         return np.full(1, np.inf)
-    here = points[frame[within], sample.person[within], sample.point[within]]
-    camera: Camera = rows.camera()
-    pixels = (
-        camera[row[within]].project(here[:, None])[:, 0] if moving else (camera[0].project(here))
-    )
+    here = points[frame, sample.person[within], sample.point[within]]
+    pixels = camera.project(here[:, None])[:, 0] if camera.batch_shape else camera.project(here)
     away = np.linalg.norm(pixels - sample.pixels[within], axis=-1)
     errors: Floats = np.where(np.isnan(away), np.inf, away)
     # A person who enters or leaves in between is no evidence.
@@ -420,59 +398,36 @@ _BODIES: Final = 1500
 """Maximum number of sampled bodies."""
 
 
-def find_frame_offset(
-    source: PointSource, view: View, settings: CheckSettings
-) -> tuple[Fault, float] | None:
-    """Return the frame offset that explains a source and a view, and the remaining error share.
-
-    Args:
-        source: 3D points.
-        view: a camera with 2D of the same people.
-        settings: thresholds for an explanation, here for the errors of whole bodies.
-    """
-    if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
+def find_frame_offset(source: PointSource, view: View, settings: CheckSettings) -> Fault | None:
+    """Return the frame offset that explains the errors of whole bodies in a view."""
+    shared = view.shared_points(source)
+    if shared is None:
         return None
-    shared = [name for name in view.skeleton if name in source.skeleton]
-    seen = view.pixels[:, :, [view.skeleton.index(name) for name in shared]]
-    points = source.points[:, :, [source.skeleton.index(name) for name in shared]]
+    seen, in_source = shared
+    points = source.points[:, :, in_source]
     known = np.isfinite(seen).all(-1).sum(-1) >= _POINTS
     frame, person = np.nonzero(known[: len(points)])
     if not len(frame):
         return None
-    picked = np.unique(np.linspace(0, len(frame) - 1, _BODIES).round().astype(np.int64))
+    picked = sample_evenly(len(frame), _BODIES)
     frame, person = frame[picked], person[picked]
-    shipped = _error(points, view, seen, frame, person, None)
-    best, least = None, shipped
-    for fault in frame_faults(moving=len(view.rows.rotation) > 1):
-        error = _error(points, view, seen, frame, person, fault)
-        if error < least - 1e-9:
-            best, least = fault, error
-    if best is None or shipped - least <= settings.min_gain_px:
-        return None
-    return (best, least / shipped) if least < settings.max_share_left * shipped else None
 
+    def error(fault: Fault) -> float:
+        """Return the median length [px] of bodies' median residuals; infinite without bodies."""
+        within, there, camera = _later(frame, len(points), view.rows, fault)
+        pixels = camera.project(points[there, person[within]])
+        away = pixels - seen[frame[within], person[within]]
+        enough = np.isfinite(away).all(-1).sum(-1) >= _POINTS
+        if not enough.any():
+            return np.inf
+        middle = np.nanmedian(away[enough], axis=1)
+        return float(np.median(np.linalg.norm(middle, axis=-1)))
 
-def _error(
-    points: Floats,
-    view: View,
-    seen: Floats,
-    frame: NDArray[np.int64],
-    person: NDArray[np.int64],
-    fault: Fault | None,
-) -> float:
-    """Return the median length [px] of bodies' median residuals; infinite without bodies."""
-    there = frame + (0 if fault is None else fault.later_points)
-    row = frame + (0 if fault is None else fault.later_camera)
-    moving = len(view.rows.rotation) > 1
-    within = (there >= 0) & (there < len(points))
-    if moving:
-        within &= (row >= 0) & (row < len(view.rows.rotation))
-    camera = view.rows.camera()
-    camera = camera[row[within]] if moving else camera[0]
-    pixels = camera.project(points[there[within], person[within]])
-    away = pixels - seen[frame[within], person[within]]
-    enough = np.isfinite(away).all(-1).sum(-1) >= _POINTS
-    if not enough.any():
-        return np.inf
-    middle = np.nanmedian(away[enough], axis=1)
-    return float(np.median(np.linalg.norm(middle, axis=-1)))
+    shipped = least = error(SOUND)
+    best = None
+    for fault in frame_faults(view.is_moving):
+        left = error(fault)
+        if left < least - 1e-9:
+            best, least = fault, left
+    explains = shipped - least > settings.min_gain_px
+    return best if explains and least < settings.max_share_left * shipped else None

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,24 @@ from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 
 MANIFEST: Final = "manifest.json"
+T = TypeVar("T")
+
+
+def _read(path: Path, form: TypeAdapter[T], expected: str, todo: str) -> T | None:
+    """Read a JSON file of a form; None if there is no such file."""
+    if not path.is_file():
+        return None
+    try:
+        return form.validate_json(path.read_bytes())
+    except ValidationError as error:
+        found = str(error.errors()[0]["msg"])
+        raise InputError(str(path), expected=expected, found=found, todo=todo) from error
+
+
+def _write(path: Path, content: object) -> Path:
+    with whole_file(path) as draft:
+        draft.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    return path
 
 
 def released_files(folder: Path, paths: Iterable[Path]) -> tuple[ReleasedFile, ...]:
@@ -46,18 +64,12 @@ def read_manifest(folder: Path) -> ReleaseManifest | None:
     Raises:
         InputError: the file is not a manifest, or has another contract version.
     """
-    path = folder / MANIFEST
-    if not path.is_file():
-        return None
-    try:
-        return ReleaseManifest.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise InputError(
-            str(path),
-            expected=f"the manifest of a release, contract {CONTRACT_VERSION}",
-            found=str(error.errors()[0]["msg"]),
-            todo="Download or copy the release again from its origin.",
-        ) from error
+    return _read(
+        folder / MANIFEST,
+        TypeAdapter(ReleaseManifest),
+        f"the manifest of a release, contract {CONTRACT_VERSION}",
+        "Download or copy the release again from its origin.",
+    )
 
 
 def changed_files(folder: Path, manifest: ReleaseManifest) -> list[str]:
@@ -85,22 +97,10 @@ def write_kinds(folder: Path, kinds: Mapping[str, Mapping[int, str]]) -> Path:
     Raises:
         InputError: the existing file has another format.
     """
-    path = folder / KINDS
-    try:
-        known = _KINDS.validate_json(path.read_bytes()) if path.is_file() else {}
-    except ValidationError as error:
-        raise InputError(
-            str(path),
-            expected="clips and the kinds of their people by id",
-            found=str(error.errors()[0]["msg"]),
-            todo="Remove the file, and export again.",
-        ) from error
-    known |= {
-        clip: {str(person): kind for person, kind in of.items()} for clip, of in kinds.items()
-    }
-    with whole_file(path) as draft:
-        draft.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    return path
+    path, expected = folder / KINDS, "clips and the kinds of their people by id"
+    known = _read(path, _KINDS, expected, "Remove the file, and export again.") or {}
+    new = {clip: {str(person): kind for person, kind in of.items()} for clip, of in kinds.items()}
+    return _write(path, known | new)
 
 
 def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
@@ -109,10 +109,7 @@ def write_frame_rates(folder: Path, rates: Mapping[str, float]) -> Path:
     Raises:
         InputError: the existing file has another format.
     """
-    known = {**read_frame_rates(folder), **rates}
-    with whole_file(folder / FRAME_RATES) as draft:
-        draft.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    return folder / FRAME_RATES
+    return _write(folder / FRAME_RATES, {**read_frame_rates(folder), **rates})
 
 
 def read_frame_rates(folder: Path) -> dict[str, float]:
@@ -121,18 +118,8 @@ def read_frame_rates(folder: Path) -> dict[str, float]:
     Raises:
         InputError: the file does not map clips to numbers.
     """
-    path = folder / FRAME_RATES
-    if not path.is_file():
-        return {}
-    try:
-        return _RATES.validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise InputError(
-            str(path),
-            expected="clips and their frames per second",
-            found=str(error.errors()[0]["msg"]),
-            todo="Export the data set again.",
-        ) from error
+    path, expected = folder / FRAME_RATES, "clips and their frames per second"
+    return _read(path, _RATES, expected, "Export the data set again.") or {}
 
 
 def clip_frame_rate(rates: Mapping[str, float], clip: str) -> float | None:

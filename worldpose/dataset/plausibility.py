@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats
 from data_contracts.release import Finding
-from worldpose.dataset.contents import PointSource, View
+from worldpose.dataset.contents import (
+    PointSource,
+    View,
+    convention,
+    implausible,
+    sample_evenly,
+)
 from worldpose.dataset.faults import (
     LATEST,
     CheckSettings,
@@ -39,7 +45,7 @@ def plausible_share(source: PointSource, settings: CheckSettings) -> float:
     and excludes other units or axes, and also a lying person. If most bodies have a left-right
     swap, the share is zero.
     """
-    feet, nose = _feet(source), _point(source, "nose")
+    feet, nose = _feet(source), source.point("nose")
     here = np.isfinite(feet) & np.isfinite(nose).all(-1)
     if not here.any() or _handedness(source) < 0.0:
         return 0.0
@@ -83,20 +89,14 @@ def ground_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fi
     if np.isnan(height) or settings.min_ground_m <= height <= settings.max_ground_m:
         return
     says = f"people's lower foot is {height:.2f} m from the ground in half of all frames"
-    fault, left = "feet_off_the_ground", height
+    fault, left, make = "feet_off_the_ground", height, implausible
     if source.pivot is not None:
         moved = source.with_points(source.points + source.pivot[:, :, None])
         left = foot_height(moved)
         if settings.min_ground_m <= left <= settings.max_ground_m and abs(left) < 0.5 * abs(height):
-            fault = "root_about_origin"
+            fault, make = "root_about_origin", convention
             says += "; on the ground if global_orient turned about the model's origin"
-    yield Finding(
-        fault=fault,
-        kind="plausibility" if fault == "feet_off_the_ground" else "convention",
-        where=(source.name,),
-        says=says,
-        figures={"foot_height_m": height, "explained_height_m": left},
-    )
+    yield make(fault, says, source.name, foot_height_m=height, explained_height_m=left)
 
 
 def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> Iterator[Finding]:
@@ -105,7 +105,7 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         bone = np.stack(
             [
                 np.linalg.norm(
-                    _point(source, f"{side}_{upper}") - _point(source, f"{side}_{lower}"), axis=-1
+                    source.point(f"{side}_{upper}") - source.point(f"{side}_{lower}"), axis=-1
                 )
                 for side in ("left", "right")
             ],
@@ -115,13 +115,9 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         lengths = np.array([np.nanmedian(bone[:, person]) for person in seen])
         low, high = settings.bones_m
         if (wrong := (lengths < low) | (lengths > high)).any():
-            yield Finding(
-                fault="limb_length",
-                kind="plausibility",
-                where=(source.name,),
-                says=f"{name} of {int(wrong.sum())} people are not of human length",
-                figures={"least_m": float(lengths.min()), "greatest_m": float(lengths.max())},
-            )
+            says = f"{name} of {int(wrong.sum())} people are not of human length"
+            figures = {"least_m": float(lengths.min()), "greatest_m": float(lengths.max())}
+            yield implausible("limb_length", says, source.name, **figures)
     middle = _hips(source)
     speed = np.linalg.norm(np.diff(middle, axis=0), axis=-1) * fps
     speed = speed[np.isfinite(speed)]
@@ -129,13 +125,9 @@ def body_findings(source: PointSource, fps: float, settings: CheckSettings) -> I
         len(speed)
         and (share := float((speed > settings.max_speed_m_s).mean())) > settings.max_fast_share
     ):
-        yield Finding(
-            fault="speed",
-            kind="plausibility",
-            where=(source.name,),
-            says=f"people move faster than {settings.max_speed_m_s:g} m/s",
-            figures={"share_of_steps": share, "fastest_m_per_s": float(speed.max())},
-        )
+        says = f"people move faster than {settings.max_speed_m_s:g} m/s"
+        figures = {"share_of_steps": share, "fastest_m_per_s": float(speed.max())}
+        yield implausible("speed", says, source.name, **figures)
 
 
 def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Finding]:
@@ -144,23 +136,18 @@ def pitch_findings(source: PointSource, settings: CheckSettings) -> Iterator[Fin
     here = np.isfinite(middle).all(-1)
     away = np.abs(middle[here][:, :2]) > np.array(settings.bounds_m)
     if len(away) and (share := float(away.any(-1).mean())) > 1.0 - settings.min_plausible_share:
-        yield Finding(
-            fault="off_the_pitch",
-            kind="plausibility",
-            where=(source.name,),
-            says="people are far off the pitch",
-            figures={"share_of_bodies": share},
-        )
+        says = "people are far off the pitch"
+        yield implausible("off_the_pitch", says, source.name, share_of_bodies=share)
 
 
-def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
+def camera_findings(name: str, rows: CameraRows, settings: CheckSettings) -> Iterator[Finding]:
     """Yield invalid rotations, and a moving camera's centre that is not constant."""
-    rotation, translation = view.rows.rotation, view.rows.translation
+    rotation, translation = rows.rotation, rows.translation
     known = np.isfinite(rotation).all((-1, -2)) & np.isfinite(translation).all(-1)
     rotation, translation = rotation[known], translation[known]
     if not len(rotation):
         return
-    where = (f"cameras/{view.name}",)
+    where = (f"cameras/{name}",)
     residual = float(np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max())
     if residual > settings.max_rotation_error:
         yield Finding(
@@ -172,21 +159,11 @@ def camera_findings(view: View, settings: CheckSettings) -> Iterator[Finding]:
         )
         return
     if (np.linalg.det(rotation) < 0.0).any():
-        yield Finding(
-            fault="mirrored_rotation",
-            kind="convention",
-            where=where,
-            says="R mirrors: its determinant is -1",
-        )
-    drift = float(np.linalg.norm(centers(view.rows) - camera_center(view.rows), axis=-1).max())
+        yield convention("mirrored_rotation", "R mirrors: its determinant is -1", *where)
+    drift = float(np.linalg.norm(centers(rows) - camera_center(rows), axis=-1).max())
     if drift > settings.max_center_drift_m:
-        yield Finding(
-            fault="moving_center",
-            kind="plausibility",
-            where=where,
-            says="the camera's centre -R't is not in one place",
-            figures={"drift_m": drift},
-        )
+        says = "the camera's centre -R't is not in one place"
+        yield implausible("moving_center", says, *where, drift_m=drift)
 
 
 def centers(rows: CameraRows) -> Floats:
@@ -202,27 +179,22 @@ def camera_center(rows: CameraRows) -> Floats:
     return np.median(found, axis=0) if len(found) else np.full(3, np.nan)
 
 
-def _point(source: PointSource, name: str) -> Floats:
-    """Return one point of all people (frames, persons, 3) [m]."""
-    return source.points[:, :, source.skeleton.index(name)]
-
-
 def _hips(source: PointSource) -> Floats:
     """Return the mid-hip of all people (frames, persons, 3) [m]."""
-    return 0.5 * (_point(source, "left_hip") + _point(source, "right_hip"))
+    return 0.5 * (source.point("left_hip") + source.point("right_hip"))
 
 
 def _handedness(source: PointSource) -> float:
     """Return 1 if most noses or toes point ahead, according to left and up; -1 if behind."""
 
     def middle(name: str) -> Floats:
-        return 0.5 * (_point(source, f"left_{name}") + _point(source, f"right_{name}"))
+        return 0.5 * (source.point(f"left_{name}") + source.point(f"right_{name}"))
 
     if "left_ear" in source.skeleton:
-        left = _point(source, "left_ear") - _point(source, "right_ear")
-        forward = _point(source, "nose") - middle("ear")
+        left = source.point("left_ear") - source.point("right_ear")
+        forward = source.point("nose") - middle("ear")
     else:
-        left = _point(source, "left_hip") - _point(source, "right_hip")
+        left = source.point("left_hip") - source.point("right_hip")
         forward = middle("big_toe") - middle("ankle")
     ahead = (np.cross(left, middle("shoulder") - middle("hip")) * forward).sum(-1)
     ahead = ahead[np.isfinite(ahead)]
@@ -277,7 +249,7 @@ def visible_share(source: PointSource, points: Floats, rows: CameraRows) -> floa
     frame, person = np.nonzero(known)
     if not len(frame):
         return 0.0
-    picked = np.unique(np.linspace(0, len(frame) - 1, _PEOPLE).round().astype(np.int64))
+    picked = sample_evenly(len(frame), _PEOPLE)
     camera = rows.camera()
     camera = camera[frame[picked]] if moving else camera[0]
     pixels = camera.project(ends[frame[picked], person[picked]])
@@ -342,16 +314,13 @@ def visibility_findings(
 def _make_finding(
     views: Sequence[View], which: NDArray[np.bool_], fault: Fault | None, share: Floats
 ) -> Finding:
-    named = [view.name for view, ours in zip(views, which, strict=True) if ours]
-    return Finding(
-        fault="sees_nobody" if fault is None else fault.name,
-        kind="damage" if fault is None else "convention",
-        where=tuple(f"cameras/{name}" for name in named),
-        says="the camera shows no person of the clip"
-        if fault is None
-        else f"{fault.says}: so the camera shows people",
-        figures={"explained_share_seen": float(share[which].min())},
-    )
+    where = tuple(f"cameras/{view.name}" for view, ours in zip(views, which, strict=True) if ours)
+    figures = {"explained_share_seen": float(share[which].min())}
+    if fault is not None:
+        says = f"{fault.says}: so the camera shows people"
+        return convention(fault.name, says, *where, **figures)
+    says = "the camera shows no person of the clip"
+    return Finding(fault="sees_nobody", kind="damage", where=where, says=says, figures=figures)
 
 
 _FRAMES: Final = 150
@@ -361,48 +330,33 @@ _POINTS: Final = 30
 
 
 def turning_findings(source: PointSource, view: View, settings: CheckSettings) -> Iterator[Finding]:
-    """Yield the frame offset that explains a source and a camera's 2D, independent of its poses.
-
-    Args:
-        source: 3D points.
-        view: a camera with 2D of the same people; others yield nothing.
-        settings: thresholds for an explanation.
-    """
+    """Yield the frame offset that explains a source and a camera's 2D, independent of its poses."""
     posed = np.isfinite(view.rows.rotation).all((-1, -2))
-    if view.pixels is None or view.pixels.shape[1] != source.points.shape[1]:
+    shared = view.shared_points(source)
+    if shared is None:
         return
     if posed.mean() > 0.5 or not np.isfinite(camera_center(view.rows)).all():
         return
-    left = {late: _left(source, view, late) for late in range(-LATEST, LATEST + 1)}
+    seen, points = shared[0], source.points[:, :, shared[1]]
+    left = {late: _left(seen, points, view.rows, late) for late in range(-LATEST, LATEST + 1)}
     best = min(left, key=lambda late: (left[late], abs(late)))
     if (
         left[0] - left[best] > settings.min_gain_px
         and left[best] < settings.max_share_left * left[0]
     ):
         (fault,) = (f for f in frame_faults(moving=False) if f.later_points == best)
-        yield Finding(
-            fault=fault.name,
-            kind="convention",
-            where=(source.name, f"cameras/{view.name}"),
-            says=fault.says,
-            figures={
-                "shipped_median_px": min(left[0], 1e6),
-                "explained_median_px": left[best],
-            },
-        )
+        figures = {"shipped_median_px": min(left[0], 1e6), "explained_median_px": left[best]}
+        where = source.name, f"cameras/{view.name}"
+        yield convention(fault.name, fault.says, *where, **figures)
 
 
-def _left(source: PointSource, view: View, late: int) -> float:
+def _left(seen: Floats, points: Floats, rows: CameraRows, late: int) -> float:
     """Return the median residual [px] between 2D and 3D of later frames, after optimal rotations.
 
     A frame without enough points is skipped; infinite without any frame.
     """
-    assert view.pixels is not None  # the caller checks that there is 2D
-    shared = [name for name in view.skeleton if name in source.skeleton]
-    seen = view.pixels[:, :, [view.skeleton.index(name) for name in shared]]
-    points = source.points[:, :, [source.skeleton.index(name) for name in shared]]
-    camera, center = view.rows.lens(), camera_center(view.rows)
-    first, last = max(0, -late), min(len(seen), len(points) - late, len(view.rows.rotation))
+    camera, center = rows.lens(), camera_center(rows)
+    first, last = max(0, -late), min(len(seen), len(points) - late, len(rows.rotation))
     errors = []
     for frame in np.unique(np.linspace(first, last - 1, _FRAMES).round().astype(np.int64)):
         here, there = seen[frame].reshape(-1, 2), points[frame + late].reshape(-1, 3)

@@ -26,13 +26,9 @@ _ZOOM: Final = 1e-2
 
 
 def read_places(folder: Path, clip: str) -> Floats:
-    """Return people's positions (frames, persons, 3) [m]; NaN where a person is missing.
+    """Return people's positions in a clip (frames, persons, 3) [m]; NaN where one is missing.
 
     The pelvis of poses, up to an offset per person, or the mid-hip.
-
-    Args:
-        folder: the data set.
-        clip: one of `list_clips`.
 
     Raises:
         InputError: a file is damaged, or the clip has no positions.
@@ -64,11 +60,7 @@ def clip_statistics(places: Floats, fps: float, camera: CameraKind | None = None
     """Return the statistics of one clip.
 
     A person's distance is the path length over the ground, from frame to frame; gaps add nothing.
-
-    Args:
-        places: (frames, persons, 3) [m], world; NaN where a person is missing.
-        fps: frames per second [1/s].
-        camera: kind of the camera.
+    Places are (frames, persons, 3) [m], world; NaN where a person is missing.
     """
     there = np.asarray(np.isfinite(places).all(-1))
     steps = np.linalg.norm(np.diff(places[..., :2], axis=0), axis=-1)
@@ -117,11 +109,9 @@ def camera_kind(path: Path) -> CameraKind | None:
 
 
 def kind_of(focal: Floats, rotation: Floats) -> CameraKind | None:
-    """Return the kind of a camera; None if its rotations are unknown.
+    """Return the kind of a camera from focal lengths (frames,) [px]; None if it is unknown.
 
-    Args:
-        focal: (frames,) [px].
-        rotation: (frames, 3, 3), or (1, 3, 3) if only the first one is known.
+    Rotations are (frames, 3, 3), or (1, 3, 3) if only the first one is known.
     """
     known = np.isfinite(focal)
     if known.any() and np.ptp(focal[known]) > _ZOOM * focal[known].mean():

@@ -77,8 +77,8 @@ def evaluate_cameras(
     samples = {
         name: camera_samples(name, estimated[name], true[name], pitch, settings) for name in names
     }
-    kinds = {name: _kind(true[name]) for name in names}
-    people = tuple(
+    kinds = {name: "broadcast" if _frames(true[name]) > 1 else "static" for name in names}
+    cameras = tuple(
         CameraScore(camera_id=name, kind=kinds[name], errors=_figures([samples[name]]))
         for name in names
     )
@@ -86,7 +86,7 @@ def evaluate_cameras(
         kind: _figures([samples[name] for name in names if kinds[name] == kind])
         for kind in sorted(set(kinds.values()))
     }
-    return CameraEvaluation(**groups), people
+    return CameraEvaluation(**groups), cameras
 
 
 def camera_samples(
@@ -98,12 +98,8 @@ def camera_samples(
 ) -> CameraSamples:
     """Return the errors of one camera per frame and per point that the true camera sees.
 
-    Args:
-        name: camera or clip, for messages.
-        estimated: one camera, or one per frame; NaN in frames without an estimate.
-        true: one camera, or one per frame.
-        pitch: the surface; without one there are no points.
-        settings: grid of test points.
+    Each camera is single, or a batch (frames,); the estimated one is NaN in frames without an
+    estimate. Without a pitch there are no points. The name of the camera or clip is for messages.
 
     Raises:
         InputError: the cameras have different numbers of frames.
@@ -128,8 +124,13 @@ def camera_samples(
         reach = float(np.hypot(pitch.length, pitch.width))
         for frame in np.flatnonzero(np.atleast_1d(known)):
             one, exact = _at(estimated, int(frame)), _at(true, int(frame))
-            ground.append(_ground_errors(one, exact, surface, pitch, reach))
-            reprojection.append(_reprojection_errors(one, exact, raised))
+            # A point that the estimated camera misses is off by the pitch, or by the image.
+            seen, pixels = _select_visible(exact, surface)
+            away = surface_points(one.unproject(pixels), pitch) - seen
+            ground.append(_capped_lengths(away, reach))
+            seen, pixels = _select_visible(exact, raised)
+            diagonal = float(np.linalg.norm(exact.image_size))
+            reprojection.append(_capped_lengths(one.project(seen) - pixels, diagonal))
     return CameraSamples(
         center=np.broadcast_to(np.where(known, center, np.nan), (frames,)),
         rotation=np.broadcast_to(angle, (frames,)),
@@ -149,61 +150,31 @@ def surface_points(rays: Rays, pitch: PitchTemplate) -> NDArray[np.float64]:
         pitch: the surface, extended beyond the touch lines.
     """
     origins, directions = rays.origins, rays.directions
+
+    def height(along: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height of the rays above the surface [m]."""
+        points = origins + along[..., None] * directions
+        return np.asarray(points[..., 2] - pitch.height(points[..., 0], points[..., 1]))
+
     down = directions[..., 2] < 0.0
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # The surface lies below z = 0 and curves away, so Newton's steps never pass it.
         along = np.where(down, -origins[..., 2] / directions[..., 2], np.nan)
         for _ in range(_NEWTON_STEPS):
-            above = _above(origins, directions, along, pitch)
-            ahead = _above(origins, directions, along + 0.5, pitch)
-            behind = _above(origins, directions, along - 0.5, pitch)
-            along = along - above / (ahead - behind)
-        points = origins + along[..., None] * directions
-        height = pitch.height(points[..., 0], points[..., 1])
+            along = along - height(along) / (height(along + 0.5) - height(along - 0.5))
         # A tenth of a millimetre: points that have not converged by now never will.
-        met = (along > 0.0) & (np.abs(points[..., 2] - height) < 1e-4)
-    return np.where(met[..., None], points, np.nan)
+        met = (along > 0.0) & (np.abs(height(along)) < 1e-4)
+        return np.where(met[..., None], origins + along[..., None] * directions, np.nan)
 
 
 _NEWTON_STEPS = 8
 """Each step squares the error; the surface is within 0.2 m of the start plane."""
 
 
-def _above(
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    along: NDArray[np.float64],
-    pitch: PitchTemplate,
-) -> NDArray[np.float64]:
-    points = origins + along[..., None] * directions
-    return np.asarray(points[..., 2] - pitch.height(points[..., 0], points[..., 1]))
-
-
-def _ground_errors(
-    estimated: Camera,
-    true: Camera,
-    surface: NDArray[np.float64],
-    pitch: PitchTemplate,
-    reach: float,
-) -> NDArray[np.float64]:
-    """Return distances on the surface between true points and their back-projected pixels [m].
-
-    If the estimated camera's ray misses the pitch surface, the error is `reach`.
-    """
-    seen, pixels = _select_visible(true, surface)
-    found = surface_points(estimated.unproject(pixels), pitch)
-    distance = np.linalg.norm(found - seen, axis=-1)
-    return np.minimum(np.where(np.isnan(distance), reach, distance), reach)
-
-
-def _reprojection_errors(
-    estimated: Camera, true: Camera, points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return pixel distances; the image diagonal if the estimated camera cannot see a point."""
-    seen, pixels = _select_visible(true, points)
-    diagonal = float(np.linalg.norm(true.image_size))
-    distance = np.linalg.norm(estimated.project(seen) - pixels, axis=-1)
-    return np.minimum(np.where(np.isnan(distance), diagonal, distance), diagonal)
+def _capped_lengths(vectors: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """Return the lengths of vectors; at most, and for a missing vector, `most`."""
+    lengths = np.linalg.norm(vectors, axis=-1)
+    return np.minimum(np.where(np.isnan(lengths), most, lengths), most)
 
 
 def _select_visible(
@@ -257,10 +228,6 @@ def _angle(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     # The skew part's norm is 2 sqrt(2) sin(angle), the trace 1 + 2 cos(angle).
     sine = np.linalg.norm(skew, axis=(-1, -2)) / np.sqrt(2.0)
     return np.asarray(np.arctan2(sine, trace - 1.0))
-
-
-def _kind(camera: Camera) -> str:
-    return "broadcast" if _frames(camera) > 1 else "static"
 
 
 def _frames(camera: Camera) -> int:

@@ -18,6 +18,7 @@ from worldpose.errors import DegenerateError, InputError
 from worldpose.evaluation.matching import (
     joint_distances,
     match_people,
+    move_people,
     register_world,
     take_matched,
 )
@@ -68,11 +69,7 @@ def read_markers(path: Path) -> Markers:
 
 
 def map_marker_names(names: tuple[str, ...]) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return people and joints from marker names of the form `joint` or `person:joint`.
-
-    Args:
-        names: markers; the function skips names outside COCO-17.
-    """
+    """Return people and joints from markers `joint` or `person:joint`; others are skipped."""
     people: dict[str, dict[str, tuple[str, ...]]] = {}
     for name in names:
         person, _, joint = name.rpartition(":")
@@ -87,12 +84,13 @@ def read_marker_map(path: Path) -> dict[str, dict[str, tuple[str, ...]]]:
     Raises:
         InputError: the file has another structure, or a joint is not in COCO-17.
     """
+    expected = "YAML: person: {joint: [marker, ...]}"
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise _wrong(path, "YAML: person: {joint: [marker, ...]}", str(error)) from None
+        raise _wrong(path, expected, str(error)) from None
     if not isinstance(content, dict) or not all(isinstance(p, dict) for p in content.values()):
-        raise _wrong(path, "YAML: person: {joint: [marker, ...]}", f"a {type(content).__name__}")
+        raise _wrong(path, expected, f"a {type(content).__name__}")
     people = {}
     for person, joints in content.items():
         unknown = [joint for joint in joints if joint not in COCO17]
@@ -258,12 +256,8 @@ def align_reference(
 def sample_joints(joints: Floats, rate: float, times: Floats) -> Floats:
     """Return joints (times, persons, 17, 3) at times on their own clock, interpolated linearly.
 
-    NaN outside the samples, and if either neighbour is missing.
-
-    Args:
-        joints: (samples, persons, 17, 3) [m].
-        rate: samples per second [1/s].
-        times: (times,) [s] since the first sample.
+    Joints are (samples, persons, 17, 3) [m] at a rate [1/s], times (times,) [s] since the first
+    sample. NaN outside the samples, and if either neighbour is missing.
     """
     place = np.round(times * rate, 9)
     before = np.floor(place).astype(np.int64)
@@ -281,8 +275,7 @@ def _match_cost(people: Floats, reference: Floats) -> tuple[float, NDArray[np.in
     motion = register_world(reference, people, _MATCH_GATE_M)
     if motion is None:
         return np.inf, None
-    moved = motion.apply(reference.reshape(len(reference), -1, 3)).reshape(reference.shape)
-    distances = joint_distances(people, moved)
+    distances = joint_distances(people, move_people(motion, reference))
     match = match_people(distances, _MATCH_GATE_M)
     there = int(np.isfinite(reference[..., 0]).any(-1).sum())
     if not (match >= 0).any():

@@ -164,11 +164,8 @@ def _hota_parts(
 def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Return boxes around projected joints (frames, persons, 4) x0 y0 x1 y1 [px].
 
-    A box is NaN where no joint is in front of the camera. Boxes are not clipped to the image.
-
-    Args:
-        joints: (frames, persons, joints, 3) [m], world; NaN where missing.
-        camera: one camera, or one per frame.
+    Joints are (frames, persons, joints, 3) [m], world, NaN where missing; there is one camera, or
+    one per frame. A box is NaN where no joint is in front of it, and not clipped to the image.
     """
     frames, persons, count, _ = joints.shape
     image = camera.project(joints.reshape(frames, persons * count, 3))
@@ -183,11 +180,8 @@ def joint_boxes(joints: NDArray[np.float64], camera: Camera) -> NDArray[np.float
 def box_overlaps(predicted: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return intersection over union of all pairs (frames, true, predicted) [0..1].
 
-    The value is NaN where a box is missing, and 0 for boxes without area.
-
-    Args:
-        predicted: (frames, predicted persons, 4) x0 y0 x1 y1 [px].
-        true: (frames, true persons, 4) [px].
+    Boxes are (frames, persons, 4) x0 y0 x1 y1 [px]. The value is NaN where one is missing, and 0
+    for boxes without area.
     """
     missing = np.isnan(true[:, :, None]).any(axis=-1) | np.isnan(predicted[:, None]).any(axis=-1)
     return np.where(missing, np.nan, box_iou(true, predicted))
@@ -200,13 +194,7 @@ _CHUNK: Final = 64
 def select_frames(
     rows: NDArray[np.float64], own_frames: NDArray[np.int64], frames: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return rows at the given frames (frames, ...), NaN in frames without a row.
-
-    Args:
-        rows: (own frames, ...).
-        own_frames: (own frames,) frame of each row, each once.
-        frames: (frames,) wanted frames, each once.
-    """
+    """Return rows (own frames, ...) at other frames (frames, ...), NaN in frames without a row."""
     selected = np.full((len(frames), *rows.shape[1:]), np.nan)
     _, own, places = np.intersect1d(own_frames, frames, assume_unique=True, return_indices=True)
     selected[places] = rows[own]
@@ -218,11 +206,8 @@ def joint_distances(
 ) -> NDArray[np.float64]:
     """Return the distance of every pair of people in every frame (frames, true, predicted) [m].
 
-    The distance is the mean over common joints, infinite without common joints.
-
-    Args:
-        predicted: (frames, predicted persons, joints, 3) [m]; NaN where missing.
-        true: (frames, true persons, joints, 3) [m]; NaN where missing.
+    The distance is the mean over common joints, infinite without common joints. People are
+    (frames, persons, joints, 3) [m]; NaN where missing.
     """
     distances = np.empty((len(true), true.shape[1], predicted.shape[1]))
     for start in range(0, len(true), _CHUNK):
@@ -239,12 +224,9 @@ def joint_distances(
 def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int64]:
     """Return the predicted person matched to each true one (frames, true), -1 for none.
 
-    One-to-one per frame, with the least sum of distances, where an unmatched true person costs as
-    much as a match at the gate (Hungarian method). Matching ignores ids.
-
-    Args:
-        distances: (frames, true persons, predicted persons) [m].
-        gate: maximum distance between matched persons [m].
+    One-to-one per frame, with the least sum of distances (frames, true persons, predicted persons)
+    [m], where an unmatched true person costs as much as a match at the gate (Hungarian method).
+    Matching ignores ids.
     """
     match = np.full(distances.shape[:2], -1, dtype=np.int64)
     costs = np.minimum(distances, gate)
@@ -258,11 +240,8 @@ def match_people(distances: NDArray[np.float64], gate: float) -> NDArray[np.int6
 def match_boxes(overlap: NDArray[np.float64], least: float) -> NDArray[np.int64]:
     """Return the predicted person matched to each true one (frames, true), -1 for none.
 
-    One-to-one and greedy per frame, by falling overlap (E3).
-
-    Args:
-        overlap: (frames, true persons, predicted persons) intersection over union [1].
-        least: minimum overlap of matched boxes [1].
+    One-to-one and greedy per frame, by falling overlap (frames, true persons, predicted persons)
+    [1], down to the least (E3).
     """
     frames, true, predicted = overlap.shape
     match = np.full((frames, true), -1, dtype=np.int64)
@@ -307,9 +286,7 @@ def merge_tracks(pairs: NDArray[np.int64], cost: NDArray[np.float64]) -> NDArray
 def take_matched(people: NDArray[np.float64], match: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return predicted people in the order of the true ones (frames, true, joints, 3).
 
-    Args:
-        people: (frames, predicted persons, joints, 3) [m].
-        match: (frames, true persons) index of the predicted person, -1 for none, which gives NaN.
+    The match (frames, true persons) has the index of the predicted person; -1, none, gives NaN.
     """
     if not people.shape[1]:
         return np.full((*match.shape, *people.shape[2:]), np.nan)
@@ -360,7 +337,7 @@ def register_world(
     ]
     motion = _one(motions, int(np.argmin(left)))
     for _ in range(_ROUNDS):
-        distances = joint_distances(motion.apply(_flat(predicted)).reshape(predicted.shape), true)
+        distances = joint_distances(move_people(motion, predicted), true)
         found = take_matched(predicted, match_people(distances, gate))
         if not np.isfinite(found).any():
             break
@@ -373,9 +350,9 @@ def _any_joint(people: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(people[..., 0]).any((-1, -2)))
 
 
-def _flat(people: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return people reshaped to (frames, persons * joints, 3)."""
-    return people.reshape(len(people), -1, 3)
+def move_people(motion: Similarity, people: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return people (frames, persons, joints, 3) [m] after a motion of the world."""
+    return motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
 
 
 def _pairs(
@@ -450,13 +427,11 @@ def match_tracks(
         cost = np.where(np.isnan(overlap), np.inf, 1.0 - overlap)
         return merge_tracks(match_boxes(overlap, settings.min_overlap), cost)
     possible = min(
-        int(np.isfinite(side[..., 0]).any(-1).sum())
-        for side in (people, true[np.isfinite(people[..., 0]).any((-1, -2))])
+        int(np.isfinite(side[..., 0]).any(-1).sum()) for side in (people, true[_any_joint(people)])
     )
     if (match >= 0).sum() < settings.min_matched_share * possible:
         motion = register_world(people, true, settings.match_gate_m)
         if motion is not None:
-            moved = motion.apply(people.reshape(len(people), -1, 3)).reshape(people.shape)
-            distances = joint_distances(moved, true)
+            distances = joint_distances(move_people(motion, people), true)
             match = match_people(distances, settings.match_gate_m)
     return merge_tracks(match, distances)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
@@ -40,10 +41,7 @@ mid-shoulder to the middle of the ears."""
 
 
 def limb_ends(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return both ends of every limb, NaN where a joint is missing.
-
-    Args:
-        joints: (..., 17, 3) [m].
+    """Return both ends of every limb of COCO-17 joints (..., 17, 3) [m]; NaN where one is missing.
 
     Returns:
         (..., 10, 2, 3) [m], in the order of `LIMBS`.
@@ -62,10 +60,7 @@ def correct_limbs(
 ) -> NDArray[np.bool_]:
     """Return a mask of correct limbs (..., 10): mean error of ends at most alpha times length.
 
-    Args:
-        predicted: (..., 17, 3) [m]; a limb with a missing joint is wrong.
-        true: (..., 17, 3) [m].
-        alpha: share of the true length.
+    Joints are (..., 17, 3) [m]; a limb with a missing joint is wrong.
 
     Note:
         Burenius et al., CVPR 2013, in the form used for Shelf and Campus: the mean of both errors
@@ -74,37 +69,23 @@ def correct_limbs(
     true_ends = limb_ends(true)
     error = np.linalg.norm(limb_ends(predicted) - true_ends, axis=-1).mean(axis=-1)
     length = np.linalg.norm(true_ends[..., 0, :] - true_ends[..., 1, :], axis=-1)
-    correct: NDArray[np.bool_] = error <= alpha * length
-    return correct
+    return np.asarray(error <= alpha * length)
 
 
 def paper_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joints of E4 (..., 14, 3) [m], NaN where missing.
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
+    """Return the joints of E4 (..., 14, 3) [m] from COCO-17 (..., 17, 3), NaN where missing."""
     neck = joints[..., 5:7, :].mean(axis=-2, keepdims=True)
     return np.concatenate([joints[..., :1, :], neck, joints[..., 5:, :]], axis=-2)
 
 
 def challenge_joints(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joints that the challenge and COCO-17 share (..., 13, 3) [m].
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
+    """Return the joints (..., 13, 3) [m] that the challenge shares with COCO-17 (..., 17, 3)."""
     return np.concatenate([joints[..., :1, :], joints[..., 5:, :]], axis=-2)
 
 
 def mid_hip(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle of the hips (..., 3) [m], NaN if one is missing.
-
-    Args:
-        joints: (..., 17, 3) [m], COCO-17.
-    """
-    middle: NDArray[np.float64] = joints[..., 11:13, :].mean(axis=-2)
-    return middle
+    """Return the middle of the hips (..., 3) [m] of COCO-17 joints, NaN if one is missing."""
+    return np.asarray(joints[..., 11:13, :].mean(axis=-2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +150,8 @@ def aligned_errors(
 def path_lengths(true: NDArray[np.float64], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the length of every true person's path (persons,) [m].
 
-    The path of the mid-hip through the compared frames, with straight lines across gaps.
-
-    Args:
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
-        compared: (frames, persons) whether both sides have the person.
+    The path of the mid-hip of joints (frames, persons, 17, 3) [m] through the compared frames
+    (frames, persons), with straight lines across gaps.
     """
     hips = mid_hip(true)
     used = compared & np.isfinite(hips[..., 0])
@@ -189,10 +167,7 @@ def drift_per_meter(
 ) -> float | None:
     """Return the mean over people of mean error over path length [1], None without long paths.
 
-    Args:
-        errors: (frames, persons, joints) [m]; NaN where missing.
-        lengths: (persons,) path lengths [m].
-        min_length: minimum path length per person [m].
+    Errors are (frames, persons, joints) [m], NaN where missing; path lengths (persons,) [m].
 
     Note:
         E1. The ratio of the published columns does not give the published drift, so that the drift
@@ -212,11 +187,8 @@ def challenge_errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return global and local joint errors (frames, persons, 13) [m], without any alignment.
 
-    Local errors are relative to the mid-hip of each side.
-
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
+    Local errors are relative to the mid-hip of each side. Joints are (frames, persons, 17, 3) [m],
+    those predicted in the order of the true people; NaN where missing.
     """
     offset = challenge_joints(predicted) - challenge_joints(true)
     roots = (mid_hip(predicted) - mid_hip(true))[..., None, :]
@@ -231,13 +203,8 @@ def acceleration_errors(
 ) -> NDArray[np.float64]:
     """Return errors of joint acceleration (frames - 2, persons, 14) [m/s^2], NaN where unknown.
 
-    Second differences of three successive frames at the minimum step, on the joints of E4.
-
-    Args:
-        predicted: (frames, persons, 17, 3) [m], in the order of the true people; NaN = missing.
-        true: (frames, persons, 17, 3) [m]; NaN where missing.
-        frames: (frames,) match frames, rising.
-        fps: match frames per second [1/s].
+    Second differences of three successive frames at the minimum step, on the joints of E4. Joints
+    are (frames, persons, 17, 3) [m] as in `challenge_errors`; match frames (frames,) rise.
     """
     offset = paper_joints(predicted) - paper_joints(true)
     steps = np.diff(frames)
@@ -315,7 +282,7 @@ def evaluate_joints(
     idle[frame, match[frame, person]] = True
 
     true = np.where(counts[..., None], reference.joints, np.nan)
-    tally = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
+    scores_of = _tally(take_matched(people, match), true, present, settings.pcp_alpha)
     identity = identity_scores(distances, present, exists & ~idle, settings.match_gate_m)
     around = None if boxes is None else select_frames(boxes, prediction.frames, reference.frames)
     tracks = match_tracks(people, reference.joints, distances, match, camera, around, settings)
@@ -324,18 +291,13 @@ def evaluate_joints(
     )
     minutes = _minutes(reference.frames, fps)
     evaluation = Evaluation(
-        **tally.scores((slice(None), slice(None))),
+        **scores_of(slice(None)),
         **figures,
         false_persons_per_frame=_ratio(exists.sum() - (match >= 0).sum(), frames),
-        idf1=identity.idf1,
-        hota=identity.hota,
-        detection_accuracy=identity.detection_accuracy,
-        association_accuracy=identity.association_accuracy,
-        switches=identity.switches,
+        **asdict(identity),
         switches_per_minute=(
             None if identity.switches is None or not minutes else identity.switches / minutes
         ),
-        fragmentations=identity.fragmentations,
         persons=int(present.any(axis=0).sum()),
         frames=frames,
     )
@@ -343,7 +305,7 @@ def evaluate_joints(
         PersonScore(
             person_id=int(person_id),
             frames=int(present[:, index].sum()),
-            **tally.scores((slice(None), index)),
+            **scores_of(index),
             **persons[index],
         )
         for index, person_id in enumerate(reference.person_ids)
@@ -351,44 +313,30 @@ def evaluate_joints(
     return evaluation, scores
 
 
-@dataclass(frozen=True, eq=False)
-class _Tally:
-    """Counts and errors of matched people; the first dimensions are frames and true persons."""
-
-    frames: NDArray[np.bool_]
-    matched: NDArray[np.bool_]
-    joints: NDArray[np.bool_]
-    found: NDArray[np.bool_]
-    error: NDArray[np.float64]
-    limbs: NDArray[np.bool_]
-    correct: NDArray[np.bool_]
-
-    def scores(self, part: tuple[slice, slice | int]) -> dict[str, float | None]:
-        """Return metrics over a part of the frames and persons."""
-        return {
-            "coverage": _ratio(self.matched[part].sum(), self.frames[part].sum()),
-            "joint_coverage": _ratio(self.found[part].sum(), self.joints[part].sum()),
-            "mpjpe_mm": _ratio(1000.0 * self.error[part].sum(), self.found[part].sum()),
-            "pcp3d": _ratio(100.0 * self.correct[part].sum(), self.limbs[part].sum()),
-        }
-
-
 def _tally(
     predicted: NDArray[np.float64],
     true: NDArray[np.float64],
     present: NDArray[np.bool_],
     alpha: float,
-) -> _Tally:
+) -> Callable[[slice | int], dict[str, float | None]]:
+    """Compare matched people (frames, persons, 17, 3) [m]; return metrics by true persons."""
     error = np.linalg.norm(predicted - true, axis=-1)
-    return _Tally(
-        frames=present,
-        matched=present & np.any(np.isfinite(predicted[..., 0]), axis=-1),
-        joints=np.isfinite(true[..., 0]),
-        found=np.isfinite(error),
-        error=np.where(np.isfinite(error), error, 0.0),
-        limbs=np.all(np.isfinite(limb_ends(true)), axis=(-1, -2)),
-        correct=correct_limbs(predicted, true, alpha),
-    )
+    found = np.isfinite(error)
+    matched = present & np.any(np.isfinite(predicted[..., 0]), axis=-1)
+    joints = np.isfinite(true[..., 0])
+    error = np.where(found, error, 0.0)
+    limbs = np.all(np.isfinite(limb_ends(true)), axis=(-1, -2))
+    correct = correct_limbs(predicted, true, alpha)
+
+    def scores(who: slice | int) -> dict[str, float | None]:
+        return {
+            "coverage": _ratio(matched[:, who].sum(), present[:, who].sum()),
+            "joint_coverage": _ratio(found[:, who].sum(), joints[:, who].sum()),
+            "mpjpe_mm": _ratio(1000.0 * error[:, who].sum(), found[:, who].sum()),
+            "pcp3d": _ratio(100.0 * correct[:, who].sum(), limbs[:, who].sum()),
+        }
+
+    return scores
 
 
 def _ratio(part: float, whole: float) -> float | None:

@@ -56,13 +56,9 @@ class BodyTracks:
 
 
 def zoom_camera(camera: Camera, corner: Floats, scale: float, size: tuple[int, int]) -> Camera:
-    """Return the camera of an enlarged part of another camera's image.
+    """Return the camera of a part of a single camera's image, enlarged to a size [px].
 
-    Args:
-        camera: the other camera, single.
-        corner: top left of the part [px]; (-0.5, -0.5) is that of the image.
-        scale: enlargement [1].
-        size: width and height of the new image [px].
+    The corner is the top left of the part [px]; (-0.5, -0.5) is that of the image.
     """
     return replace(
         camera,
@@ -175,16 +171,10 @@ def plot_bodies(
     still: Image | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of all bodies in one camera: the part of the image with most people.
+    """Return a PNG of all bodies in one single camera: the part of the image with most people.
 
-    Args:
-        camera: a single camera.
-        title: names camera, frame and body model.
-        surfaces: (persons, vertices, 3) [m], world; NaN for missing people.
-        faces: (triangles, 3), counter-clockwise seen from outside.
-        person_ids: (persons,).
-        still: background image (height, width, 3), RGB, of the camera; None = plain ground.
-        pitch: draw its markings if there is no still; None without a pitch.
+    Surfaces are (persons, vertices, 3) [m], world, NaN for missing people; faces (triangles, 3),
+    counter-clockwise seen from outside. Without a still, RGB, the markings of the pitch are drawn.
     """
     present = np.isfinite(surfaces[:, 0, 0])
     ids = np.asarray(person_ids)[present]
@@ -208,9 +198,7 @@ def plot_bodies(
 def crowded_part(camera: Camera, bodies: Floats) -> tuple[Floats, Floats]:
     """Return corner and side lengths [px] of the part of an image that shows most people.
 
-    Args:
-        camera: a single camera.
-        bodies: (persons, points, 3) [m], world.
+    The camera is single; bodies are (persons, points, 3) [m], world.
     """
     size = np.asarray(camera.image_size, dtype=np.float64)
     side = IMAGE_SHARE * size

@@ -19,9 +19,8 @@ from worldpose.reports.drawing import (
     INK,
     PALETTE,
     TEMPLATE,
-    draw_skeleton,
-    markings,
-    person_color,
+    draw_markings,
+    draw_people,
     picture_panels,
     png,
     style,
@@ -95,12 +94,7 @@ def _curves(camera: Camera) -> dict[str, Floats]:
 def largest_pose_changes(before: Camera, after: Camera, tracks: JointTracks) -> tuple[int, int]:
     """Return the frame index and person index with the largest distance between two projections.
 
-    Only people well inside the image count; (0, 0) without any.
-
-    Args:
-        before: a batch (frames,).
-        after: another batch (frames,).
-        tracks: people in the same frames.
+    Cameras are batches (frames,). Only people well inside the image count; (0, 0) without any.
     """
     frames, persons = tracks.joints.shape[:2]
     one, two = (
@@ -129,17 +123,8 @@ def plot_before_after(
 ) -> bytes:
     """Return a PNG of one person, their surroundings and the markings in two camera estimates.
 
-    Crosses are detected keypoints, which are the same in both.
-
-    Args:
-        before: a single camera.
-        after: another single camera.
-        tracks: people, one colour each.
-        frame: index in `tracks`.
-        person: index in `tracks` of the central person.
-        still: background image (height, width, 3), RGB.
-        seen: detected keypoints (detections, 17, 2) [px].
-        pitch: draw its markings; None without a pitch.
+    The cameras are single; `frame` and `person` are indices in `tracks`. Crosses are detected
+    keypoints `seen` (detections, 17, 2) [px], the same in both; `still` is (height, width, 3), RGB.
     """
     shown = after.project(tracks.joints[frame, person])
     middle = np.nan_to_num(shown[np.isfinite(shown).all(axis=-1)].mean(axis=0))
@@ -150,10 +135,8 @@ def plot_before_after(
     side = tall * np.array([2.6, 1.7])
     figure, panels = picture_panels(titles, middle - 0.5 * side, side, still=still)
     for axes, camera in zip(panels, (before, after), strict=True):
-        for line in markings(pitch) if pitch is not None else ():
-            axes.plot(*camera.project(line).T, color=TEMPLATE, linewidth=1.3, zorder=1)
-        for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
-            draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
+        draw_markings(axes, camera, pitch, TEMPLATE, 1.3)
+        draw_people(axes, camera, tracks, frame)
         axes.plot(*seen.reshape(-1, 2).T, "x", color="white", markersize=5.0, zorder=4)
     return png(figure)
 
@@ -181,14 +164,10 @@ def plot_flow(
     rejected: NDArray[np.bool_],
     predicted: Floats,
 ) -> bytes:
-    """Return a PNG of the optical flow from a frame to the next, with inliers and outliers.
+    """Return a PNG of the optical flow from a frame, RGB, to the next, with inliers and outliers.
 
-    Args:
-        still: the frame (height, width, 3), RGB.
-        start: (n, 2) points in it [px].
-        end: (n, 2) their positions in the next frame [px].
-        rejected: (n,) outliers.
-        predicted: (n, 2) positions predicted by the estimated camera [px].
+    Points (n, 2) [px] start in the frame, and end in the next one; the estimated camera predicts
+    their positions there. `rejected` (n,) are outliers.
     """
     height, width = still.shape[:2]
     longest = float(np.linalg.norm(end - start, axis=-1).max(initial=1e-6))

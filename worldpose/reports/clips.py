@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,13 +26,15 @@ from worldpose.reports.drawing import (
     PALETTE,
     TEMPLATE,
     draw_label,
+    draw_markings,
+    draw_people,
     draw_pitch,
     draw_skeleton,
-    markings,
     person_color,
     picture_panels,
+    pitch_corners,
     png,
-    style,
+    style_ground,
 )
 
 
@@ -45,11 +47,8 @@ def plot_paths(
 ) -> bytes:
     """Return a PNG of all people's paths over the ground: the whole scene, and a close-up.
 
-    Args:
-        tracks: one dot per frame and person, with the person's id at the end of the path.
-        truth: true paths, as broad grey lines under the dots.
-        cameras: single cameras by id, as triangles.
-        pitch: draw its markings; None without a pitch.
+    There is a dot per frame and person, with the id at the end of the path; true paths are broad
+    grey lines under the dots, and single cameras, by id, are triangles.
     """
     ways = _ground(tracks)
     true_ways = _ground(truth) if truth is not None else np.empty((0, 0, 2))
@@ -61,16 +60,14 @@ def plot_paths(
     centers = {name: camera.center[:2] for name, camera in (cameras or {}).items()}
     corners = [everywhere, *(center[None] for center in centers.values())]
     if pitch is not None:
-        corners.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
+        corners.append(pitch_corners(pitch))
     whole = _frame(np.concatenate(corners), 6.0)
 
     figure = Figure(figsize=(14.0, 5.7), dpi=110, layout="constrained", facecolor="white")
     overview, detail = figure.subplots(1, 2)
     for axes, (low, high) in ((overview, whole), (detail, close)):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        axes.set_xlabel("x, along the touch line [m]", color=INK)
-        axes.set_ylabel("y, across [m]", color=INK)
-        style(axes)
+        style_ground(axes)
         if pitch is not None:
             draw_pitch(axes, pitch)
     for way in true_ways.swapaxes(0, 1):
@@ -129,23 +126,15 @@ def plot_camera_view(
     still: NDArray[np.uint8] | None = None,
     pitch: PitchSpec | None = None,
 ) -> bytes:
-    """Return a PNG of markings and people projected into one camera.
+    """Return a PNG of markings and people projected into one single camera.
 
-    Args:
-        camera: a single camera.
-        title: names camera and frame.
-        tracks: people, one colour each.
-        frame: index in `tracks` of the frame to draw.
-        still: background image (height, width, 3), RGB, of the camera; None = plain ground.
-        pitch: draw its markings; None without a pitch.
+    `frame` is an index in `tracks`; `still` is the background (height, width, 3), RGB, None = plain
+    ground.
     """
     width, height = (int(n) for n in camera.image_size)
     figure, (axes,) = picture_panels([title], (-0.5, -0.5), (width, height), still=still)
-    line_color = LINE if still is None else TEMPLATE
-    for line in markings(pitch) if pitch is not None else ():
-        axes.plot(*camera.project(line).T, color=line_color, linewidth=1.3, zorder=1)
-    for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
-        draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
+    draw_markings(axes, camera, pitch, LINE if still is None else TEMPLATE, 1.3)
+    draw_people(axes, camera, tracks, frame)
     return png(figure)
 
 
@@ -158,19 +147,13 @@ def plot_stadium(
 ) -> bytes:
     """Return a PNG of the stadium from above in the first frame: cameras, fields of view, people.
 
-    Shading shows the ground in each camera's field of view, on and near the pitch if there is one:
-    the more cameras see a place, the darker it is.
-
-    Args:
-        cameras: single cameras by id.
-        title: names the frame.
-        tracks: people, one colour each, with their ids.
-        pitch: draw its markings; None without a pitch.
+    Shading shows the ground in each single camera's field of view, on and near the pitch if there
+    is one: the more cameras see a place, the darker it is.
     """
     hips = tracks.joints[0][:, HIPS, :2].mean(axis=1)
     places = [camera.center[None, :2] for camera in cameras.values()] + [hips]
     if pitch is not None:
-        places.append(0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]]))
+        places.append(pitch_corners(pitch))
     everything = np.concatenate(places)
     everything = everything[np.isfinite(everything[:, 0])]
     low, high = everything.min(axis=0) - 8.0, everything.max(axis=0) + np.array([14.0, 8.0])
@@ -179,9 +162,7 @@ def plot_stadium(
     figure.set_layout_engine("constrained")
     axes = figure.subplots()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axes.set_xlabel("x, along the touch line [m]", color=INK)
-    axes.set_ylabel("y, across [m]", color=INK)
-    style(axes)
+    style_ground(axes)
     ground = None
     if pitch is not None:
         draw_pitch(axes, pitch)
@@ -206,15 +187,7 @@ def plot_stadium(
     for person_id, place in zip(tracks.person_ids, hips, strict=True):
         if np.isfinite(place).all():
             color = person_color(int(person_id))
-            axes.plot(
-                place[0],
-                place[1],
-                "o",
-                color=color,
-                markersize=8.0,
-                markeredgecolor="white",
-                zorder=5,
-            )
+            axes.plot(*place, "o", color=color, markersize=8.0, markeredgecolor="white", zorder=5)
             draw_label(axes, f"{person_id}", (place[0], place[1]), (5, 5), color)
     axes.set_title(title, color=INK, loc="left", fontsize=12)
     return png(figure)
@@ -281,15 +254,10 @@ def plot_detections(
     pitch: PitchSpec | None = None,
     part: tuple[Floats, Floats] | None = None,
 ) -> bytes:
-    """Return a PNG of a part of an image: detections on the left, reconstruction on the right.
+    """Return a PNG of a part of a single camera's image: detections, and the reconstruction.
 
-    Args:
-        camera: a single camera.
-        detections: its detections, on the left.
-        people: the reconstruction, on the right, with one colour per person.
-        still: background image (height, width, 3), RGB; None = plain ground.
-        pitch: draw its markings on the right; None without a pitch.
-        part: corner and side lengths (2,) [px] of the part; None = the part with most people.
+    The part has a corner and side lengths (2,) [px]; None = the part with most people. Without a
+    still, RGB, the ground is plain.
     """
     boxes, joints = detections.boxes, people.joints
     whole = joints[np.isfinite(joints).all((-1, -2))]
@@ -304,11 +272,9 @@ def plot_detections(
     figure, (before, after) = picture_panels(titles, corner, side, still=still, ground=ground)
     for number in np.flatnonzero(there):
         color = USED if number in detections.used else LEFT_OUT
-        _box(before, boxes[number], color, dashed=False)
+        _box(before, boxes[number], color)
         draw_skeleton(before, detections.keypoints[number], color)
-    line_color = LINE if still is None else TEMPLATE
-    for line in markings(pitch) if pitch is not None else ():
-        after.plot(*camera.project(line).T, color=line_color, linewidth=1.2, zorder=1)
+    draw_markings(after, camera, pitch, LINE if still is None else TEMPLATE)
     for person in np.flatnonzero(found):
         color = person_color(int(people.person_ids[person]))
         pixels = camera.project(joints[person])
@@ -319,22 +285,18 @@ def plot_detections(
         (left, top), (right, bottom) = pixels.min(0), pixels.max(0)
         margin = 0.08 * (bottom - top)
         around = np.array([left - margin, top - margin, right + margin, bottom + margin])
-        _box(after, around, color, dashed=not people.seen[person])
+        _box(after, around, color, "-" if people.seen[person] else "--")
         draw_label(after, f"{people.person_ids[person]}", (left, top - margin), (0, 3), color)
     return png(figure)
 
 
-def _box(axes: Axes, box: NDArray[np.floating], color: str, *, dashed: bool) -> None:
+def _box(axes: Axes, box: NDArray[np.floating], color: str, style: str = "-") -> None:
     x0, y0, x1, y1 = (float(value) for value in box)
-    axes.add_patch(
-        Rectangle(
-            (x0, y0),
-            x1 - x0,
-            y1 - y0,
-            fill=False,
-            color=color,
-            linewidth=1.3,
-            linestyle="--" if dashed else "-",
-            zorder=2,
-        )
-    )
+    look: dict[str, Any] = {
+        "fill": False,
+        "color": color,
+        "linewidth": 1.3,
+        "linestyle": style,
+        "zorder": 2,
+    }
+    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, **look))

@@ -16,13 +16,7 @@ from worldpose.reports.html_page import CaptionedImage, Failure, Section, Table,
 
 
 def data_set_page(title: str, found: DataSetStatistics, checks: Mapping[str, CheckReport]) -> str:
-    """Return a self-contained HTML page.
-
-    Args:
-        title: heading of the page.
-        found: statistics of the data set.
-        checks: findings of the check per folder.
-    """
+    """Return a self-contained HTML page of statistics, and of findings of the check per folder."""
     people = "-" if found.subjects_per_frame is None else f"{found.subjects_per_frame:.1f}"
     wrong = sum(len(report.findings) for report in checks.values())
     tiles = (

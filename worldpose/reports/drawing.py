@@ -31,6 +31,8 @@ from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
+from worldpose.formats.joints_file import JointTracks
+from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 
 if TYPE_CHECKING:
@@ -70,6 +72,37 @@ def draw_pitch(axes: Axes, pitch: PitchSpec) -> None:
     axes.add_patch(Rectangle(corner, pitch.length, pitch.width, color=GRASS, zorder=0))
     for line in markings(pitch):
         axes.plot(line[:, 0], line[:, 1], color=LINE, linewidth=1.2, zorder=1)
+
+
+def style_ground(axes: Axes) -> None:
+    """Style axes that show the ground from above, in metres of the world."""
+    axes.set_xlabel("x, along the touch line [m]", color=INK)
+    axes.set_ylabel("y, across [m]", color=INK)
+    style(axes)
+
+
+def draw_markings(
+    axes: Axes,
+    camera: Camera,
+    pitch: PitchSpec | None,
+    color: str,
+    width: float = 1.2,
+    zorder: int = 1,
+) -> None:
+    """Draw the markings as a single camera projects them; nothing without a pitch."""
+    for line in markings(pitch) if pitch is not None else ():
+        axes.plot(*camera.project(line).T, color=color, linewidth=width, zorder=zorder)
+
+
+def draw_people(axes: Axes, camera: Camera, tracks: JointTracks, frame: int) -> None:
+    """Draw the skeletons of all people as a single camera projects them; `frame` is an index."""
+    for person_id, joints in zip(tracks.person_ids, tracks.joints[frame], strict=True):
+        draw_skeleton(axes, camera.project(joints), person_color(int(person_id)))
+
+
+def pitch_corners(pitch: PitchSpec) -> NDArray[np.float64]:
+    """Return two opposite corners of the pitch (2, 2) [m]."""
+    return 0.5 * np.array([[-pitch.length, -pitch.width], [pitch.length, pitch.width]])
 
 
 def markings(pitch: PitchSpec) -> list[NDArray[np.float64]]:
@@ -220,6 +253,11 @@ def person_color(person_id: int) -> str:
     return PALETTE[person_id % len(PALETTE)]
 
 
+def rgb(color: str) -> tuple[int, int, int]:
+    """Return `#rrggbb` as numbers."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+
+
 def png(figure: Figure) -> bytes:
     """Return the figure as PNG without date or version: equal figures have equal bytes."""
     canvas: Any = FigureCanvasAgg(figure)
@@ -336,13 +374,7 @@ def require_plot(path: Path) -> None:
 
 
 def draw_synchronization(found: Synchronization, names: Sequence[str], path: Path) -> None:
-    """Write a plot of each camera's matches by its clock offset, as SVG, PDF or PNG.
-
-    Args:
-        found: the offsets.
-        names: of the cameras.
-        path: file to write; its suffix is the form.
-    """
+    """Write a plot of each camera's matches by its clock offset; the suffix is the form."""
     figure = Figure(figsize=(7.0, 1.3 * len(names) + 0.8), layout="constrained")
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for panel, name, matches, late, std, reason in zip(
@@ -368,12 +400,7 @@ def draw_synchronization(found: Synchronization, names: Sequence[str], path: Pat
 
 
 def draw_lens_fits(fits: Mapping[str, LensFit], path: Path) -> None:
-    """Write a plot of board corners, their residuals, and residuals by radius, for each camera.
-
-    Args:
-        fits: lenses by camera.
-        path: file to write; its suffix is the form.
-    """
+    """Write a plot of board corners, their residuals, and residuals by radius, by camera."""
     figure = Figure(figsize=(8.0, 3.2 * len(fits)), layout="constrained")
     rows = figure.subplots(len(fits), 2, squeeze=False)
     for (seen, radial), (name, fit) in zip(rows, fits.items(), strict=True):

@@ -105,17 +105,12 @@ def whole_page(
     tiles: Sequence[tuple[str, str]] = (),
     last: Folded | None = None,
 ) -> str:
-    """Return a whole HTML page.
+    """Return a whole HTML page, without the sections that have no blocks.
 
-    Args:
-        title: heading of the page.
-        about: subtitle.
-        sections: sections of the page; those without blocks are left out.
-        tiles: key metrics at the top, each with its label.
-        last: folded tables after the sections.
+    Tiles are key metrics at the top, each with its label.
     """
     shown = [section for section in sections if section.blocks]
-    allowed = " ".join(dict.fromkeys(map(_allow, _scripts(shown))))
+    allowed = " ".join(dict.fromkeys(_allowed_scripts(shown)))
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
     policy += f"; script-src {allowed}" if allowed else ""
     numbers = count(1)
@@ -135,6 +130,7 @@ def whole_page(
         end = (
             f'\n<section id="last"><h2>{escape(last.heading)}</h2>\n{_folded_html(last)}</section>'
         )
+    style = (files("worldpose.reports") / "page" / "report.css").read_text(encoding="utf-8")
     marks = "".join(
         f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in tiles
     )
@@ -142,7 +138,7 @@ def whole_page(
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_part('report.css')}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f"<header><div><h1>{escape(title)}</h1><p>{escape(about)}</p>"
         f'<div class="tiles">{marks}</div></div></header>\n'
         f'<nav aria-label="Parts of this page"><div>{links}</div></nav>\n'
@@ -150,23 +146,14 @@ def whole_page(
     )
 
 
-def _part(name: str) -> str:
-    """Return the text of a page resource."""
-    return (files("worldpose.reports") / "page" / name).read_text(encoding="utf-8")
-
-
-def _scripts(sections: Sequence[Section]) -> Iterator[str]:
-    """Yield the scripts of embedded pages, which inherit the policy of this page."""
+def _allowed_scripts(sections: Sequence[Section]) -> Iterator[str]:
+    """Yield a source of the policy, which embedded pages inherit, for each of their scripts."""
     for section in sections:
         for block in section.blocks:
             if isinstance(block, EmbeddedPage):
-                yield from re.findall(r'<script type="module">(.*?)</script>', block.html, re.S)
-
-
-def _allow(script: str) -> str:
-    """Return the source of a Content-Security-Policy that allows exactly this script."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    return f"'sha256-{digest}'"
+                for script in re.findall(r'<script type="module">(.*?)</script>', block.html, re.S):
+                    digest = base64.b64encode(hashlib.sha256(script.encode()).digest())
+                    yield f"'sha256-{digest.decode('ascii')}'"
 
 
 def _section(section: Section, number: int, small: Mapping[bytes, SmallImage]) -> str:
@@ -254,11 +241,7 @@ SmallImage: TypeAlias = tuple[str, bytes, tuple[int, int]]
 
 
 def compress_image(png: bytes) -> SmallImage:
-    """Return kind, content and size (width, height) [px] of an image: WebP if it is smaller.
-
-    Args:
-        png: a PNG.
-    """
+    """Return kind, content and size (width, height) [px] of a PNG: as WebP if it is smaller."""
     size = (int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big"))
     if len(png) < LARGE:
         return "png", png, size

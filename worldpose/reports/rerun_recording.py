@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.colors import to_rgb
 
 from data_contracts.conventions import COCO17_BONES
 from data_contracts.pitch import PitchSpec
@@ -15,7 +14,7 @@ from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
-from worldpose.reports.drawing import markings, person_color
+from worldpose.reports.drawing import markings, person_color, rgb
 
 NAME: Final = "worldpose"
 _WHITE: Final = (235, 235, 235)
@@ -79,10 +78,7 @@ def _skeletons(rr: Any, tracks: JointTracks, row: int) -> Any:  # noqa: ANN401
     """Return the bones of all people in one frame."""
     ends = tracks.joints[row][:, np.array(COCO17_BONES)]
     people, bones = np.nonzero(np.isfinite(ends).all((-1, -2)))
-    shades = {
-        person: tuple(round(255 * part) for part in to_rgb(person_color(int(number))))
-        for person, number in enumerate(tracks.person_ids)
-    }
+    shades = [rgb(person_color(int(number))) for number in tracks.person_ids]
     return rr.LineStrips3D(
         ends[people, bones],
         colors=[shades[person] for person in people.tolist()],

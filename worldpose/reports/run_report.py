@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from data_contracts.evaluation import Evaluation
@@ -177,31 +176,6 @@ def format_number(value: float) -> str:
     return f"{value:,.0f}" if float(value).is_integer() or abs(value) >= 1e4 else f"{value:.4g}"
 
 
-@dataclass(frozen=True)
-class CameraSummary:
-    """Accuracy of one static camera.
-
-    Attributes:
-        camera_id: the camera.
-        origin: `given`, or the evidence of its calibration.
-        ground_error_median_m: expected ground error, median over the visible pitch [m].
-        ground_error_p95_m: expected ground error, 95th percentile [m].
-        reprojection_rms_px: root mean square reprojection error of the inlying clicks [px].
-        clicks_used: number of inlying clicks.
-        clicks_wrong: names of outliers among the clicks.
-        weak: why a person should review the camera; empty without warnings.
-    """
-
-    camera_id: str
-    origin: str
-    ground_error_median_m: float | None = None
-    ground_error_p95_m: float | None = None
-    reprojection_rms_px: float | None = None
-    clicks_used: int | None = None
-    clicks_wrong: tuple[str, ...] = ()
-    weak: tuple[str, ...] = ()
-
-
 def report_page(
     title: str,
     run: RunRecord,
@@ -213,13 +187,8 @@ def report_page(
 ) -> str:
     """Return a self-contained HTML page without external resources.
 
-    Args:
-        title: heading of the page.
-        run: record of the run, with the quality metrics of its units.
-        seconds: computation time of each unit, by `stage/unit` [s].
-        scores: metrics against the truth, if there is a reference.
-        sections: sections of the page; those without blocks are left out.
-        tiles: key metrics at the top, each with its label.
+    `seconds` is the computation time of each unit, by `stage/unit` [s]; scores are metrics against
+    the truth, if there is a reference.
     """
     shown = list(sections)
     if run.warnings:
@@ -249,35 +218,8 @@ def _record(run: RunRecord, seconds: Mapping[str, float]) -> tuple[Table, ...]:
     )
 
 
-def camera_table(cameras: Sequence[CameraSummary]) -> Table:
-    """Return a table of static cameras."""
-    columns = (
-        "camera",
-        "from",
-        ">expected ground error mm",
-        ">95 % mm",
-        ">clicks rms px",
-        ">clicks",
-        "wrong clicks",
-        "weak because",
-    )
-    rows = tuple(
-        (
-            camera.camera_id,
-            camera.origin,
-            _or_dash(camera.ground_error_median_m, 1000.0, 1),
-            _or_dash(camera.ground_error_p95_m, 1000.0, 1),
-            _or_dash(camera.reprojection_rms_px, 1.0, 2),
-            _or_dash(camera.clicks_used, 1.0, 0),
-            ", ".join(camera.clicks_wrong),
-            Failure("; ".join(camera.weak)),
-        )
-        for camera in cameras
-    )
-    return Table("", columns, rows)
-
-
-def _or_dash(value: float | None, scale: float, decimals: int) -> str:
+def format_scaled(value: float | None, scale: float, decimals: int) -> str:
+    """Return a number times a factor with some decimals; a dash for none."""
     return "-" if value is None else f"{scale * value:,.{decimals}f}"
 
 

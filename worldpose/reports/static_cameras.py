@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,11 +20,12 @@ from worldpose.reports.drawing import (
     LINE,
     TEMPLATE,
     draw_label,
+    draw_markings,
     markings,
     picture_panels,
     png,
     show_image,
-    style,
+    style_ground,
 )
 
 ACCEPTED: Final = "#0072b2"
@@ -37,29 +37,18 @@ ERROR_RANGE: Final = (0.005, 1.0)
 """Range of expected ground errors of the colour scale [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Click:
-    """A clicked point, as inlier or outlier of its camera.
-
-    Attributes:
-        name: name of the pitch template.
-        place: (2,) the click [px].
-        inlier: whether the fit includes the click.
-    """
+class Click(NamedTuple):
+    """A clicked point of the template at a place (2,) [px], and whether the fit includes it."""
 
     name: str
     place: NDArray[np.float64]
     inlier: bool
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorMap:
-    """Expected ground error over the pitch.
+class ErrorMap(NamedTuple):
+    """Expected ground error (rows, columns) at x (columns,) and y (rows,) of the world [m].
 
-    Attributes:
-        x: (columns,) [m], world.
-        y: (rows,) [m], world.
-        expected: (rows, columns) [m]; NaN outside the field of view.
+    NaN outside the field of view.
     """
 
     x: NDArray[np.float64]
@@ -78,13 +67,8 @@ def plot_calibration(
 ) -> bytes:
     """Return a PNG with the template and all clicks over the still, and the coverage map below.
 
-    Args:
-        camera: a single camera.
-        title: names the camera.
-        pitch: its markings are projected.
-        clicks: inliers are circles, outliers crosses with their names.
-        still: the camera's image (height, width, 3), RGB; None = plain ground.
-        error_map: coverage map; None = no map.
+    The camera is single; inlier clicks are circles, outliers crosses with their names. `still` is
+    the camera's image (height, width, 3), RGB, None = plain ground.
     """
     width, height = (int(n) for n in camera.image_size)
     below = 0 if error_map is None else MAP_HEIGHT
@@ -93,9 +77,7 @@ def plot_calibration(
     )
     if error_map is not None:
         _draw_error_map(figure, error_map, pitch)
-    for line in markings(pitch):
-        color = TEMPLATE if still is not None else LINE
-        axes.plot(*camera.project(line).T, color=color, linewidth=1.2, zorder=1)
+    draw_markings(axes, camera, pitch, LINE if still is None else TEMPLATE)
     for click in clicks:
         sign, color = ("o", ACCEPTED) if click.inlier else ("x", REFUSED)
         axes.plot(
@@ -130,9 +112,7 @@ def _draw_error_map(figure: Figure, error_map: ErrorMap, pitch: PitchSpec) -> No
     )
     for line in markings(pitch):
         axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.0, zorder=1)
-    axes.set_xlabel("x, along the touch line [m]", color=INK)
-    axes.set_ylabel("y, across [m]", color=INK)
-    style(axes)
+    style_ground(axes)
     beside = figure.add_axes((0.83, 0.12 * high, 0.015, 0.76 * high))
     bar = figure.colorbar(shades, cax=beside, extend="both")
     bar.set_label("expected ground error [m]", color=INK)
@@ -153,12 +133,9 @@ NEAR_PAINT_PX: Final = 12.0
 
 
 def detect_paint(still: Image) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of pixels that look like paint.
+    """Return the mask (height, width) of pixels of a still, RGB, that look like paint.
 
     They are colourless, bright, brighter than both sides, and part of a long region.
-
-    Args:
-        still: (height, width, 3), RGB.
     """
     grey = cv2.GaussianBlur(cv2.cvtColor(still, cv2.COLOR_RGB2GRAY), (3, 3), 0)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (MAX_WIDTH_PX, MAX_WIDTH_PX))
@@ -186,12 +163,8 @@ def marking_distances(
 ) -> NDArray[np.float64]:
     """Return distances of projected marking samples to paint (n,) [px].
 
-    The result omits samples without paint nearby, which are occluded or outside the image.
-
-    Args:
-        camera: a single camera.
-        pitch: pitch with the markings.
-        distance: result of `distance_to`.
+    The camera is single, the distance that of `distance_to`. The result omits samples without paint
+    nearby, which are occluded or outside the image.
     """
     height, width = distance.shape
     pixels = np.concatenate([camera.project(line) for line in markings(pitch)])
@@ -205,10 +178,7 @@ def marking_distances(
 def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, float]:
     """Return a PNG of paint and of distances to it, and the share of markings on paint [1].
 
-    Args:
-        camera: a single camera; projects the markings over the distances.
-        still: its image (height, width, 3), RGB.
-        pitch: pitch with the markings.
+    The single camera projects the markings over the distances; its still is RGB.
     """
     paint = detect_paint(still)
     distance = distance_to(paint)
@@ -223,6 +193,5 @@ def plot_paint(camera: Camera, still: Image, pitch: PitchSpec) -> tuple[bytes, f
     # The square root makes distances of a few pixels visible.
     grey = np.sqrt(np.minimum(distance, MAX_DISTANCE_PX))
     show_image(right, np.rint(255.0 * grey / max(float(grey.max()), 1.0)).astype(np.uint8))
-    for line in markings(pitch):
-        right.plot(*camera.project(line).T, color=TEMPLATE, linewidth=0.8)
+    draw_markings(right, camera, pitch, TEMPLATE, 0.8, zorder=2)
     return png(figure), float((off < ON_PAINT_PX).mean()) if len(off) else float("nan")

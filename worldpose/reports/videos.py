@@ -16,7 +16,7 @@ from worldpose.formats.joints_file import JointTracks
 from worldpose.formats.tables import Positions
 from worldpose.geometry.cameras import Camera
 from worldpose.reports.bodies import BodyTracks, paint_bodies, zoom_camera
-from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, person_color
+from worldpose.reports.drawing import GRASS, INK, LINE, TEMPLATE, markings, person_color, rgb
 
 _PARTS: Final = 16
 """Subpixel steps of line coordinates per pixel."""
@@ -44,13 +44,8 @@ def overlay_frames(
 ) -> Iterator[Image]:
     """Yield frames at half size with projected markings and people.
 
-    Args:
-        pictures: (height, width, 3) RGB, one per entry of `frames`.
-        camera: a batch (frames,).
-        tracks: people, one colour each.
-        frames: (n,) match frames; the function draws people in frames of `tracks`.
-        pitch: draw its markings; None without a pitch.
-        bodies: surfaces to draw instead of bones, for people with bodies.
+    There is one image (height, width, 3) RGB, and one camera of a batch, per match frame; people
+    are drawn in frames of `tracks`, and as surfaces instead of bones if they have bodies.
     """
     lines = markings(pitch) if pitch is not None else []
     rows = {int(frame): row for row, frame in enumerate(tracks.frames)}
@@ -61,7 +56,7 @@ def overlay_frames(
         canvas = np.asarray(even, dtype=np.uint8, order="C")
         half = zoom_camera(camera[place], np.full(2, -0.5), 0.5, (canvas.shape[1], canvas.shape[0]))
         for line in lines:
-            _draw(canvas, half.project(line), _rgb(TEMPLATE))
+            _draw(canvas, half.project(line), rgb(TEMPLATE))
         if frame in rows:
             joints = tracks.joints[rows[frame]]
             drawn = _paint(canvas, half, joints, tracks.person_ids, int(frame), bodies)
@@ -69,7 +64,7 @@ def overlay_frames(
                 if int(person_id) not in drawn:
                     pixels = half.project(own)
                     for bone in COCO17_BONES:
-                        _draw(canvas, pixels[list(bone)], _rgb(person_color(int(person_id))))
+                        _draw(canvas, pixels[list(bone)], rgb(person_color(int(person_id))))
         yield np.asarray(canvas, dtype=np.uint8)
 
 
@@ -93,7 +88,7 @@ def _paint(
     seen = embodied & set(person_ids[near.all(axis=-1).any(axis=-1)].tolist())
     who = np.flatnonzero(np.isin(bodies.person_ids, list(seen)))
     if len(who):
-        colors = np.array([_rgb(person_color(int(n))) for n in bodies.person_ids[who]]) / 255.0
+        colors = np.array([rgb(person_color(int(n))) for n in bodies.person_ids[who]]) / 255.0
         surfaces = bodies.model.vertices(poses[who])
         paint_bodies(canvas, camera, surfaces, bodies.model.faces, colors, opacity=_OPACITY)
     return embodied
@@ -124,9 +119,9 @@ def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
         pixels = np.stack([xy[..., 0] + half[0], half[1] - xy[..., 1]], axis=-1) * PIXELS_PER_M
         return np.rint(pixels).astype(np.int32)
 
-    ground = np.full((height, width, 3), _rgb(GRASS), dtype=np.uint8)
+    ground = np.full((height, width, 3), rgb(GRASS), dtype=np.uint8)
     for line in markings(pitch):
-        cv2.polylines(ground, [locate(line[:, :2])], False, _rgb(LINE), 2, cv2.LINE_AA)
+        cv2.polylines(ground, [locate(line[:, :2])], False, rgb(LINE), 2, cv2.LINE_AA)
     legend = "disc: triangulated, ring: by the feet"
     for row, frame in enumerate(positions.frames.tolist()):
         canvas = ground.copy()
@@ -136,16 +131,11 @@ def minimap_frames(positions: Positions, pitch: PitchSpec) -> Iterator[Image]:
             x, y = locate(positions.xy[row, p]).tolist()
             thickness = 2 if positions.on_plane[row, p] else cv2.FILLED
             color = person_color(person)
-            cv2.circle(canvas, (x, y), RADIUS_PX, _rgb(color), thickness, cv2.LINE_AA)
+            cv2.circle(canvas, (x, y), RADIUS_PX, rgb(color), thickness, cv2.LINE_AA)
             _write(canvas, positions.names[p] or str(person), (x + 10, y - 6), color)
         yield canvas
 
 
 def _write(canvas: Image, text: str, place: tuple[int, int], color: str) -> None:
     """Write a label."""
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _rgb(color), 1, cv2.LINE_AA)
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    """Return `#rrggbb` as numbers."""
-    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, rgb(color), 1, cv2.LINE_AA)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
 from data_contracts.conventions import COCO17
+from data_contracts.match import CameraSpec
 from data_contracts.review import (
     AddedDetection,
     Correction,
@@ -45,10 +46,6 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
 
     A correction applies only if the current value equals its `was`: the function does not move a
     point that has a new click in the match folder or another correction in between.
-
-    Args:
-        folder: the folder as read.
-        corrections: corrections in the order of their creation.
     """
     pictures = _pictures(folder)
     template = None if folder.pitch is None else PitchTemplate.from_spec(folder.pitch)
@@ -57,45 +54,31 @@ def replay_corrections(folder: MatchFolder, corrections: Iterable[Correction]) -
         edit = correction.edit
         if isinstance(edit, IDENTITY_EDITS):
             # The stage `tracking`, which has the tracks, checks whether the edit applies.
-            known = edit.clip in {clip.id for clip in folder.spec.clips}
-            if known:
-                applied.append(correction)
-            else:
-                stale.append((correction, f"there is no clip {edit.clip}"))
-            continue
-        if isinstance(edit, DETECTION_EDITS):
+            is_known = edit.clip in {clip.id for clip in folder.spec.clips}
+            reason = None if is_known else f"there is no clip {edit.clip}"
+        elif isinstance(edit, DETECTION_EDITS):
             # The camera's stage, which has the detections, checks whether the edit applies.
             reason = _unknown(folder, edit)
-            if reason is None:
-                applied.append(correction)
-            else:
-                stale.append((correction, reason))
+        elif isinstance(edit, MovedPoint | RedrawnMarking):
+            reason = _objection(folder, template, pictures, edit)
+        else:
+            reason = f"no stage applies a correction of kind {edit.kind}"
+        if reason is not None:
+            stale.append((correction, reason))
             continue
-        if not isinstance(edit, MovedPoint | RedrawnMarking):
-            stale.append((correction, f"no stage applies a correction of kind {edit.kind}"))
-            continue
-        reason = _objection(folder, template, pictures, edit)
-        if reason is None:
+        applied.append(correction)
+        if isinstance(edit, MovedPoint | RedrawnMarking):
             picture = (edit.camera, edit.frame)
             pictures[picture] = _apply_edit(pictures.get(picture, ClickedMarkings()), edit)
-            applied.append(correction)
-        else:
-            stale.append((correction, reason))
-    if not any(isinstance(each.edit, MovedPoint | RedrawnMarking) for each in applied):
-        return Replay(folder, tuple(applied), tuple(stale))
-    corrected = replace(
-        folder, clicked=_clicks_in(folder, pictures), key_frames=_key_frames(pictures)
-    )
-    return Replay(corrected, tuple(applied), tuple(stale))
+    if any(isinstance(each.edit, MovedPoint | RedrawnMarking) for each in applied):
+        cameras = (camera.id for camera in folder.spec.static_cameras)
+        clicked = {name: pictures[name, None] for name in cameras if (name, None) in pictures}
+        folder = replace(folder, clicked=clicked, key_frames=_key_frames(pictures))
+    return Replay(folder, tuple(applied), tuple(stale))
 
 
 def add_previous_value(folder: MatchFolder, edit: Edit) -> Edit:
-    """Return the edit with the current value as `was`, unless it has one.
-
-    Args:
-        folder: match folder with the corrections so far.
-        edit: edit as entered.
-    """
+    """Return the edit with the value in the match folder as `was`, unless it has one."""
     if not isinstance(edit, MovedPoint | RedrawnMarking) or "was" in edit.model_fields_set:
         return edit
     return edit.model_copy(update={"was": current_value(folder, edit)})
@@ -104,12 +87,7 @@ def add_previous_value(folder: MatchFolder, edit: Edit) -> Edit:
 def current_value(
     folder: MatchFolder, edit: MovedPoint | RedrawnMarking
 ) -> Pixel | tuple[Pixel, ...] | None:
-    """Return the current value of an edit's point or marking: None or empty without a click.
-
-    Args:
-        folder: match folder with the corrections so far.
-        edit: names the point or marking; its new value is ignored.
-    """
+    """Return the value in the folder of an edit's point or marking: None or empty without one."""
     return _now(_pictures(folder), edit)
 
 
@@ -132,8 +110,9 @@ def _objection(
     place = edit.camera if edit.frame is None else f"{edit.camera} frame {edit.frame}"
     if template is None:
         return "the match has no pitch"
-    size = _picture_size(folder, edit)
-    if size is None:
+    camera = folder.spec.filming_camera(edit.camera)
+    is_static = edit.camera in {each.id for each in folder.spec.static_cameras}
+    if camera is None or is_static != (edit.frame is None):
         return f"there is no image {place}"
     if edit.frame is None and edit.camera in folder.calibrations:
         return f"camera {edit.camera} is given, so that its clicks decide nothing"
@@ -141,7 +120,7 @@ def _objection(
     if edit.marking not in (template.points if is_point else template.marking_names):
         return f"the pitch has no {'point' if is_point else 'marking'} {edit.marking}"
     for pixel in _pixels(edit.xy):
-        if not _is_inside(pixel, size):
+        if not _is_inside(pixel, camera):
             return f"{list(pixel)} is outside of the image {place}"
     now = _now(pictures, edit)
     if now != edit.was:
@@ -152,13 +131,9 @@ def _objection(
 
 def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
     """Return why a correction of detections is invalid in the match; None if it is valid."""
-    spec = folder.spec
-    owners = {camera.id: camera.id for camera in spec.static_cameras}
-    owners |= {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
-    if edit.camera not in owners:
+    camera = folder.spec.filming_camera(edit.camera)
+    if camera is None:
         return f"there is no camera {edit.camera}"
-    camera = spec.camera(owners[edit.camera])
-    size = (camera.width, camera.height)
     placed: tuple[Pixel | None, ...] = ()
     if isinstance(edit, MovedKeypoint):
         if edit.joint not in COCO17:
@@ -166,29 +141,19 @@ def _unknown(folder: MatchFolder, edit: DetectionEdit) -> str | None:
         placed = (edit.xy,)
     elif isinstance(edit, AddedDetection):
         x0, y0, x1, y1 = edit.box
-        if not (x0 < x1 and y0 < y1 and x0 < size[0] and y0 < size[1] and x1 > 0 and y1 > 0):
+        is_inside = x0 < camera.width and y0 < camera.height and x1 > 0 and y1 > 0
+        if not (x0 < x1 and y0 < y1 and is_inside):
             return f"{list(edit.box)} is not a box inside the image of {edit.camera}"
         placed = edit.keypoints
     for xy in placed:
-        if xy is not None and not _is_inside(xy, size):
+        if xy is not None and not _is_inside(xy, camera):
             return f"{list(xy)} is outside of the image of {edit.camera}"
     return None
 
 
-def _is_inside(pixel: Pixel, size: tuple[int, int]) -> bool:
-    return all(-0.5 <= value <= side - 0.5 for value, side in zip(pixel, size, strict=True))
-
-
-def _picture_size(folder: MatchFolder, edit: MovedPoint | RedrawnMarking) -> tuple[int, int] | None:
-    """Return the size of an edit's image [px], None if the match has no such image."""
-    spec = folder.spec
-    owners = {camera.id: camera.id for camera in spec.static_cameras if edit.frame is None}
-    if edit.frame is not None:
-        owners = {clip.id: clip.broadcast for clip in spec.clips if clip.broadcast is not None}
-    if edit.camera not in owners:
-        return None
-    camera = spec.camera(owners[edit.camera])
-    return camera.width, camera.height
+def _is_inside(pixel: Pixel, camera: CameraSpec) -> bool:
+    x, y = pixel
+    return -0.5 <= x <= camera.width - 0.5 and -0.5 <= y <= camera.height - 0.5
 
 
 def _pixels(xy: Pixel | tuple[Pixel, ...] | None) -> tuple[Pixel, ...]:
@@ -220,14 +185,6 @@ def _apply_edit(clicked: ClickedMarkings, edit: MovedPoint | RedrawnMarking) -> 
     if edit.xy:
         drawn[edit.marking] = DrawnMarking(name=edit.marking, xy=edit.xy)
     return clicked.model_copy(update={"drawn": tuple(drawn.values())})
-
-
-def _clicks_in(
-    folder: MatchFolder, pictures: dict[Picture, ClickedMarkings]
-) -> dict[str, ClickedMarkings]:
-    """Return the clicks of the static cameras, in their order."""
-    cameras = (camera.id for camera in folder.spec.static_cameras)
-    return {camera: pictures[camera, None] for camera in cameras if (camera, None) in pictures}
 
 
 def _key_frames(pictures: dict[Picture, ClickedMarkings]) -> dict[str, KeyFrames]:

@@ -42,11 +42,7 @@ def replay_detections(found: KeypointDetections, edits: Iterable[DetectionEdit])
 
     An edit applies only if the current value equals its `was`. Corrected keypoints and added people
     have confidence 1; other keypoints, and the indices of detections, stay. If an added person
-    exceeds the number of detections, every frame gets one more.
-
-    Args:
-        found: detected or given observations; not modified.
-        edits: edits of this camera, in the order they were made.
+    exceeds the number of detections, every frame gets one more. `found` is not modified.
     """
     changed = found.with_arrays(
         {name: array.copy() for name, array in found.arrays().items()}, found.frame

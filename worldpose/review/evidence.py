@@ -174,10 +174,7 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     The function projects the part of the pixel's ray where joints can be into the other image, with
     lens distortion, and clips it to the image.
 
-    Args:
-        source: one camera.
-        target: another camera.
-        pixel: (2,) pixel in the image of `source` [px].
+    Both are single cameras; the pixel (2,) [px] is one of `source`.
 
     Returns:
         Polylines (n, 2) [px] within the image of `target`; none if the ray is not visible.
@@ -191,11 +188,14 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
     def project_along(along: Floats) -> Floats:
         return target.project(origin + along[:, None] * direction)
 
+    def is_inside(places: Floats) -> NDArray[np.bool_]:
+        return _is_in_or_near(places, target.image_size, 0.0)
+
     along = np.linspace(span[0], span[1], INITIAL_SAMPLES)
     places = project_along(along)
     for _ in range(HALVINGS):
         gap = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        inside = _is_inside(places, target)
+        inside = is_inside(places)
         wide = np.flatnonzero((gap > MAX_SPACING_PX) & (inside[1:] | inside[:-1]))
         # One end may be behind the camera, or outside the valid range of its lens model.
         cut = np.flatnonzero(np.isfinite(places[1:, 0]) != np.isfinite(places[:-1, 0]))
@@ -206,20 +206,17 @@ def epipolar_curves(source: Camera, target: Camera, pixel: ArrayLike) -> list[Fl
         along = np.insert(along, halved + 1, middle)
         places = np.insert(places, halved + 1, project_along(middle), axis=0)
     # The last point within the image, found by bisection: else a curve ends up to 12 px too early.
-    inside = _is_inside(places, target)
+    inside = is_inside(places)
     edges = np.flatnonzero(inside[1:] != inside[:-1])
     inner = np.where(inside[edges], along[edges], along[edges + 1])
     outer = np.where(inside[edges], along[edges + 1], along[edges])
     for _ in range(EDGE_HALVINGS):
         middle = (inner + outer) / 2
-        is_seen = _is_inside(project_along(middle), target)
+        is_seen = is_inside(project_along(middle))
         inner, outer = np.where(is_seen, middle, inner), np.where(is_seen, outer, middle)
     moved = ~np.isin(inner, along)
     places = np.insert(places, edges[moved] + 1, project_along(inner[moved]), axis=0)
-    inside = _is_inside(places, target)
-    bounds = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    runs = [places[begin:end] for begin, end in zip(bounds[::2], bounds[1::2], strict=True)]
-    return [run for run in runs if len(run) > 1]
+    return _runs(places, is_inside(places))
 
 
 def check_views(cameras: Camera, keypoints: ArrayLike) -> ViewCheck:
@@ -274,12 +271,6 @@ def _span(rays: Rays) -> tuple[float, float] | None:
     return span if span[0] < span[1] else None
 
 
-def _is_inside(places: Floats, camera: Camera) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        inside = (places >= -0.5) & (places <= camera.image_size - 0.5)
-    return np.asarray(inside.all(axis=1), dtype=np.bool_)
-
-
 MARKING_SPACING_M = 0.5
 """Spacing of points along a drawn marking [m]: the chords of a curved marking are only a few pixels
 long."""
@@ -315,7 +306,8 @@ class PitchDrawing:
         found, begin = {}, 0
         for name, points in self.markings.items():
             end = begin + len(points)
-            pieces = _pieces(stacked[begin:end], camera.image_size)
+            near = _is_in_or_near(stacked[begin:end], camera.image_size, MARGIN)
+            pieces = _runs(stacked[begin:end], near)
             begin = end
             if pieces:
                 found[name] = pieces
@@ -357,14 +349,8 @@ def preview(
 ) -> Preview:
     """Return the camera from the current clicks, and the projected pitch.
 
-    Args:
-        drawing: the pitch.
-        clicked: the current clicks.
-        image_size: width, height [px].
-        picture: (height, width, 3); if given, the calibration refines the camera on the painted
-            lines, which takes seconds and not milliseconds.
-        settings: settings as for the stage `static_calibration`.
-        lens: the given lens of a static camera, if there is one.
+    With the image (height, width, 3), the calibration refines the camera on the painted lines,
+    which takes seconds and not milliseconds.
 
     Raises:
         InputError: the clicks do not determine a camera; the message says which clicks to add.
@@ -384,14 +370,11 @@ def preview(
     )
 
 
-def _pieces(
-    pixels: NDArray[np.float64], image_size: NDArray[np.int64]
-) -> list[NDArray[np.float64]]:
-    """Return the runs of two points or more in or near the image."""
-    near = _is_in_or_near(pixels, image_size, MARGIN)
-    bounds = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]])))
+def _runs(points: NDArray[np.float64], chosen: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
+    """Return the runs of two or more chosen points in a row."""
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
     runs = zip(bounds[::2], bounds[1::2], strict=True)
-    return [pixels[begin:end] for begin, end in runs if end - begin > 1]
+    return [points[begin:end] for begin, end in runs if end - begin > 1]
 
 
 def _is_in_or_near(

@@ -101,22 +101,14 @@ def stored_identities(result: xr.Dataset) -> Identities:
 
 
 def find_plane_frames(tracks: xr.Dataset) -> NDArray[np.bool_]:
-    """Return in which frames the feet alone place a person (frames, persons).
-
-    Args:
-        tracks: result of stage `tracking`, or some frames of it.
-    """
+    """Return in which frames of tracks the feet alone place a person (frames, persons)."""
     if "ground" not in tracks:
         return np.zeros((tracks.sizes["frame"], tracks.sizes["person"]), dtype=np.bool_)
     return np.asarray(np.isfinite(tracks["ground"].values).all(axis=-1))
 
 
 def select_triangulated(tracks: xr.Dataset) -> xr.Dataset:
-    """Return tracks without the people, and the detections, that the feet alone place.
-
-    Args:
-        tracks: result of stage `tracking`, or some frames of it.
-    """
+    """Return tracks, or some frames of them, without what the feet alone place."""
     if "ground" not in tracks:
         return tracks
     kinds = [Track.model_validate(track).kind for track in tracks.attrs["tracks"]]
@@ -170,10 +162,6 @@ def replay_identities(found: Identities, edits: Iterable[IdentityEdit]) -> Ident
 
     Each edit uses the ids after the previous edits. An edit applies only if the sightings of its
     people still match; a merged person's detections go to the kept person.
-
-    Args:
-        found: identities from the tracker.
-        edits: edits of this clip, in the order they were made.
     """
     objections = []
     for edit in edits:
@@ -224,12 +212,9 @@ def find_objection(found: Identities, edit: IdentityEdit) -> str | None:
 
 
 def find_sighting(found: Identities, person: int, first: int = 0) -> Sighting | None:
-    """Return a person's detection with the smallest ray distance, None without detections.
+    """Return a person's detection with the smallest ray distance from match frame `first` on.
 
-    Args:
-        found: the identities.
-        person: an id in them.
-        first: first match frame to search.
+    None without detections.
     """
     k = found.person.tolist().index(person)
     seen = (found.detection_index[:, :, k] >= 0) & (found.frame >= first)[:, None]

@@ -70,13 +70,9 @@ class Journal:
     def extend(
         self, entries: Sequence[JournalEntry], last: int, damage: Sequence[str], tip: str | None
     ) -> Journal:
-        """Return the journal with further entries, without processing earlier entries again.
+        """Return the journal with further intact entries and lines about damaged ones.
 
-        Args:
-            entries: the intact new entries.
-            last: the highest number in use.
-            damage: a line for each new damaged entry.
-            tip: checksum of the last intact entry.
+        Earlier entries are not processed again.
         """
         questions = list(self.questions)
         corrections, standing = dict(self.corrections), dict(self.standing)
@@ -201,12 +197,7 @@ def _extend(journal: Journal, found: Sequence[tuple[int, bytes]], folder: str) -
 
 
 def append(store: Store, journal: Journal, records: Sequence[ReviewRecord]) -> Journal | None:
-    """Return the journal with one more entry, which is durable on return.
-
-    Args:
-        store: store of the journal.
-        journal: the journal as read, on which `records` are based.
-        records: content of the entry, written atomically.
+    """Return the journal as read with one more entry of all records, which is durable on return.
 
     Returns:
         None if another writer added an entry since: nothing is written; read and decide again.
@@ -231,11 +222,7 @@ def say(
 ) -> Journal:
     """Return the journal with the records of `decide`, retried if another writer was first.
 
-    Args:
-        store: store of the journal.
-        match_id: the match.
-        decide: returns records for the current journal, possibly none. Its exceptions propagate,
-            and nothing is written.
+    It returns records for the current journal, possibly none; if it raises, nothing is written.
     """
     while True:
         journal = read_journal(store, match_id)

@@ -48,8 +48,13 @@ CAMERA = {
 }
 
 
-@pytest.mark.parametrize("kind", ["static", "plain", "challenge"])
-@pytest.mark.parametrize("fault", CAMERA)
+def with_kinds(faults):
+    """Each fault in a data set without 2D and in one of the two that have it."""
+    cases = enumerate(faults)
+    return [(f, kind) for n, f in cases for kind in ("plain", ("static", "challenge")[n % 2])]
+
+
+@pytest.mark.parametrize(("fault", "kind"), with_kinds(CAMERA))
 def test_a_fault_of_cameras_is_named(data_set, model, kind, fault):
     folder = data_set(kind)
     edit_cameras(folder, CAMERA[fault])
@@ -80,27 +85,10 @@ def test_a_camera_of_a_part_of_the_pitch_where_nobody_comes_is_sound(data_set, m
     assert (found.fault, found.where) == ("sees_nobody", ("cameras/corner",))
 
 
-def test_the_one_camera_that_is_wrong_is_named(data_set, model):
+def test_a_lens_in_the_wrong_order_is_named(data_set, model):
     folder = data_set("static")
-    edit(folder / "cameras" / "east.npz", transpose_rotation)
-    _, found = findings(folder, model)
-    assert {each.fault for each in found} == {"transposed_rotation"}
-    assert {p for f in found for p in f.where if p.startswith("cameras/")} == {"cameras/east"}
-
-
-@pytest.mark.parametrize("order", [[0, 1, 4, 2, 3], [2, 3, 0, 1, 4]])
-def test_a_lens_in_the_wrong_order_is_named(data_set, model, order):
-    folder = data_set("static")
-    edit_cameras(folder, lambda a: a.update(k=a["k"][:, order]))
+    edit_cameras(folder, lambda a: a.update(k=a["k"][:, [0, 1, 4, 2, 3]]))
     assert {each.fault for each in findings(folder, model)[1]} == {"distortion_order"}
-
-
-def test_a_lens_of_two_coefficients_in_the_place_of_others_is_named(data_set, model):
-    folder = data_set("challenge")
-    edit_cameras(folder, lambda a: a.update(k=a["k"][:, [2, 3, 0, 1, 4]]))
-    found = findings(folder, model)[1]
-    assert {each.fault for each in found} == {"distortion_order"}
-    assert {each.says[:19] for each in found} == {"k is p1 p2 k1 k2 k3"}
 
 
 POSES = {
@@ -114,8 +102,7 @@ POSES = {
 }
 
 
-@pytest.mark.parametrize("kind", ["static", "plain", "challenge"])
-@pytest.mark.parametrize("fault", POSES)
+@pytest.mark.parametrize(("fault", "kind"), with_kinds(POSES))
 def test_a_fault_of_poses_is_named(data_set, model, kind, fault):
     folder = data_set(kind)
     edit_poses(folder, lambda arrays: POSES[fault](arrays, model))
@@ -124,16 +111,15 @@ def test_a_fault_of_poses_is_named(data_set, model, kind, fault):
     assert all(each.where[0].startswith("poses/A_1.npz") for each in found)
 
 
-@pytest.mark.parametrize("kind", ["static", "challenge"])
-def test_a_slip_of_one_frame_is_named(data_set, model, kind):
-    folder = data_set(kind)
+def test_a_slip_of_one_frame_is_named(data_set, model):
+    folder = data_set("static")
     edit_poses(folder, late_poses)
     _, found = findings(folder, model)
     assert {each.fault for each in found} == {"frame_offset"}
     assert "3D is 1 frame late" in found[0].says
 
 
-@pytest.mark.parametrize("late", [-2, 0, 1])
+@pytest.mark.parametrize("late", [-2, 0])
 def test_a_slip_is_named_where_the_camera_has_the_pose_of_the_first_frame_alone(
     data_set, model, late
 ):
@@ -145,10 +131,8 @@ def test_a_slip_is_named_where_the_camera_has_the_pose_of_the_first_frame_alone(
     joints[:, gone] = np.nan
     write_submission(folder / "submission.zip", {"A_1": joints})
     found = findings(folder, model)[1]
-    expected = {1: "the 3D is 1 frame late", -2: "the 3D is 2 frames early"}
-    assert [each.says[: len(expected[late])] for each in found] == (
-        [expected[late]] if late else []
-    )
+    expected = ["the 3D is 2 frames early against the 2D"] if late else []
+    assert [each.says for each in found] == expected
 
 
 def test_a_slip_of_the_moving_camera_is_named(data_set, model):

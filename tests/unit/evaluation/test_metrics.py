@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from people_samples import crowd, person, score, tracks
 
-from worldpose.evaluation.metrics import evaluate_joints
+from worldpose.evaluation.metrics import LIMBS, correct_limbs, evaluate_joints
 from worldpose.formats.joints_file import JointTracks
 
 # Sums of a few hundred rounded distances of some metres: 1e-9 mm is a thousand times their error.
@@ -35,14 +35,6 @@ def test_truth_re_encoded_scores_perfectly():
         dict.fromkeys(errors, 0.0), abs=MM
     )
     assert len(errors) == 19
-
-
-def test_a_shift_of_a_tenth_of_a_metre_is_100_mm():
-    truth = crowd()
-    shifted = replace(truth, joints=truth.joints + np.array([0.1, 0.0, 0.0]))
-    scores, people = evaluate_joints(shifted, truth)
-    assert scores.mpjpe_mm == pytest.approx(100.0, abs=MM)
-    assert [each.mpjpe_mm for each in people] == pytest.approx([100.0] * 3, abs=MM)
 
 
 def test_case_a_matching_takes_the_least_sum_not_the_nearest_pair_first():
@@ -106,15 +98,6 @@ def test_case_g_a_limb_is_right_within_half_its_length():
         assert score(tracks([[predicted]]), tracks([[person()]])).pcp3d == expected
 
 
-def test_joints_that_one_camera_saw_are_not_scored():
-    views = np.full((1, 1, 17), 2)
-    views[0, 0, 9] = 1
-    predicted = person()
-    predicted[9] += 0.5
-    scores = score(tracks([[predicted]]), tracks([[person()]], views=views))
-    assert (scores.mpjpe_mm, scores.joint_coverage, scores.pcp3d) == (0.0, 1.0, 100.0)
-
-
 def test_half_of_the_joints_make_a_person_count():
     views = np.zeros((1, 1, 17), dtype=np.int64)
     for seen, persons in ((8, 0), (9, 1)):
@@ -129,20 +112,6 @@ def test_frames_are_paired_by_number():
     assert (scores.frames, scores.coverage, scores.mpjpe_mm) == (10, 0.4, 0.0)
     beyond = score(truth, later)
     assert (beyond.frames, beyond.coverage, beyond.false_persons_per_frame) == (4, 1.0, 0.0)
-
-
-def test_a_false_person_is_counted_in_every_frame_it_shows_up():
-    truth = tracks([[person(0.0)]] * 4)
-    joints = np.concatenate([truth.joints, truth.joints + np.array([9.0, 0.0, 0.0])], axis=1)
-    joints[0, 1] = np.nan
-    scores = score(tracks(joints), truth)
-    assert (scores.false_persons_per_frame, scores.coverage) == (0.75, 1.0)
-
-
-def test_two_predictions_of_one_person_are_one_match_and_one_false_person():
-    scores = score(tracks([[person(0.1), person(0.2)]]), tracks([[person()]]))
-    assert scores.mpjpe_mm == pytest.approx(100.0, abs=MM)
-    assert scores.false_persons_per_frame == 1.0
 
 
 def test_an_empty_prediction_and_an_empty_truth_have_no_error():
@@ -167,11 +136,25 @@ def test_neither_order_nor_ids_of_people_change_a_score(order, seed):
     assert again == pytest.approx(plain.model_dump(exclude_none=True), rel=1e-9)
 
 
-@given(noise=st.floats(0.001, 0.1), seed=st.integers(0, 99))
-def test_mpjpe_is_the_mean_error_when_nobody_is_confused(noise, seed):
-    truth = tracks([[person(0.0), person(8.0)]])
-    error = np.random.default_rng(seed).normal(0.0, noise, truth.joints.shape)
-    expected = 1000.0 * np.linalg.norm(error, axis=-1).mean()
-    assert score(replace(truth, joints=truth.joints + error), truth).mpjpe_mm == pytest.approx(
-        expected, abs=MM
-    )
+NAMES = list(LIMBS)
+
+
+def spread_out():
+    """17 joints at (index, 0, 0)."""
+    return np.stack([np.arange(17.0), np.zeros(17), np.zeros(17)], axis=-1)
+
+
+def test_every_body_joint_carries_a_limb_and_the_face_only_the_ears():
+    used = {joint for ends in LIMBS.values() for end in ends for joint in end}
+    assert used == set(range(3, 17))
+
+
+def test_a_missing_joint_makes_its_limbs_wrong():
+    predicted = spread_out()
+    predicted[5] = np.nan
+    wrong = {
+        name
+        for name, right in zip(NAMES, correct_limbs(predicted, spread_out(), 0.5), strict=True)
+        if not right
+    }
+    assert wrong == {"left upper arm", "torso", "head"}

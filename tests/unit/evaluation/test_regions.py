@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from joint_regions import group_errors, region_counts
 
-from data_contracts.conventions import COCO17, JOINT_GROUPS
+from data_contracts.conventions import COCO17
 from worldpose.errors import InputError
 from worldpose.formats.joints_file import JointTracks
 
@@ -20,33 +20,12 @@ def people(frames=60, persons=4, spread=0.03, stated=0.03, seed=0):
     return JointTracks(numbers, ids, found, covariance), JointTracks(numbers, ids, true)
 
 
-def test_every_joint_is_in_one_group():
-    joints = [
-        name for parts in JOINT_GROUPS.values() for name in COCO17 if any(p in name for p in parts)
-    ]
-    assert sorted(joints) == sorted(COCO17)
-
-
 @pytest.mark.parametrize("level", [0.5, 0.95])
 def test_regions_of_the_true_size_hold_the_stated_share(level):
     found = region_counts(*people(), level)
     inside, count = np.array(list(found.values())).sum(axis=0)
     assert count == 60 * 4 * 17
     assert inside / count == pytest.approx(level, abs=0.02)
-
-
-def test_regions_half_as_wide_hold_what_the_chi_square_distribution_says():
-    found = region_counts(*people(stated=0.015))
-    inside, count = np.array(list(found.values())).sum(axis=0)
-    assert inside / count == pytest.approx(0.4177, abs=0.02)  # P(chi2_3 < 7.8147 / 4)
-
-
-def test_only_the_group_that_is_off_falls_out():
-    prediction, truth = people()
-    prediction.joints[:, :, [COCO17.index("left_hip"), COCO17.index("right_hip")], 2] += 0.2
-    found = region_counts(prediction, truth)
-    assert found["hip"][0] == 0
-    assert found["knee"][0] > 0.9 * found["knee"][1]
 
 
 def test_missing_joints_frames_and_unseen_joints_do_not_count():
@@ -65,7 +44,7 @@ def test_missing_joints_frames_and_unseen_joints_do_not_count():
     assert count == 3 * 2 * 17 - 2
 
 
-@pytest.mark.parametrize(("predicted", "true"), [(0, 3), (3, 0), (0, 0)])
+@pytest.mark.parametrize(("predicted", "true"), [(0, 3), (3, 0)])
 def test_without_common_frames_no_joint_counts(predicted, true):
     prediction, _ = people(frames=predicted, persons=2)
     _, truth = people(frames=true, persons=2)

@@ -46,24 +46,11 @@ def cameras(*rotations, missing=()):
 
 
 @pytest.mark.parametrize(
-    ("pan", "tilt", "roll"), [(0, 0, 0), (20, 0, 0), (0, -15, 0), (0, 0, 3), (-40, -12, 1.5)]
+    ("pan", "tilt", "roll"), [(20, 0, 0), (0, -15, 0), (0, 0, 3), (-40, -12, 1.5)]
 )
 def test_angles_are_those_that_the_camera_was_turned_by(pan, tilt, roll):
     found = np.concatenate(camera_angles(cameras(turned(pan, tilt, roll))))
     np.testing.assert_allclose(found, [pan, tilt, roll], atol=1e-9)
-
-
-def test_a_camera_panned_to_the_right_looks_towards_positive_x():
-    ahead = turned(pan=30)[2]
-    np.testing.assert_allclose(ahead, [0.5, np.sqrt(0.75), 0.0], atol=1e-12)
-
-
-def test_the_course_is_drawn_also_where_frames_have_no_camera():
-    moving = cameras(*(turned(pan) for pan in range(5)), missing=[2])
-    covariance = np.tile(1e-6 * np.eye(7), (5, 1, 1))
-    covariance[2] = np.nan
-    picture = plot_camera_course(np.arange(5), moving, covariance)
-    assert matplotlib.image.imread(io.BytesIO(picture)).shape[:2] == (704, 1540)
 
 
 def people(*places):
@@ -81,6 +68,7 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     # The third stands where the image ends, and is not shown.
     tracks = people((0.0, 80.0), (9.0, 80.0), (18.2, 80.0))
     assert largest_pose_changes(before, after, tracks) == (1, 1)
+    assert largest_pose_changes(after, after, people((200.0, 80.0))) == (0, 0)
     still = np.full((1080, 1920, 3), 90, np.uint8)
     seen = after[1].project(tracks.joints[1])
     picture = plot_before_after(before[1], after[1], tracks, 1, 1, still=still, seen=seen)
@@ -99,11 +87,6 @@ def test_whom_a_refinement_moves_most_is_shown_before_and_after():
     assert abs(rows[1] - rows[2]) < 30.0
 
 
-def test_nobody_in_the_picture_is_moved_most():
-    some = cameras(turned(), turned())
-    assert largest_pose_changes(some, some, people((200.0, 80.0))) == (0, 0)
-
-
 def painted(png, color):
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
@@ -111,9 +94,10 @@ def painted(png, color):
 
 
 def test_the_course_without_smoothing_lies_beneath_the_smoothed_one():
-    moving = cameras(*(turned(pan) for pan in range(5)))
+    moving = cameras(*(turned(pan) for pan in range(5)), missing=[2])
     rough = cameras(*(turned(pan + 0.3 * (-1) ** pan) for pan in range(5)))
     covariance = np.tile(1e-6 * np.eye(7), (5, 1, 1))
+    covariance[2] = np.nan
     alone, both = (
         painted(plot_camera_course(np.arange(5), moving, covariance, before), PALETTE[1])
         for before in (None, rough)

@@ -12,7 +12,6 @@ from worldpose.reports.drawing import (
     GRASS,
     WIDTH,
     figure_data,
-    keep_figures,
     picture_panels,
     png,
     show_image,
@@ -58,17 +57,6 @@ def test_the_data_are_the_numbers_that_were_drawn(figure):
     assert found["text"] == {"kind": "text", "text": "kick", "x": [1.5], "y": [2.5]}
 
 
-def test_areas_have_the_value_of_their_colour():
-    drawn = Figure()
-    x, y = np.meshgrid(np.linspace(0.0, 1.0, 20), np.linspace(0.0, 1.0, 20))
-    drawn.subplots().contourf(x, y, x, levels=[0.0, 0.5, 1.0])
-    ((areas,),) = [panel["series"] for panel in figure_data(drawn)]
-    pairs = zip(areas["x"], areas["value"], strict=True)
-    at = {value: [x for x, v in pairs if v == value] for value in (0.25,)}
-    assert at[0.25] and max(at[0.25]) <= 0.5 + 1e-6
-    assert 0.75 in areas["value"]
-
-
 def test_files_are_equal_for_equal_figures_and_text_stays_text(figure, tmp_path):
     first = write_figure(figure, tmp_path / "a", "two clocks, cam00 ± 1")
     again = write_figure(figure, tmp_path / "b", "two clocks, cam00 ± 1")
@@ -81,14 +69,6 @@ def test_files_are_equal_for_equal_figures_and_text_stays_text(figure, tmp_path)
     shown = json.loads(data.read_text())
     assert shown["caption"] == "two clocks, cam00 ± 1"
     assert shown["panels"] == figure_data(figure)
-
-
-def test_figures_are_kept_only_where_it_is_asked_for(figure):
-    png(figure)
-    with keep_figures() as kept:
-        drawn = png(figure)
-    png(figure)
-    assert kept == {drawn: figure}
 
 
 def coded_places(height, width):
@@ -104,7 +84,7 @@ def drawn(figure):
     return pixels[..., ::-1].astype(int)
 
 
-@pytest.mark.parametrize("across", [3080.0, 1540.0, 308.0])
+@pytest.mark.parametrize("across", [3080.0, 308.0])
 def test_a_picture_is_shown_at_its_places_in_every_size(across):
     side = across * np.array([1.0, 900.0 / 1540.0])
     corner = np.zeros(2) if across > 3000.0 else np.array([700.0, 400.0])
@@ -118,12 +98,6 @@ def test_a_picture_is_shown_at_its_places_in_every_size(across):
         np.testing.assert_allclose(shown[top + y, x], still[v, u], atol=2)
 
 
-def test_a_picture_of_the_figure_s_resolution_is_copied():
-    still = np.random.default_rng(5).integers(0, 255, (300, 1600, 3)).astype(np.uint8)
-    shown = drawn(picture_panels(["part"], (39.5, 19.5), (1540.0, 200.0), still=still)[0])
-    np.testing.assert_array_equal(shown[-195:-5, 5:-5], still[25:215, 45:1575])
-
-
 def test_beyond_the_picture_there_is_plain_ground():
     still = coded_places(100, 200)
     figure, (axes,) = picture_panels(["edge"], (150.0, 50.0), (100.0, 100.0), still=still)
@@ -133,15 +107,6 @@ def test_beyond_the_picture_there_is_plain_ground():
     np.testing.assert_allclose(shown[-1520, 20], still[51, 151], atol=2)
     assert not picture_panels(["off"], (300.0, 0.0), (50.0, 50.0), still=still)[1][0].images
     assert len(axes.images) == 1
-
-
-def test_panels_stand_side_by_side_and_show_the_same_part():
-    still = coded_places(540, 960)
-    figure, panels = picture_panels(["left", "right"], (-0.5, -0.5), (960, 540), still=still)
-    shown = drawn(figure)
-    width = (WIDTH - 14) // 2
-    assert [axes.get_title(loc="left") for axes in panels] == ["left", "right"]
-    np.testing.assert_array_equal(shown[60:-5, 5 : width - 5], shown[60:-5, width + 19 : -5])
 
 
 def test_a_grey_picture_is_grey_and_goes_into_vector_files(tmp_path):

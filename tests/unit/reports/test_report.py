@@ -7,9 +7,8 @@ from html.parser import HTMLParser
 
 import cv2
 import numpy as np
-import pytest
 
-from data_contracts.evaluation import Evaluation
+from data_contracts.evaluation import CameraErrors, CameraEvaluation, Evaluation
 from data_contracts.run import RunRecord, UnitFailure
 from worldpose.reports.html_page import (
     CaptionedImage,
@@ -18,7 +17,12 @@ from worldpose.reports.html_page import (
     Section,
     compress_image,
 )
-from worldpose.reports.run_report import MEANINGS, CameraSummary, camera_table, report_page
+from worldpose.reports.run_report import (
+    CAMERA_MEANINGS,
+    MEANINGS,
+    report_page,
+    score_rows,
+)
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJg"
@@ -75,34 +79,35 @@ class Page(HTMLParser):
 
 
 def test_units_say_what_happened_to_them():
-    page = Page(report_page("A run", run(), seconds={"tracking/clip": 1.234}))
+    asked = run(overrides={"tracking": {"gate_m": 0.5}})
+    scores = Evaluation(mpjpe_mm=23.456, coverage=0.5, frames=100)
+    page = Page(report_page("A run", asked, seconds={"tracking/clip": 1.234}, scores=scores))
     assert ["ingest/cam00", "reused", ""] in page.rows
     assert ["tracking/clip", "computed", "1.23"] in page.rows
     assert ["triangulation/clip", "failed: <script>no</script>", ""] in page.rows
+    assert ["tracking/clip", "persons", "5"] in page.rows
+    assert ["", "mean_views", "5.812"] in page.rows
+    assert ["tracking", "gate_m", "0.5"] in page.rows
+    assert ["Mean joint error", "23.46 mm", MEANINGS["mpjpe_mm"][2]] in page.rows
+    assert ["People found", "50 %", MEANINGS["coverage"][2]] in page.rows
+    assert not any("Correct limbs" in row for row in page.rows)
     assert page.open == []
-
-
-def test_figures_are_shown_by_unit():
-    rows = Page(report_page("A run", run(), seconds={})).rows
-    assert ["tracking/clip", "persons", "5"] in rows
-    assert ["", "mean_views", "5.812"] in rows
-
-
-def test_scores_come_with_unit_and_meaning_and_shares_in_per_cent():
-    scores = Evaluation(mpjpe_mm=23.456, coverage=0.5, frames=100)
-    rows = Page(report_page("A run", run(), seconds={}, scores=scores)).rows
-    assert ["Mean joint error", "23.46 mm", MEANINGS["mpjpe_mm"][2]] in rows
-    assert ["People found", "50 %", MEANINGS["coverage"][2]] in rows
-    assert ["Frames scored", "100", MEANINGS["frames"][2]] in rows
-    assert not any("Correct limbs" in row for row in rows)
 
 
 def test_every_score_has_a_meaning():
     assert set(MEANINGS) == set(Evaluation.model_fields)
-
-
-def test_without_truth_there_is_no_table_of_scores():
-    assert "Against the truth" not in report_page("A run", run(), seconds={})
+    assert set(CAMERA_MEANINGS) == set(CameraErrors.model_fields)
+    errors = CameraErrors(ground_error_p95_m=0.25, coverage=0.5)
+    scores = Evaluation(g_mpjpe_mm=80.04, cameras=CameraEvaluation(broadcast=errors))
+    assert [row[:3] for row in score_rows(scores)] == [
+        ("g_mpjpe_mm", "G-MPJPE", "80.04 mm"),
+        (
+            "cameras.broadcast.ground_error_p95_m",
+            "Broadcast cameras: ground error, 95 %",
+            "0.25 m",
+        ),
+        ("cameras.broadcast.coverage", "Broadcast cameras: frames", "50 %"),
+    ]
 
 
 def pictured(*pictures, heading="Seen"):
@@ -120,13 +125,16 @@ def test_text_is_escaped():
 
 
 def test_nothing_is_asked_from_outside():
-    text = report_page(
-        "A run", run(), seconds={}, sections=pictured(CaptionedImage("from above", PNG))
-    )
+    linked = Section("Videos", (LinkedFile("goal & corner", 'a "1".mp4'),))
+    sections = [Section("Nothing", ()), *pictured(CaptionedImage("from above", PNG)), linked]
+    text = report_page("A run", run(), seconds={}, sections=sections)
+    assert "Nothing" not in text and "Against the truth" not in text
+    assert '<a href="#part1">Seen</a>' in text
+    assert '<a href="a%20%221%22.mp4">goal &amp; corner</a>' in text
     page = Page(text)
     jumps = [address for address in page.addresses if address.startswith("#")]
-    assert jumps == ["#part1", "#last"]
-    (data,) = [address for address in page.addresses if address not in jumps]
+    assert jumps == ["#part1", "#part2", "#last"]
+    data, _ = [address for address in page.addresses if address not in jumps]
     assert data[:22] == "data:image/png;base64,"
     assert base64.b64decode(data[22:]) == PNG
     assert not re.search(r"https?:|url\(|@import", text)
@@ -145,37 +153,6 @@ def test_an_embedded_page_brings_the_one_script_that_the_page_may_run():
     (frame,) = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)"></iframe>', text)
     assert [unescape(each) for each in frame] == [block.title, block.html]
     assert Page(text).open == []
-
-
-def test_files_beside_the_page_are_linked():
-    section = Section("Videos", (LinkedFile("goal & corner", 'a "1".mp4'),))
-    text = report_page("A run", run(), seconds={}, sections=[section])
-    assert '<a href="a%20%221%22.mp4">goal &amp; corner</a>' in text
-
-
-def test_parts_without_content_are_left_out():
-    empty = [Section("Nothing", ()), *pictured(CaptionedImage("from above", PNG))]
-    text = report_page("A run", run(), seconds={}, sections=empty)
-    assert "Nothing" not in text
-    assert '<a href="#part1">Seen</a>' in text
-
-
-@pytest.mark.parametrize("shown", [True, False])
-def test_only_settings_that_were_asked_for_are_listed(shown):
-    overrides = {"tracking": {"gate_m": 0.5}} if shown else {}
-    text = report_page("A run", run(overrides=overrides), seconds={})
-    assert (["tracking", "gate_m", "0.5"] in Page(text).rows) == shown
-
-
-def test_static_cameras_are_listed_with_what_is_wrong_with_them():
-    cameras = [
-        CameraSummary("cam0", "given"),
-        CameraSummary("cam1", "clicks", 0.0213, 0.35, 1.128, 9, ("corner_left_far",), ("few",)),
-    ]
-    shown = [Section("Static cameras", (camera_table(cameras),))]
-    rows = Page(report_page("A run", run(), seconds={}, sections=shown)).rows
-    assert ["cam0", "given", "-", "-", "-", "-", "", ""] in rows
-    assert ["cam1", "clicks", "21.3", "350.0", "1.13", "9", "corner_left_far", "few"] in rows
 
 
 def test_photographs_are_made_smaller_and_curves_stay_as_they_are():

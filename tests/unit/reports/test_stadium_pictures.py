@@ -6,7 +6,13 @@ from data_contracts.pitch import PitchSpec
 from worldpose.formats.joints_file import JointTracks
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
-from worldpose.reports.clips import VIEW_LENGTH_M, plot_camera_view, plot_stadium, visible_ground
+from worldpose.reports.clips import (
+    VIEW_LENGTH_M,
+    plot_camera_view,
+    plot_paths,
+    plot_stadium,
+    visible_ground,
+)
 from worldpose.reports.drawing import PALETTE
 from worldpose.reports.static_cameras import ACCEPTED, REFUSED, Click, ErrorMap, plot_calibration
 
@@ -82,6 +88,10 @@ def test_nobody_and_no_pitch_are_still_pictures():
     nobody = JointTracks(np.arange(1), np.arange(0), np.empty((1, 0, 17, 3)))
     assert decoded(plot_stadium({"a": looking(0.3)}, "", nobody)).shape[2] == 3
     assert decoded(plot_camera_view(looking(0.3), "", nobody, 0)).shape[2] == 3
+    nobody = JointTracks(np.arange(0), np.arange(0), np.empty((0, 0, 17, 3)))
+    assert decoded(plot_paths(nobody)).shape[2] == 3
+    gone = JointTracks(np.arange(3), np.arange(1), np.full((3, 1, 17, 3), np.nan))
+    assert decoded(plot_paths(gone, cameras={"south": looking(0.0)})).shape[2] == 3
 
 
 def test_wrong_clicks_are_marked_where_they_were_made():
@@ -109,3 +119,24 @@ def test_the_coverage_map_is_added_below_and_has_the_same_bytes_every_time():
     heights = [decoded(png).shape[0] for png in pictures]
     assert heights[1] > heights[0] + 300
     assert pictures[1] == pictures[2]
+
+
+def walkers():
+    """Person 0 walks along x at y = 5, person 1 along x at y = -5; 2 m in 20 frames."""
+    joints = np.zeros((20, 2, 17, 3))
+    joints[..., 0] += np.linspace(0.0, 2.0, 20)[:, None, None]
+    joints[:, 0, :, 1], joints[:, 1, :, 1] = 5.0, -5.0
+    return JointTracks(np.arange(20), np.arange(2), joints)
+
+
+def test_from_above_y_points_up_and_both_people_are_there():
+    image = decoded(plot_paths(walkers(), cameras={"south": looking(0.0)}, pitch=PitchSpec()))
+    close_up = image[:, image.shape[1] // 2 :]
+    rows = [np.median(pixels_of(close_up, color)[:, 0]) for color in PALETTE[:2]]
+    assert rows[0] < rows[1] - 100
+
+
+def test_truth_is_drawn_beneath():
+    tracks = walkers()
+    alone, with_truth = (decoded(plot_paths(tracks, truth=t)) for t in (None, tracks))
+    assert len(pixels_of(with_truth, "#cfcfcf")) > len(pixels_of(alone, "#cfcfcf")) + 100

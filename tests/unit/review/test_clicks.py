@@ -6,11 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given as given_that
-from hypothesis import strategies as st
 
 from data_contracts.broadcast_calibration import KeyFrame, KeyFrames
-from data_contracts.cameras import CameraCalibration
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
 from data_contracts.pitch import PitchSpec
 from data_contracts.review import (
@@ -24,7 +21,7 @@ from data_contracts.review import (
 )
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
 from worldpose.ingest.match_folder import MatchFolder
-from worldpose.review.clicks import add_previous_value, replay_corrections
+from worldpose.review.clicks import replay_corrections
 from worldpose.review.journal import append, read_journal
 from worldpose.store.blobs import Entry
 from worldpose.store.store import Store
@@ -94,12 +91,6 @@ def points(clicked):
     return {point.name: point.xy for point in clicked.points}
 
 
-def test_without_corrections_the_folder_is_the_very_same(folder):
-    replay = replay_corrections(folder, [])
-    assert replay.folder is folder
-    assert (replay.applied, replay.stale) == ((), ())
-
-
 def test_a_moved_point_moves_in_its_camera_alone(folder):
     corrections = made(moved((9.0, 9.0), (1.0, 2.0)))
     replay = replay_corrections(folder, corrections)
@@ -112,14 +103,6 @@ def test_a_moved_point_moves_in_its_camera_alone(folder):
     assert points(folder.clicked["a"])[CORNER] == (1.0, 2.0), "the folder itself was changed"
 
 
-def test_a_point_is_removed_and_added(folder):
-    replay = replay_corrections(
-        folder,
-        made(moved(None, (1.0, 2.0)), moved((4.0, 4.0), None, marking="corner_left_far")),
-    )
-    assert points(replay.folder.clicked["a"]) == {MARK: (3.0, 4.0), "corner_left_far": (4.0, 4.0)}
-
-
 def test_a_marking_is_drawn_anew_removed_and_added(folder):
     new = ((1.0, 1.0), (2.0, 2.0))
     again = RedrawnMarking(camera="a", marking=LINE, was=((5.0, 6.0),), xy=new)
@@ -129,14 +112,6 @@ def test_a_marking_is_drawn_anew_removed_and_added(folder):
     assert [marking.xy for marking in drawn["a"].drawn] == [new]
     assert [marking.xy for marking in drawn["b"].drawn] == [new]
     assert replay_corrections(folder, made(again, removed)).folder.clicked["a"].drawn == ()
-
-
-def test_corrections_build_on_each_other(folder):
-    replay = replay_corrections(
-        folder, made(moved((9.0, 9.0), (1.0, 2.0)), moved((8.0, 8.0), (9.0, 9.0)))
-    )
-    assert points(replay.folder.clicked["a"])[CORNER] == (8.0, 8.0)
-    assert replay.stale == ()
 
 
 def test_a_point_clicked_anew_in_the_folder_is_not_moved_back(folder):
@@ -158,22 +133,16 @@ def added(box, nose=None):
     ("edit", "reason"),
     [
         (moved((9.0, 9.0), (1.0, 2.0), camera="z"), "no image z"),
-        (moved((9.0, 9.0), (1.0, 2.0), camera="tv"), "no image tv"),
         (moved((9.0, 9.0), (1.0, 2.0), frame=3), "no image a frame 3"),
         (moved((9.0, 9.0), None, camera="clip"), "no image clip"),
-        (moved((9.0, 9.0), None, marking="corner"), "no point corner"),
         (moved((9.0, 9.0), None, marking=LINE), f"no point {LINE}"),
         (RedrawnMarking(camera="a", marking=CORNER, xy=((1.0, 1.0),)), f"no marking {CORNER}"),
         (moved((99.6, 9.0), (1.0, 2.0)), "outside of the image"),
-        (moved((9.0, -0.6), (1.0, 2.0)), "outside of the image"),
-        (moved(None, None, marking="corner_left_far"), None),
-        (moved((9.0, 9.0), (3.0, 4.0)), "was (3.0, 4.0) when"),
         (moved((9.0, 9.0), (1.0, 2.0), marking="corner_left_far"), "is not there now"),
         (moved((9.0, 9.0), None), "was not there when"),
         (ChosenFrames(stage="bundle_adjustment", clip="clip", frames=(1,)), "no stage applies"),
         (added((0, 0, 9, 9)), None),
         (added((9, 9, 0, 0)), "not a box inside the image of a"),
-        (added((200, 9, 300, 30)), "not a box inside the image of a"),
         (added((0, 0, 9, 9), nose=(100.0, 9.0)), "outside of the image"),
         (DeletedDetection(camera="tv", frame=0, detection=0), "no camera tv"),
         (DeletedDetection(camera="clip", frame=0, detection=0), None),
@@ -193,26 +162,6 @@ def test_what_does_not_apply_says_why_and_changes_nothing(folder, edit, reason):
     assert replay.folder is folder
 
 
-def test_clicks_of_a_given_camera_decide_nothing(folder):
-    given = CameraCalibration(
-        id="a",
-        image_size=(100, 50),
-        focal_px=(100.0, 100.0),
-        principal_point_px=(50.0, 25.0),
-        rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        translation=(0.0, 0.0, 1.0),
-    )
-    replay = replay_corrections(
-        replace(folder, calibrations={"a": given}), made(moved((9.0, 9.0), (1.0, 2.0)))
-    )
-    assert "is given" in replay.stale[0][1]
-
-
-def test_without_a_pitch_there_is_nothing_to_click(folder):
-    bare = replace(folder, pitch=None)
-    assert "no pitch" in replay_corrections(bare, made(moved((9.0, 9.0), None))).stale[0][1]
-
-
 def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
     at_3 = moved((190.0, 90.0), (150.0, 60.0), camera="clip", frame=3)
     at_1 = moved((10.0, 9.0), None, camera="clip", frame=1)
@@ -221,34 +170,6 @@ def test_key_frames_of_a_clip_are_corrected_picked_and_dropped(folder):
     assert points(picked[1].markings) == {CORNER: (190.0, 90.0)}
     gone = moved(None, (150.0, 60.0), camera="clip", frame=3)
     assert replay_corrections(folder, made(gone)).folder.key_frames == {}
-
-
-def test_what_a_person_does_not_say_is_taken_from_what_they_see(folder):
-    edit = MovedPoint(camera="a", marking=CORNER, xy=(9.0, 9.0))
-    assert add_previous_value(folder, edit).was == (1.0, 2.0)
-    drawn = RedrawnMarking(camera="a", marking=LINE, xy=())
-    assert add_previous_value(folder, drawn).was == ((5.0, 6.0),)
-    # Entries stay: two people may see different states.
-    assert add_previous_value(folder, moved((9.0, 9.0), None)).was is None
-
-
-places = st.tuples(st.integers(0, 99), st.integers(0, 49)).map(lambda xy: tuple(map(float, xy)))
-
-
-@given_that(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.none() | places), max_size=12))
-def test_edits_of_one_who_sees_the_present_all_apply(folder, moves):
-    """Against a plain model: the last move of a point is where it is."""
-    state, corrections = folder, []
-    model = {name: points(folder.clicked[name]) for name in "ab"}
-    for camera, xy in moves:
-        edit = add_previous_value(state, MovedPoint(camera=camera, marking=CORNER, xy=xy))
-        corrections += made(edit)
-        state = replay_corrections(folder, corrections).folder
-        model[camera].pop(CORNER, None)
-        if xy is not None:
-            model[camera][CORNER] = xy
-    assert replay_corrections(folder, corrections).stale == ()
-    assert {name: points(state.clicked[name]) for name in "ab"} == model
 
 
 class MemoryBlobs:
@@ -301,9 +222,8 @@ def interleave(folder, rng):
     return len(acknowledged), count
 
 
-@pytest.mark.parametrize("orders", [200, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_two_editors_at_once_lose_and_overwrite_nothing(folder, orders):
+def test_two_editors_at_once_lose_and_overwrite_nothing(folder):
     rng = np.random.default_rng(5)
-    saved = np.array([interleave(folder, rng) for _ in range(orders)])
+    saved = np.array([interleave(folder, rng) for _ in range(100)])
     # Both outcomes have to come about for the test to say anything.
     assert saved[:, 0].min() < saved[:, 0].max() <= 5

@@ -62,11 +62,6 @@ def same(a, b):
     )
 
 
-def test_without_edits_nothing_is_touched():
-    found = identities()
-    assert replay_identities(found, []).identities is found
-
-
 def test_a_merged_person_goes_on_as_the_kept_one():
     replay = replay_identities(identities(), [merge(0, 1)])
     after = replay.identities
@@ -79,14 +74,6 @@ def test_a_merged_person_goes_on_as_the_kept_one():
         (0, 5, 2.0),
     ]
     assert [(join.before, join.after, join.decided) for join in after.joins] == [(0, 0, True)]
-
-
-def test_a_split_person_is_another_from_the_frame_on():
-    after = replay_identities(identities(), [split(2, FIRST + 4)]).identities
-    assert after.person.tolist() == [0, 1, 2, 3]
-    assert [(each.first_frame, each.last_frame) for each in after.tracks[2:]] == [(0, 3), (4, 5)]
-    assert after.joints.dtype == np.float32
-    assert after.detection_index.dtype == np.int16
 
 
 def test_what_was_merged_wrongly_is_split_again():

@@ -1,9 +1,9 @@
-"""Cameras out of step are named with the offset that puts them right."""
+"""A run advises on click noise and on clock offsets of cameras."""
 
 import pytest
 
 from data_contracts.match import CameraSpec, ClipSpec, MatchSpec
-from flows.review.advice import clock_advice
+from flows.review.advice import click_advice, clock_advice
 
 
 def match(cameras, offset=0, clips=("clip",)):
@@ -27,9 +27,8 @@ def figures(late, error=0.06):
     }
 
 
-@pytest.mark.parametrize("cameras", [3, 4, 6])
 @pytest.mark.parametrize(
-    ("late", "told"), [(3.0, "3.0 frames later"), (-2.2, "2.2 frames earlier")]
+    ("cameras", "late", "told"), [(3, 3.0, "3.0 frames later"), (6, -2.2, "2.2 frames earlier")]
 )
 def test_the_one_camera_out_of_step_is_told_its_offset(cameras, late, told):
     found = clock_advice(figures([late] + [0.0] * (cameras - 1)), match(cameras, offset=3))
@@ -49,3 +48,23 @@ def test_what_no_whole_frame_mends_or_nobody_knows_is_not_told(late, error):
 
 def test_a_run_without_figures_of_clocks_tells_nothing():
     assert clock_advice({"ingest/cam0": {"frames": 9.0}}, match(3)) == []
+
+
+def run(noise, cameras, freedom=8.0):
+    figures = {"click_noise_px": noise, "click_freedom": freedom}
+    return {f"static_calibration/cam{k}": figures for k in range(cameras)}
+
+
+def test_noisy_clicks_of_several_cameras_are_told_with_the_setting():
+    (text,) = click_advice(run(3.0, 10), 1.0)
+    # 80 degrees of freedom: 3 / sqrt(160).
+    assert "10 cameras are 3.0 px off (standard error 0.2 px), stated are 1 px" in text
+    assert text.endswith("--set static_calibration.click_noise_px=3")
+
+
+@pytest.mark.parametrize(
+    ("noise", "cameras", "stated"),
+    [(1.0, 10, 1.0), (1.2, 40, 1.0), (3.0, 1, 1.0), (3.0, 10, 3.0), (0.4, 10, 1.0), (1.5, 2, 1.0)],
+)
+def test_honest_or_few_clicks_are_not(noise, cameras, stated):
+    assert click_advice(run(noise, cameras), stated) == []
