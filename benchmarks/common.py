@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from registry import Table
 
-from data_contracts.arrays import Flags, Floats, Image
+from data_contracts.arrays import Floats, Image
 from flows.match import task_of
 from flows.method import METHOD
 from flows.registering import register
 from flows.run_plan import plan_run
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import Scene, simulate_scene
@@ -62,11 +61,6 @@ def compare_times(
 def tell(text: str) -> None:
     """Print progress where tables do not go."""
     print(text, file=sys.stderr, flush=True)
-
-
-def inside_image(camera: Camera, pixels: Floats) -> Flags:
-    """Return whether pixels (..., 2) are in the camera's image."""
-    return np.asarray(((pixels > 0.0) & (pixels < camera.image_size - 1.0)).all(axis=-1))
 
 
 def simulate(name: str, seed: int, duration: float | None = None) -> tuple[Scenario, Scene]:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
@@ -26,14 +22,11 @@ from typing import Any, TypeVar
 import numpy as np
 import psutil
 import torch
-from common import WORLDPOSE, run_worldpose, tell
-from distributed import LocalCluster
+from common import WORLDPOSE, tell
 from registry import OUT, Table, Tables, benchmark, integer, option
 
 from data_contracts.arrays import Image
-from data_contracts.work import Work
 from flows.results.dataset import check, count
-from tasks.unit import keep_freed_memory
 from worldpose.body.body_file import OPEN_BODY, find_body
 from worldpose.body.model import BodyParameters
 from worldpose.detection.enlargement import SeesParts, expect_parts
@@ -52,7 +45,6 @@ from worldpose.simulation.matches import open_view, render_frame
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.simulation.settings import RenderingSettings, RigSettings
-from worldpose.store.paths import ResultId
 from worldpose.store.store import Store
 from worldpose.video.files import write_video
 from worldpose.video.folder import open_video
@@ -70,8 +62,6 @@ SURE = 0.4
 
 INTERVAL_S = 0.25
 
-PERIOD_US = 20_000
-"""Period in which a group gets its share [us]."""
 
 GROUPS = Path("/sys/fs/cgroup")
 
@@ -283,125 +273,6 @@ def measure_run(folder: Path, project: Path) -> dict[str, Cost]:
         for stage, (first, last) in sorted(spans.items(), key=lambda item: item[1])
     }
     return {**costs, "all": Cost(whole, *memory.peak(begin, begin + whole))}
-
-
-@benchmark(
-    "scaling",
-    "time of stages by the number of workers on slow machines",
-    option("match", type=Path),
-    option("--workers", type=int, nargs="+", default=[1, 2, 4]),
-    option("--share", type=float, default=0.25, help="of one processor, for each worker"),
-)
-def measure_scaling(options: Namespace) -> Tables:
-    """`worldpose simulate --scenario tiny --duration 0.32 --cameras 8 --render --out tiny-8`.
-
-    Each worker is a Dask worker process that Linux gives a share of one processor (control group
-    `cpu`; needs its permission), as a machine of that speed would be. For each number of workers
-    the match runs up to detection in a new project on a scheduler of its own. Efficiency is the
-    time with one worker over the number of workers times the time with them. The serial part is
-    that of Amdahl's law for the largest number.
-    """
-    found: dict[int, dict[str, float]] = {}
-    folder = Path(tempfile.mkdtemp(prefix="scaling-"))
-    for number in sorted({1, *options.workers}):
-        part = folder / str(number)
-        part.mkdir()
-        found[number] = measure_workers(options.match, part, number, options.share)
-        tell(f"{number} workers: {sum(found[number].values()):.1f} s")
-    most, rows = max(found), []
-    for stage, alone in found[1].items():
-        cells: list[Any] = [stage]
-        for number, times in found.items():
-            cells += [times[stage], 100.0 * alone / (number * times[stage])]
-        serial = (found[most][stage] / alone - 1 / most) / (1 - 1 / most) if most > 1 else 1.0
-        rows.append([*cells, 100.0 * serial])
-    kinds = ("[s]", "efficiency [%]")
-    columns = [f"{n} workers {kind}" for n in found for kind in kinds]
-    return {"stages": Table("scaling", ["stage", *columns, "serial part [%]"], rows)}
-
-
-@contextmanager
-def limited_group(name: str, share: float) -> Iterator[Path]:
-    """Yield a new control group whose processes get `share` of one processor together."""
-    is_v2 = (GROUPS / "cgroup.controllers").exists()
-    group = (GROUPS if is_v2 else GROUPS / "cpu") / name
-    group.mkdir()
-    try:
-        quota = int(share * PERIOD_US)
-        if is_v2:
-            (group / "cpu.max").write_text(f"{quota} {PERIOD_US}")
-        else:
-            (group / "cpu.cfs_period_us").write_text(str(PERIOD_US))
-            (group / "cpu.cfs_quota_us").write_text(str(quota))
-        yield group
-    finally:
-        for _ in range(100):  # ended processes leave it a little later
-            try:
-                group.rmdir()
-                break
-            except OSError:
-                time.sleep(0.1)
-
-
-def measure_workers(match: Path, folder: Path, workers: int, share: float) -> dict[str, float]:
-    """Return the time of each stage up to detection with so many workers [s]."""
-    project = folder / "project"
-    with ExitStack() as stack:
-        names = [f"scaling-{os.getpid()}-{n}" for n in range(workers)]
-        groups = [stack.enter_context(limited_group(name, share)) for name in names]
-        options = {"threads_per_worker": 1, "memory_limit": 0, "preload": ["tasks.preload"]}
-        address = {"host": "127.0.0.1", "dashboard_address": None}
-        cluster = stack.enter_context(LocalCluster(n_workers=workers, **options, **address))
-        for group, worker in zip(groups, cluster.workers.values(), strict=True):
-            (group / "cgroup.procs").write_text(str(worker.pid))
-        where = ("--project", project, "--dask", cluster.scheduler_address)
-        run_worldpose("run", match, *where, "--until", "detection")
-    return {stage: last - first for stage, (first, last) in stage_spans(project, match).items()}
-
-
-@benchmark(
-    "unit_cost",
-    "CPU time of one unit of a project's latest run",
-    option("project", type=Path),
-    option("match", type=Path, help="match folder"),
-    option("unit", help="STAGE/UNIT"),
-    integer("repeat", 2),
-    option("--as-dask", action="store_true", help="without keep_freed_memory"),
-)
-def measure_unit(options: Namespace) -> Tables:
-    """The unit is computed in a thread of this process, as a Dask worker does.
-
-    Inputs are those of the run, in a copy of the project whose files are links. The first
-    computation includes the loading of kernels, and their compilation after a change of code.
-    """
-    if not options.as_dask:
-        keep_freed_memory()
-    given = Store.open(options.project)
-    (match_id,) = given.matches()
-    stage, _, unit = options.unit.partition("/")
-    result = ResultId(match_id, stage, unit, given.run(match_id).results[options.unit])
-    manifest = given.manifest(match_id, stage, unit, result.key)
-    task = getattr(importlib.import_module(f"tasks.{stage}"), stage)
-    rows = []
-    with tempfile.TemporaryDirectory(dir=options.project.parent) as scratch:
-        copy, folder = Path(scratch) / "project", str(options.match.resolve())
-        shutil.copytree(options.project, copy, copy_function=os.link)
-        work = Work(
-            project=str(copy),
-            folder=folder,
-            recipe=manifest.recipe,
-            key=manifest.key,
-            run_id="0001",
-        )
-        for turn in range(options.repeat):
-            Store.open(copy).withdraw(result)
-            before = os.times()
-            with ThreadPoolExecutor(1) as thread:
-                # Below the wrapper, which refuses code other than the run's.
-                thread.submit(task.fn.__wrapped__, work).result()
-            after = os.times()
-            rows.append([turn + 1, after.user + after.system - before.user - before.system])
-    return {"cost": Table(f"CPU time of {options.unit}", ["computation", "time"], rows, "s")}
 
 
 STEPS = ("write", "check", "count")

@@ -19,29 +19,16 @@ from common import (
     tell,
 )
 from registry import DATA, SET, Table, Tables, benchmark, integer, option
-from scipy.optimize import linear_sum_assignment
 
-from data_contracts.arrays import Floats
-from data_contracts.keypoints import KeypointDetections
 from flows.results.best_results import JointDefinition, joint_tracks
 from worldpose.body_fitting.objective import perceived_joints
 from worldpose.errors import WorldposeError
-from worldpose.geometry.cameras import Camera
-from worldpose.ingest.footage import read_unit
 from worldpose.ingest.importing import import_match
-from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store, open_run
-from worldpose.tracking.settings import TrackingSettings
-from worldpose.tracking.tracker import track_people
-from worldpose.triangulation.chunking import reconstruct_joints
-from worldpose.triangulation.settings import TriangulationSettings
 
 FPS = 25.0
 
 ALL_FRAMES = range(1_000_000)
-
-WINDOWS = (range(300, 421), range(421, 511))
-"""Frames in which settings are chosen, and in which they are scored."""
 
 
 STAGES = ("triangulation", "retriangulation", "body_fitting")
@@ -213,73 +200,3 @@ def score(
         error = found["mpjpe_mm_matched"]
         scores[letter] = found["avg_pcp_actors_1_3"], np.nan if error is None else error
     return scores
-
-
-@benchmark(
-    "shelf_pairs",
-    "who is found in single frames of the pairs of Shelf's cameras",
-    DATA,
-    option("--odds", type=float, nargs="+", default=[3.0], help="values of tracking.pair_odds"),
-    integer("every", 4),
-)
-def score_pairs(options: Namespace) -> Tables:
-    """Every 4th of the frames 300 to 420 is a clip of one frame for each pair of cameras.
-
-    The people of all cameras, tracked over all frames, are the truth: asked are those whom both
-    cameras of a pair detect. A person is found if a result is within 0.5 m, by the mean over the
-    joints; results without a person are false.
-    """
-    data, rows = options.data / "shelf_dev", []
-    with tempfile.TemporaryDirectory() as temporary:
-        case = write_case(data / "import", list_cameras(data), WINDOWS[0], Path(temporary))
-        match = read_match(case)
-        ids = [camera.id for camera in match.spec.static_cameras]
-        cameras = Camera.stack([Camera.from_calibration(match.calibrations[name]) for name in ids])
-        seen = KeypointDetections.stack([read_unit(match, name)[0] for name in ids])
-    truth, index = find_people(cameras, seen, TrackingSettings())
-    for odds in options.odds:
-        settings = TrackingSettings(pair_odds=odds)
-        asked = found = false = 0
-        errors: list[float] = []
-        for pair in itertools.combinations(range(len(ids)), 2):
-            views = np.array(pair)
-            for frame in range(0, len(truth), options.every):
-                both = (index[frame, views] >= 0).all(axis=0)
-                now = seen[frame : frame + 1]
-                one = KeypointDetections.from_keypoints(
-                    now.keypoints[:, views], now.confidence[:, views]
-                )
-                joints, _ = find_people(cameras[views], one, settings)
-                matched, _, distance = pair_people(truth[frame], joints[0])
-                asked += int(both.sum())
-                found += int(both[matched].sum())
-                false += joints.shape[1] - len(matched)
-                errors += distance.tolist()
-        rows.append([odds, found, asked, 100.0 * found / asked, 100.0 * np.mean(errors), false])
-    columns = ["odds", "found", "of", "found [%]", "mean error [cm]", "false"]
-    return {"pairs": Table("people of pairs of cameras", columns, rows)}
-
-
-def find_people(
-    cameras: Camera, detections: KeypointDetections, settings: TrackingSettings
-) -> tuple[Floats, Floats]:
-    """Return joints (frames, persons, 17, 3) [m], and detection indices (frames, cameras, ...)."""
-    tracks = track_people(cameras, detections, FPS, settings)
-    index = tracks.detection_index
-    if not len(tracks.person):
-        return np.empty((len(index), 0, 17, 3)), np.asarray(index, dtype=np.float64)
-    assigned = detections.assign_people(index)
-    placed = reconstruct_joints(cameras, assigned, FPS, TriangulationSettings())
-    joints = placed.triangulation.joints.astype(np.float64)
-    return joints, np.asarray(index, dtype=np.float64)
-
-
-def pair_people(truth: Floats, found: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return rows and columns of people and results of one frame, and their distances [m]."""
-    off = np.linalg.norm(truth[:, None] - found[None], axis=-1)
-    known = np.isfinite(off)
-    mean = np.where(known, off, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    mean = np.where(known.any(axis=-1), mean, np.inf)
-    rows, columns = linear_sum_assignment(np.minimum(mean, 1e3))
-    near = mean[rows, columns] <= FOUND_M
-    return rows[near], columns[near], mean[rows[near], columns[near]]

@@ -13,29 +13,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import fetch_file, quantile, read_changes, read_image, run_worldpose, tell
+from common import fetch_file, read_changes, read_image, run_worldpose, tell
 from registry import DATA, SET, Table, Tables, benchmark, integer, option
 
 from data_contracts.arrays import Flags, Floats
-from data_contracts.conventions import COCO17
-from worldpose.body.body_file import load_open_body
-from worldpose.body.keypoints import fold_keypoints
-from worldpose.body.model import BODY_POSE, BodyParameters
-from worldpose.detection.bundled_nets import load_weights
 from worldpose.detection.interfaces import People
-from worldpose.detection.landmark_net import POINTS, LandmarkEstimator, LandmarkNet
 from worldpose.detection.models import (
     load_bundled_detector,
     load_bundled_pose,
     load_detectors,
-    load_landmarks,
     load_pose,
 )
 from worldpose.detection.settings import DetectionSettings
 from worldpose.detection.suppression import fuse
 from worldpose.detection.views import TiledDetector
-from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.scene import simulate_scene
 from worldpose.training.fine_tuning import split
 from worldpose.training.labels import (
     LabelledPicture,
@@ -46,13 +37,11 @@ from worldpose.training.labels import (
     write_labels,
 )
 from worldpose.training.metrics import (
-    TORSO_SHARE,
     average_precision,
     detect_labelled,
     judge_boxes,
     score_keypoints,
     score_people,
-    torso_sizes,
 )
 from worldpose.training.settings import FineTuningSettings
 
@@ -88,14 +77,6 @@ MARGIN_PX = 4.0
 PARTS = {"train": "_1st_", "test": "_2nd_", "all": ""}
 """Text in the names of the images of each part."""
 
-NEAREST = 12
-"""Landmarks from which a joint follows."""
-
-RIDGE_M = 0.05
-"""Weight of equal shares against the fit to bodies [m]: small shares pass on little noise."""
-
-LABELLED = COCO17[5:]
-"""Joints that the stills have labels of: all but those of the head."""
 
 RECIPE = Path(__file__).parents[1] / "infra" / "embedded_detector"
 
@@ -292,73 +273,6 @@ def measure(
         "people": sum(len(still.boxes) for still in stills),
         "time": 1e3 * (time.process_time() - begun) / len(stills),
     }
-
-
-@benchmark(
-    "real_landmarks",
-    "landmarks of the body's surface on the labelled real stills",
-    DATA,
-    option("--net", type=Path, help="weights; the shipped ones in integers if absent"),
-)
-def score_landmarks(options: Namespace) -> Tables:
-    """No real image has labelled landmarks, but twelve stills have joints labelled by eye.
-
-    A joint follows from the landmarks of its neighbouring segments, by weights that are fitted to
-    the body model in simulated poses. So landmarks are compared with labels, as are the joints of
-    the bundled pose net in the same boxes: PCK at 0.2 torsos, and the median error.
-    """
-    nets = None if options.net else load_landmarks(DetectionSettings(landmarks=True))
-    nets = nets or LandmarkEstimator(load_weights(options.net, LandmarkNet()))
-    shares, pose, cache = joint_shares(), load_bundled_pose(), PictureCache(1 << 28)
-    each: dict[str, list[Floats]] = {"landmarks": [], "pose net": []}
-    for still in read_labels(options.data / "stills" / "labels.json"):
-        asked = (still.visible > 0).any(axis=1)
-        if not asked.any():
-            continue
-        image, true = cache[still.path], still.keypoints[asked]
-        joints = pose.estimate(image, still.boxes[asked])
-        found = nets.estimate(image, np.asarray(joints.boxes, dtype=np.float64))
-        derived = np.full(true.shape, np.nan)
-        derived[:, 5:] = np.einsum("jk,pka->pja", shares, found.places)
-        shown = (still.visible[asked] == 2) & (np.arange(17) >= 5)
-        for name, places in (("landmarks", derived), ("pose net", joints.keypoints)):
-            off = np.linalg.norm(places - true, axis=-1) / torso_sizes(true)[:, None]
-            each[name].append(np.where(shown, off, np.nan))
-    rows = []
-    for name, parts in each.items():
-        for joint in (*range(5, 17, 2), None):
-            off = np.concatenate(parts)[:, slice(5, 17) if joint is None else [joint, joint + 1]]
-            label = "all" if joint is None else COCO17[joint].removeprefix("left_")
-            off = off[np.isfinite(off)]
-            rows.append([f"{name}, {label}", (off <= TORSO_SHARE).mean(), quantile(off), len(off)])
-    columns = ["joints", "PCK", "median error [torsos]", "number"]
-    return {"joints": Table("joints of the stills", columns, rows)}
-
-
-def joint_shares() -> Floats:
-    """Return the shares of landmarks in joints (12, points), from bodies in simulated poses."""
-    model = load_open_body()
-    scenario = SCENARIOS["match"].model_copy(update={"duration": 4.0, "broadcast": None})
-    poses = simulate_scene(scenario, 77).poses[:, ::20]
-    rest = BodyParameters(np.zeros(model.shapes), np.zeros(3), np.zeros(BODY_POSE), np.zeros(3))
-    points, joints = (fold_keypoints(model, names) for names in (POINTS, LABELLED))
-    apart = np.linalg.norm(joints(rest)[:, None] - points(rest), axis=-1)
-    places, aims = points(poses).reshape(-1, len(POINTS), 3), joints(poses).reshape(-1, 12, 3)
-    shares = np.zeros((len(LABELLED), len(POINTS)))
-    for joint in range(len(LABELLED)):
-        near = np.argsort(apart[joint])[:NEAREST]
-        # Shares have the sum 1: the last one follows from the others.
-        base = places[:, near[-1]]
-        columns = np.moveaxis(places[:, near[:-1]] - base[:, None], 1, 2).reshape(-1, NEAREST - 1)
-        aim = (aims[:, joint] - base).ravel()
-        weight = RIDGE_M**2 * len(columns)
-        equal = np.full(NEAREST - 1, 1.0 / NEAREST)
-        found = np.linalg.solve(
-            columns.T @ columns + weight * np.eye(NEAREST - 1), columns.T @ aim + weight * equal
-        )
-        shares[joint, near[:-1]] = found
-        shares[joint, near[-1]] = 1.0 - found.sum()
-    return shares
 
 
 @benchmark(

@@ -1,7 +1,7 @@
 """Settings of Sphinx, which builds the site of these pages: `make docs`.
 
-The pages of the reference that repeat the code (settings, command line, API) are written when the
-build begins, so that they cannot differ from it.
+The pages that repeat the code (settings, command line, API) or recorded results are written when
+the build begins, so that they cannot differ from these.
 """
 
 import sys
@@ -38,6 +38,10 @@ html_title = "worldpose"
 
 def setup(app: Sphinx) -> None:
     """Write the generated pages before Sphinx looks for sources."""
-    from generate_reference import write_reference
+    from generate_reference import write_reference, write_results
 
-    app.connect("config-inited", lambda *_: write_reference(DOCS / "reference" / "generated"))
+    def write_pages(*_: object) -> None:
+        write_reference(DOCS / "reference" / "generated")
+        write_results(DOCS / "results" / "data", DOCS / "results" / "generated")
+
+    app.connect("config-inited", write_pages)

@@ -1,11 +1,15 @@
-"""Writes the pages of the reference that repeat the code: settings, command line and API."""
+"""Writes the pages that repeat other files: settings, command line and API, and the results.
+
+The tables of the results are those that `python benchmarks/run.py NAME --json` wrote.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -13,6 +17,9 @@ from data_contracts.records import field_docstrings
 from flows.cli.app import COMMANDS, app
 from flows.method import METHOD
 from flows.stage import Stage
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from registry import Table, format_table
 
 if TYPE_CHECKING:
     from typer._click.core import Command
@@ -24,6 +31,66 @@ def write_reference(folder: Path) -> None:
     write(folder / "settings.md", settings_page())
     write(folder / "command_line.md", command_page())
     write(folder / "api.md", api_page())
+
+
+RESULT_PAGES = {
+    "real": ("Real data", "real shelf shelf_subsets mvor pose2sim_demo"),
+    "detection": ("Detection", "detection stills panorama_people finetuning"),
+    "static_cameras": (
+        "Static cameras",
+        "static_calibration static_accuracy camera_projection camera_faults synchronization "
+        "proposals pitch_lines still_cameras bundle_adjustment adjustment_accuracy",
+    ),
+    "people": (
+        "People, joints and bodies",
+        "tracking triangulation body_fitting body_accuracy second_world",
+    ),
+    "moving_cameras": (
+        "Moving cameras",
+        "broadcast_calibration broadcast_accuracy broadcast_line_sets broadcast_clip "
+        "broadcast_cuts",
+    ),
+    "whole_runs": (
+        "Time and memory",
+        "run_memory data_set_size",
+    ),
+}
+"""Title of each page of results, and the benchmarks whose tables it has."""
+
+
+def write_results(data: Path, folder: Path) -> None:
+    """Write a page for each part of the method from the tables that benchmarks recorded.
+
+    Raises:
+        ValueError: a file is of a benchmark that no page has.
+    """
+    found = {path.stem: json.loads(path.read_text()) for path in sorted(data.glob("*.json"))}
+    folder.mkdir(parents=True, exist_ok=True)
+    for page, (title, names) in RESULT_PAGES.items():
+        results = [found.pop(name) for name in names.split() if name in found]
+        write(folder / f"{page}.md", result_page(title, results))
+    if found:
+        raise ValueError(f"{data}: no page of results has {', '.join(found)}; add it to one")
+
+
+def result_page(title: str, results: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of one page: for each benchmark its command, machine and tables."""
+    yield f"# {title}"
+    for result in results:
+        machine, versions = result["machine"], result["versions"]
+        yield ""
+        yield f"## {result['benchmark']}"
+        yield ""
+        yield f"    {result['command']}"
+        yield ""
+        yield f"{result['date']}, {result['seconds']:.0f} s, worldpose {versions['worldpose']}."
+        yield f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB."
+        for table in result["tables"].values():
+            yield ""
+            yield format_table(Table(**table)).rstrip()
+    if not results:
+        yield ""
+        yield "No benchmark of this page has a recorded result."
 
 
 def write(path: Path, lines: Iterator[str]) -> None:

@@ -2,6 +2,7 @@
 
 All take and return plain arrays and frozen records, and need neither Prefect, Dask nor a store:
 
+- the whole method: `reconstruct` a match folder, see worldpose/pipeline.py;
 - read: `read_match` a match folder, `read_unit` one camera's 2D poses of it, `read_cameras` a
   calibration file, `read_observations` a file of 2D poses, `read_still` an image, `open_video`;
 - calibrate: `calibrate_camera` from clicks on pitch markings, `calibrate_broadcast` a moving
@@ -58,6 +59,8 @@ if TYPE_CHECKING:
     from worldpose.ingest.footage import read_unit as read_unit
     from worldpose.ingest.match_folder import MatchFolder as MatchFolder
     from worldpose.ingest.match_folder import read_match as read_match
+    from worldpose.pipeline import Reconstruction as Reconstruction
+    from worldpose.pipeline import reconstruct as reconstruct
     from worldpose.pitch.template import PitchTemplate as PitchTemplate
     from worldpose.static_calibration.calibration import calibrate_camera as calibrate_camera
     from worldpose.static_calibration.settings import (
@@ -93,6 +96,7 @@ _MODULES: Final = {
     "MatchFolder": "worldpose.ingest.match_folder",
     "PitchSpec": "data_contracts.pitch",
     "PitchTemplate": "worldpose.pitch.template",
+    "Reconstruction": "worldpose.pipeline",
     "Rigid": "worldpose.geometry.rigid",
     "StaticCalibrationSettings": "worldpose.static_calibration.settings",
     "TrackingSettings": "worldpose.tracking.settings",
@@ -113,6 +117,7 @@ _MODULES: Final = {
     "read_observations": "worldpose.formats.keypoint_files",
     "read_still": "worldpose.ingest.footage",
     "read_unit": "worldpose.ingest.footage",
+    "reconstruct": "worldpose.pipeline",
     "reconstruct_joints": "worldpose.triangulation.chunking",
     "track_people": "worldpose.tracking.tracker",
     "triangulate_joints": "worldpose.triangulation.passes",

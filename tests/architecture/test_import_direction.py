@@ -47,6 +47,7 @@ ORDER_IN_WORLDPOSE = (
     "broadcast_calibration",
     "filtering",
     "redetection",
+    "pipeline",
     "evaluation",
     "dataset",
     "reports",

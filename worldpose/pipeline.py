@@ -1,0 +1,145 @@
+"""The method in the paper's order on plain arrays; `reconstruct` is the whole of it.
+
+Each step below is one stage of `worldpose run`, which adds what a recording of a whole match needs:
+checks of cameras against each other, review gates, iterations, chunks, stored results and lineage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_contracts.keypoints import KeypointDetections
+from data_contracts.pitch import PitchSpec
+from worldpose.body.body_file import find_body
+from worldpose.body_fitting.body_fit import BodyFit, ClipEvidence, fit_bodies
+from worldpose.body_fitting.ray_constraints import find_ray_constraints
+from worldpose.broadcast_calibration.calibration import (
+    BroadcastCalibration,
+    BroadcastClip,
+    calibrate_broadcast,
+)
+from worldpose.broadcast_calibration.players import People
+from worldpose.bundle_adjustment.adjustment import BundleAdjustment, adjust_cameras
+from worldpose.bundle_adjustment.clip import Clicks, Clip
+from worldpose.detection.pipeline import detect_people
+from worldpose.geometry.cameras import Camera
+from worldpose.ingest.footage import read_still, read_unit, unit_frames
+from worldpose.ingest.match_folder import MatchFolder
+from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.report import StaticCalibration
+from worldpose.tracking.tracker import Tracking, track_people
+from worldpose.triangulation.chunking import reconstruct_joints
+from worldpose.triangulation.limb_lengths import undo_swaps
+from worldpose.triangulation.passes import Triangulation
+from worldpose.triangulation.settings import TriangulationSettings
+from worldpose.video.folder import open_video
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """All results of one clip, in one world frame.
+
+    Attributes:
+        frame: (frames,) match frames.
+        tracking: the person of each detection.
+        adjusted: static cameras, adjusted to people and markings.
+        joints: (frames, persons, 17, ...) triangulated joints.
+        bodies: (frames, persons) bodies and their joints.
+        broadcast: the moving camera of each frame; None without one.
+    """
+
+    frame: NDArray[np.int64]
+    tracking: Tracking
+    adjusted: BundleAdjustment
+    joints: Triangulation
+    bodies: BodyFit
+    broadcast: BroadcastCalibration | None
+
+
+def reconstruct(match: MatchFolder, clip_id: str | None = None) -> Reconstruction:
+    """Return the people and cameras of a clip with clicked static cameras.
+
+    Args:
+        match: a match folder with a pitch, clicks, and 2D poses or videos.
+        clip_id: name of the clip; None = the first one.
+    """
+    pitch, fps = PitchTemplate.from_spec(match.pitch or PitchSpec()), match.spec.fps
+    clip_id = clip_id or match.spec.clips[0].id
+
+    known = calibrate_static_cameras(match, pitch)
+    cameras = Camera.stack([each.estimate.camera for each in known])
+    errors = np.stack([each.estimate.covariance for each in known])
+
+    seen = find_people(match, clip_id)
+    size = (pitch.length, pitch.width)
+    tracks = track_people(cameras, seen, fps, pitch_size=size, camera_covariance=errors)
+    people = seen.assign_people(tracks.detection_index)
+    first = reconstruct_joints(cameras, people, fps, camera_covariance=errors).triangulation
+
+    clicks = tuple(Clicks.of(each, pitch) for each in known)
+    on_lines = np.array([each.report.stage == "lines" for each in known])
+    placed = (people, first.joints, first.views, TriangulationSettings(), pitch, on_lines)
+    adjusted = adjust_cameras(Clip(cameras, errors, clicks, fps, *placed))
+    cameras, errors = adjusted.cameras, adjusted.covariance
+    joints = reconstruct_joints(cameras, people, fps, camera_covariance=errors).triangulation
+
+    rays = find_ray_constraints(cameras, undo_swaps(people, joints.exchanged), joints.joints)
+    shared = joints.shared_covariance
+    evidence = ClipEvidence(
+        joints.joints, joints.covariance, fps, joints.common_bias, [rays], shared_covariance=shared
+    )
+    bodies = fit_bodies(find_body(), evidence, ground=pitch.height)
+    broadcast = calibrate_moving_camera(match, clip_id, pitch, bodies)
+    return Reconstruction(seen.frame, tracks, adjusted, joints, bodies, broadcast)
+
+
+def calibrate_static_cameras(match: MatchFolder, pitch: PitchTemplate) -> list[StaticCalibration]:
+    """Return each static camera from clicks on markings, and from painted lines in its still."""
+    calibrations = []
+    for spec in match.spec.static_cameras:
+        size, still = (spec.width, spec.height), match.stills.get(spec.id)
+        picture = None if still is None else read_still(still, size)
+        calibrations.append(calibrate_camera(pitch, match.clicked[spec.id], size, picture=picture))
+    return calibrations
+
+
+def find_people(match: MatchFolder, clip_id: str) -> KeypointDetections:
+    """Return the 2D poses (frames, cameras, detections, 17): given ones, or those of our nets."""
+    clip, cameras = match.spec.clip(clip_id), []
+    for camera in match.spec.static_cameras:
+        if camera.id in match.detections:
+            given = read_unit(match, camera.id)[0]
+            after = given.frame - clip.first_frame
+            cameras.append(given[np.flatnonzero((after >= 0) & (after < clip.frame_count))])
+        else:
+            start = clip.first_frame + unit_frames(match.spec, camera.id).offset
+            with open_video(match.videos[camera.id]) as video:
+                pictures = (each for _, each in video.frames(start, start + clip.frame_count))
+                cameras.append(detect_people(pictures))
+    return KeypointDetections.stack(cameras)
+
+
+def calibrate_moving_camera(
+    match: MatchFolder, clip_id: str, pitch: PitchTemplate, bodies: BodyFit
+) -> BroadcastCalibration | None:
+    """Return the broadcast camera of each frame: E_field + E_player, similarity and smoothness."""
+    if clip_id not in match.key_frames:
+        return None
+    frames = unit_frames(match.spec, clip_id)
+    start = frames.first + frames.offset
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with open_video(match.videos[clip_id]) as video:
+            shown = video.frames(start, start + frames.count, grey=True)
+            yield from (picture for _, picture in shown)
+
+    seen = read_unit(match, clip_id)[0] if clip_id in match.detections else None
+    people = None if seen is None else People(bodies.joints, seen.keypoints, match.spec.fps)
+    keys, fps = list(match.key_frames[clip_id].key_frames), match.spec.fps
+    clip = BroadcastClip(keys, pictures, fps, people=people, where=clip_id, first=start)
+    return calibrate_broadcast(pitch, clip)
