@@ -215,10 +215,6 @@ def age(since: datetime | None) -> float:
     return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
 
 
-def _failed(name: str, message: str) -> UnitSummary:
-    return UnitSummary(_unit(name), "failed", why=message)
-
-
 def _unit(name: str) -> str:
     return name.partition("/")[2]
 
