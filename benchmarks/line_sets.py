@@ -30,8 +30,11 @@ from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.paint_segments import Ridges, guess_lens, straighten_paint
-from worldpose.static_calibration.proposal import calibrate_without_clicks, propose_from_paint
+from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
+from worldpose.static_calibration.from_paint.proposal import (
+    calibrate_without_clicks,
+    propose_from_paint,
+)
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 from worldpose.static_calibration.sides import SeenPeople, decide_sides, turn_camera

@@ -39,7 +39,7 @@ from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.ingest.validation import validate_record
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
 from worldpose.static_calibration.sides import turn_camera
 from worldpose.video.folder import open_video
 

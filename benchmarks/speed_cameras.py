@@ -23,8 +23,8 @@ from data_contracts.arrays import Floats, Image
 from worldpose.broadcast_calibration.evidence import (
     PLAYER,
     FlowEvidence,
-    ObservedPoints,
     PointEvidence,
+    whiten_points,
 )
 from worldpose.broadcast_calibration.moving_camera import FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.priors import build_prior
@@ -504,8 +504,16 @@ def draw_clip(frames: int, rng: np.random.Generator) -> tuple[MovingCamera, Poin
     inside = ((image > 0.0) & (image < moving.image_size - 1.0)).all(axis=-1)
     frame, _ = np.nonzero(inside)
     source = np.zeros(len(frame), dtype=np.int64)
-    seen = ObservedPoints(frame, world[inside], image[inside], PLAYER, source)
-    return moving, PointEvidence.at_points(seen, np.full(len(frame), NOISE), 1.0, LOSS)
+    return moving, PointEvidence.observe(
+        PLAYER,
+        frame,
+        world[inside],
+        image[inside],
+        whiten_points(np.full(len(frame), NOISE)),
+        source=source,
+        weight=1.0,
+        loss=LOSS,
+    )
 
 
 def start_of(true: MovingCamera, rng: np.random.Generator) -> MovingCamera:

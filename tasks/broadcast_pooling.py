@@ -7,8 +7,12 @@ from typing import Any
 from data_contracts.broadcast_pooling import BROADCAST_POOLING
 from data_contracts.work import Work
 from tasks.unit import open_input, unit_task
-from worldpose.broadcast_calibration.calibration import moving_arrays, moving_from_arrays
-from worldpose.broadcast_calibration.uncertainty import drawn_to, pool_centers
+from worldpose.broadcast_calibration.uncertainty import (
+    drawn_to,
+    moving_arrays,
+    moving_from_arrays,
+    pool_centers,
+)
 from worldpose.store.store import Store
 
 

@@ -19,9 +19,8 @@ from data_contracts.tracking import Track
 from data_contracts.work import Work
 from tasks.clip_inputs import select_frames
 from tasks.unit import open_input, require_registered, unit_task
-from worldpose.broadcast_calibration.calibration import moving_from_arrays
 from worldpose.broadcast_calibration.pitch_errors import SIZES
-from worldpose.broadcast_calibration.uncertainty import static_covariance
+from worldpose.broadcast_calibration.uncertainty import moving_from_arrays, static_covariance
 from worldpose.pitch.template import PitchTemplate
 from worldpose.store.store import Store
 from worldpose.tracking.feet import GroundPositions, locate_feet

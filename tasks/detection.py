@@ -36,8 +36,8 @@ from worldpose.pitch.template import PitchTemplate
 from worldpose.review.detections import DetectionEdit, replay_detections
 from worldpose.static_calibration.venue import join_cameras
 from worldpose.store.store import Store
-from worldpose.video.files import FrameIndex
 from worldpose.video.folder import open_video
+from worldpose.video.pictures import FrameIndex
 
 
 @unit_task

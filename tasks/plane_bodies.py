@@ -19,8 +19,7 @@ from worldpose.body_fitting.body_fit import BodyFit
 from worldpose.body_fitting.fit_quality import report_fit
 from worldpose.body_fitting.monocular import read_monocular
 from worldpose.body_fitting.plane_bodies import PlaneEvidence, fit_bodies_on_plane
-from worldpose.broadcast_calibration.calibration import moving_from_arrays
-from worldpose.broadcast_calibration.uncertainty import static_covariance
+from worldpose.broadcast_calibration.uncertainty import moving_from_arrays, static_covariance
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import surface_motion

@@ -139,7 +139,9 @@ def calibrate_moving_camera(
             yield from (picture for _, picture in shown)
 
     seen = read_unit(match, clip_id)[0] if clip_id in match.detections else None
-    people = None if seen is None else People(bodies.joints, seen.keypoints, match.spec.fps)
     keys, fps = list(match.key_frames[clip_id].key_frames), match.spec.fps
+    people = None
+    if seen is not None:
+        people = People(bodies.joints, seen.keypoints.astype(np.float64), fps)
     clip = BroadcastClip(keys, pictures, fps, people=people, where=clip_id, first=start)
     return calibrate_broadcast(pitch, clip)

@@ -22,7 +22,7 @@ from worldpose.reports.static_cameras import (
     plot_calibration,
     plot_paint,
 )
-from worldpose.static_calibration.proposal import PROPOSED
+from worldpose.static_calibration.from_paint.proposal import PROPOSED
 from worldpose.store.store import Run, Store
 
 MAX_CAMERAS = 2

@@ -27,7 +27,7 @@ from worldpose.errors import InputError, WorldposeError
 from worldpose.ingest.footage import read_still
 from worldpose.pitch.template import PitchTemplate
 from worldpose.review.evidence import PitchDrawing, Preview, preview
-from worldpose.static_calibration.proposal import propose_camera
+from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 from worldpose.video.folder import open_video
 

@@ -37,10 +37,11 @@ from worldpose.ingest.footage import read_still, require_footage
 from worldpose.ingest.match_folder import MatchFolder, read_match
 from worldpose.ingest.validation import list_problems, validate_record
 from worldpose.store.store import Store
-from worldpose.video.files import FrameIndex, VideoReader, index_frames
+from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.folder import HEADER_BYTES, declared_size
 from worldpose.video.folder import SUFFIXES as IMAGE_SUFFIXES
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.pictures import FrameIndex
 
 DRAFTS: Final = ".drafts"
 """Folder of all drafts in the inbox."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint
-from worldpose.pitch.template import PitchTemplate, law_points
+from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import PitchTemplate
 from worldpose.video.folder import median_picture, open_video
 
 CROWN = 0.1

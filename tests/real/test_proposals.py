@@ -14,7 +14,7 @@ from common import run_in_process
 from line_sets import RIGHT_PX, drawn_lines
 
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.proposal import calibrate_without_clicks
+from worldpose.static_calibration.from_paint.proposal import calibrate_without_clicks
 from worldpose.store.store import Store
 from worldpose.video.folder import median_picture, open_video
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,7 @@ from worldpose.broadcast_calibration.evidence import (
 )
 from worldpose.broadcast_calibration.key_frames import calibrate_keys
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, follow_lines
-from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
+from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.pitch_errors import SIZES, PitchErrors, PitchFit
 from worldpose.broadcast_calibration.players import (
     FeedOffset,
@@ -58,10 +58,11 @@ from worldpose.broadcast_calibration.uncertainty import (
     Uncertainty,
     compute_uncertainty,
     lasting_samples,
+    moving_arrays,
     paint_variance,
 )
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera, camera_from_arrays
+from worldpose.geometry.cameras import Camera, camera_arrays, camera_from_arrays
 from worldpose.pitch.template import PitchTemplate
 
 Pictures = Callable[[], Iterator[Image]]
@@ -211,21 +212,19 @@ def refine(
     before = camera
     for number in range(settings.passes):  # one or more
         samples = FieldSamples.of(pitch, learned.errors, surface)
-        lines = follow_lines(camera, samples, clip.pictures(), boxes, settings)
-        before = lines.camera if number == 0 else before
-        parts = [learned.errors.rescale(clicks, first_errors), lines.evidence]
+        lines, corrected = follow_lines(camera, samples, clip.pictures(), boxes, settings)
+        before = corrected if number == 0 else before
+        parts = [learned.errors.rescale(clicks, first_errors), lines]
         if people is not None and settings.player_weight > 0.0:
             if offset is None:
                 # Before any fit includes these players.
-                offset = estimate_feed_offset(lines.camera, people)
+                offset = estimate_feed_offset(corrected, people)
                 if settings.feed_offset == "correct" and offset.determined:
                     people = people.later(offset.frames)
-            matches = match(lines.camera, people)
-            players, noise = player_evidence(lines.camera, people, matches, settings)
+            matches = match(corrected, people)
+            players, noise = player_evidence(corrected, people, matches, settings)
             parts.append(players)
-        problem, solution, learned = _fit_and_learn(
-            join_evidence(parts), lines.camera, learned, terms
-        )
+        problem, solution, learned = _fit_and_learn(join_evidence(parts), corrected, learned, terms)
         camera = solution.camera
         shown = problem.of_size(solution.paint_offsets)
         surface = pitch.surface + (learned.errors.size_m * shown)[2:]
@@ -259,14 +258,6 @@ def refine(
     return BroadcastCalibration(solution.camera, uncertainty, report, tracked.chain.camera, before)
 
 
-_MAX_FITS: Final = 4
-"""Maximum fits of a pass in which noise and paint errors are learned [1]."""
-_CONVERGED_RATIO: Final = 1.05
-"""Ratio of two spreads that count as equal [1]."""
-_PRIOR_CLICKS: Final = 10.0
-"""Coordinates that the assumed noise of clicks is worth in its estimate [1]."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Learned:
     """Spreads that the residuals of a clip show.
@@ -294,13 +285,14 @@ class _Learned:
 
     def is_near(self, other: _Learned) -> bool:
         """Return whether another fit would change little."""
+        ratio = 1.05  # of two spreads that count as equal
         pairs = (
             (self.errors.paint_m, other.errors.paint_m),
             (self.lines, other.lines),
             (self.clicks, other.clicks),
             (self.lasting, other.lasting),
         )
-        return all(1.0 / _CONVERGED_RATIO < one / two < _CONVERGED_RATIO for one, two in pairs)
+        return all(1.0 / ratio < one / two < ratio for one, two in pairs)
 
     def describe(self, pitch: PitchTemplate, problem: Problem, solution: Solution) -> PitchFit:
         """Return the pitch and the noise for the report."""
@@ -326,6 +318,7 @@ class _Learned:
 
 def _learn(problem: Problem, solution: Solution, learned: _Learned) -> _Learned:
     """Return the spreads that the residuals of a fit show."""
+    prior = 10.0  # coordinates that the assumed noise of clicks is worth
     points = displace(problem.points, problem, solution.paint_offsets)
     off = np.clip(pixel_residuals(solution.camera, points), -1e6, 1e6)
     white = np.abs(np.einsum("nij,nj->ni", points.whitening, off))
@@ -337,7 +330,7 @@ def _learn(problem: Problem, solution: Solution, learned: _Learned) -> _Learned:
     used = white[clicked][np.abs(points.whitening[clicked]).any(axis=-1)]
     if len(used):
         squares = float((np.minimum(used, points.loss[clicked].max()) ** 2).sum())
-        clicks *= np.sqrt((_PRIOR_CLICKS + squares) / (_PRIOR_CLICKS + len(used)))
+        clicks *= np.sqrt((prior + squares) / (prior + len(used)))
     painted = len(problem.painted)
     errors = learned.errors
     if not errors.surveyed.all():
@@ -386,15 +379,8 @@ class _Terms:
 def _fit_and_learn(
     points: PointEvidence, camera: MovingCamera, learned: _Learned, terms: _Terms
 ) -> tuple[Problem, Solution, _Learned]:
-    """Return fits that alternate with the spreads that their residuals show, until these settle.
-
-    Args:
-        points: evidence of the assumed noise.
-        camera: the start.
-        learned: spreads so far.
-        terms: all other terms of the fit.
-    """
-    for left in reversed(range(_MAX_FITS)):
+    """Return fits that alternate with the spreads that their residuals show, until these settle."""
+    for left in reversed(range(4)):
         problem = terms.pose(points, learned, camera)
         solution = solve(camera, problem, terms.settings.max_iterations)
         camera, before = solution.camera, learned
@@ -411,20 +397,15 @@ def _select_flow(
     """Return the followed points consistent with the camera, with their measured deviation."""
     kept = links.kept
     counts = [int(mine.sum()) for mine in kept]
-    residual = np.concatenate(
-        [np.empty((0, 2)), *(r[mine] for r, mine in zip(links.residual, kept, strict=True))]
-    )
+    none = np.empty((0, 2))
+    residual = np.concatenate([none, *(r[m] for r, m in zip(links.residual, kept, strict=True))])
     seen = 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
     return FlowEvidence(
         frame=np.repeat(np.arange(len(followed)), counts),
-        start=_stack_arrays([p.start[mine] for p, mine in zip(followed, kept, strict=True)]),
-        end=_stack_arrays([p.end[mine] for p, mine in zip(followed, kept, strict=True)]),
+        start=np.concatenate([none, *(p.start[m] for p, m in zip(followed, kept, strict=True))]),
+        end=np.concatenate([none, *(p.end[m] for p, m in zip(followed, kept, strict=True))]),
         deviation=np.full(sum(counts), max(seen, settings.flow_noise_px)),
     )
-
-
-def _stack_arrays(parts: Sequence[Floats]) -> Floats:
-    return np.concatenate([np.empty((0, 2)), *parts])
 
 
 def _keep_frames(
@@ -444,14 +425,11 @@ def _finite_or_zero(value: float) -> float:
 
 def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any]]:
     """Return the stored arrays of a calibrated clip, by name, without the frame numbers."""
-    report, before = calibration.report, calibration.before.camera
+    report, before = calibration.report, camera_arrays(calibration.before.camera)
+    del before["image_size"]
     return {
         **moving_arrays(calibration.camera, calibration.uncertainty),
-        "focal_before": before.focal,
-        "principal_point_before": before.principal_point,
-        "distortion_before": before.distortion,
-        "rotation_before": before.cam_from_world.rotation,
-        "translation_before": before.cam_from_world.translation,
+        **{f"{name}_before": array for name, array in before.items()},
         "status": report.status,
         "reprojection_error": report.reprojection_error,
         "marking_rms": report.marking_rms,
@@ -462,40 +440,11 @@ def broadcast_arrays(calibration: BroadcastCalibration) -> dict[str, NDArray[Any
     }
 
 
-def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, NDArray[Any]]:
-    """Return the stored arrays of a moving camera and its covariance, by name."""
-    camera, covariance = moving.camera, uncertainty.frame
-    return {
-        "focal": camera.focal,
-        "principal_point": camera.principal_point,
-        "distortion": camera.distortion,
-        "rotation": camera.cam_from_world.rotation,
-        "translation": camera.cam_from_world.translation,
-        "image_size": moving.image_size,
-        "center": moving.center,
-        "covariance": covariance[:, :FRAME_SIZE, :FRAME_SIZE],
-        "shared_covariance": covariance[:, :FRAME_SIZE, FRAME_SIZE:],
-        "clip_covariance": uncertainty.clip,
-    }
-
-
 def camera_before(arrays: Mapping[Any, ArrayLike]) -> Camera:
     """Return the stored camera (frames,) before players and the joint fit."""
-    names = ("focal", "principal_point", "distortion", "rotation", "translation")
-    stored = {name: arrays[f"{name}_before"] for name in names}
+    ends = "_before"
+    stored = {name.removesuffix(ends): arrays[name] for name in arrays if name.endswith(ends)}
     return camera_from_arrays({**stored, "image_size": arrays["image_size"]})
-
-
-def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
-    """Return the moving camera of stored arrays, and its covariance."""
-    names = ("covariance", "shared_covariance", "clip_covariance")
-    own, across, shared = (np.asarray(arrays[name]) for name in names)
-    whole = np.empty((len(own), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
-    whole[:, :FRAME_SIZE, :FRAME_SIZE] = own
-    whole[:, :FRAME_SIZE, FRAME_SIZE:] = across
-    whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
-    whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared
-    return MovingCamera.from_batch(camera_from_arrays(arrays)), Uncertainty(whole)
 
 
 def broadcast_attributes(
@@ -509,6 +458,7 @@ def broadcast_attributes(
         first: number of its first frame in its video.
     """
     report, offset = calibration.report, calibration.report.feed_offset
+    spec = report.pitch.spec
     return {
         "clip_id": clip_id,
         "status_names": list(FRAME_STATUS),
@@ -526,7 +476,12 @@ def broadcast_attributes(
         "pick_next": [first + frame for frame in report.pick_next],
         "markings_off": _finite_or_none(report.markings_off),
         "players_off": _finite_or_none(report.players_off),
-        "pitch": _pitch_record(report.pitch),
+        "pitch": None
+        if spec is None
+        else {
+            **spec.model_dump(mode="json", include={*SIZES, "points"}),
+            "std_m": report.pitch.size_std.tolist(),
+        },
         "noise": {
             "paint_m": report.pitch.paint_m,
             "lines": report.pitch.line_noise,
@@ -535,15 +490,6 @@ def broadcast_attributes(
         "decisions": list(report.decisions),
         "reasons": list(report.reasons),
     }
-
-
-def _pitch_record(fit: PitchFit) -> dict[str, Any] | None:
-    """Return the estimated pitch for a record; None if all is given."""
-    spec = fit.spec
-    if spec is None:
-        return None
-    chosen = spec.model_dump(mode="json", include={*SIZES, "points"})
-    return {**chosen, "std_m": fit.size_std.tolist()}
 
 
 def _finite_or_none(values: tuple[float, float]) -> list[float | None]:

@@ -6,45 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.normal_equations import Points
+from worldpose.geometry.rows import Index, join_rows, take_rows
 
 ENDS = 2
 """Maximum template points that define a place: the ends of its line, or the center of its arc, or
 itself."""
 CLICK, MARKING, PLAYER = 0, 1, 2
 """Kinds of `PointEvidence`: clicked points and drawn markings, painted lines, players' joints."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedPoints:
-    """Pixels of known world points, without their noise.
-
-    Attributes:
-        frame: (n,) index of the frame, rising.
-        world: (n, 3) [m], world.
-        image: (n, 2) [px].
-        kind: CLICK, MARKING or PLAYER.
-        source: (n,) index of the marking or person, -1 for clicks.
-        ends: (n, 2) indices of the template's points that define the world point, -1 = none;
-            None = no survey error.
-        shares: (n, 2) [m] displacement of the world point per standard deviation of the survey
-            error of `ends`; None without `ends`.
-        by_size: (n, 2, 3) [m] displacement of the world point along x, y, z per standard deviation
-            of the pitch's length, width and crown, and along z per that of its end fall; None = all
-            four are known.
-    """
-
-    frame: Integers
-    world: Floats
-    image: Floats
-    kind: int
-    source: Integers
-    ends: Integers | None = None
-    shares: Floats | None = None
-    by_size: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +35,8 @@ class PointEvidence:
         ends: (n, 2) indices of the template's points that define the place; -1 = none.
         shares: (n, 2) [m] displacement of the place per standard deviation of these points' survey
             error.
-        by_size: (n, 2, 3) [m] displacement of the place per standard deviation of the pitch's size,
-            as in `ObservedPoints`.
+        by_size: (n, 2, 3) [m] displacement of the place along x, y, z per standard deviation of the
+            pitch's length, width and crown, and along z per that of its end fall.
     """
 
     frame: Integers
@@ -99,70 +70,50 @@ class PointEvidence:
         )
 
     @classmethod
-    def across_lines(
+    def observe(
         cls,
-        observed: ObservedPoints,
-        normals: Floats,
-        deviation: Floats,
+        kind: int,
+        frame: Integers,
+        world: Floats,
+        image: Floats,
+        whitening: Floats,
+        *,
+        source: Integers | None = None,
         weight: float,
         loss: float,
     ) -> PointEvidence:
-        """Return evidence that constrains places only across a line.
+        """Return evidence of places without survey error and with a known size of the pitch.
 
         Args:
-            observed: pixels and places.
-            normals: (n, 2) unit vectors across the line.
-            deviation: (n,) standard deviation [px].
+            kind: CLICK, MARKING or PLAYER.
+            frame: (n,) rising.
+            world: (n, 3) [m], world.
+            image: (n, 2) [px].
+            whitening: (n, 2, 2) [1/px], see `whiten_across` and `whiten_points`.
+            source: (n,) index of the marking or person; None = clicks.
             weight: factor on the loss [1].
             loss: scale of the loss [standard deviations].
         """
-        whitening = np.zeros((len(observed.frame), 2, 2))
-        whitening[:, 0] = normals / deviation[:, None]
-        return cls._whiten(observed, whitening, weight, loss)
-
-    @classmethod
-    def at_points(
-        cls, observed: ObservedPoints, deviation: Floats, weight: float, loss: float
-    ) -> PointEvidence:
-        """Return evidence with equal noise in both image directions.
-
-        Args:
-            observed: pixels and places.
-            deviation: (n,) standard deviation, each axis [px].
-            weight: factor on the loss [1].
-            loss: scale of the loss [standard deviations].
-        """
-        return cls._whiten(observed, np.eye(2) / deviation[:, None, None], weight, loss)
-
-    @classmethod
-    def _whiten(
-        cls, observed: ObservedPoints, whitening: Floats, weight: float, loss: float
-    ) -> PointEvidence:
-        count = len(observed.frame)
-        ones = np.ones(count)
-        ends, shares = observed.ends, observed.shares
-        if ends is None or shares is None:
-            ends, shares = np.full((count, ENDS), -1), np.zeros((count, ENDS))
+        count = len(frame)
         return cls(
-            frame=observed.frame,
-            world=observed.world,
-            image=observed.image,
+            frame=frame,
+            world=world,
+            image=image,
             whitening=whitening,
-            weight=weight * ones,
-            loss=loss * ones,
-            kind=np.full(count, observed.kind),
-            source=observed.source,
-            ends=ends,
-            shares=shares,
-            by_size=np.zeros((count, 2, 3)) if observed.by_size is None else observed.by_size,
+            weight=weight * np.ones(count),
+            loss=loss * np.ones(count),
+            kind=np.full(count, kind),
+            source=np.full(count, -1) if source is None else source,
+            ends=np.full((count, ENDS), -1),
+            shares=np.zeros((count, ENDS)),
+            by_size=np.zeros((count, 2, 3)),
         )
 
     def arrays(self, ends: Integers, size_row: int = -1) -> Points:
         """Return the arrays for compiled kernels.
 
-        Args:
-            ends: (n, 2) rows of the paint errors that define a point; -1 = none.
-            size_row: first row that holds the pitch's size; -1 = known.
+        Points are defined by rows (n, 2) of the paint errors, -1 = none, and from `size_row` on by
+        the size of the pitch, -1 = known.
         """
         return Points(
             self.world,
@@ -179,8 +130,8 @@ class PointEvidence:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def __getitem__(self, index: Integers | NDArray[np.bool_]) -> PointEvidence:
-        return PointEvidence(*(getattr(self, name)[index] for name in _POINT_PARTS))
+    def __getitem__(self, index: Index) -> PointEvidence:
+        return take_rows(self, index)
 
     def in_frame(self, frame: int) -> PointEvidence:
         """Return evidence of a single frame with another frame index."""
@@ -212,15 +163,23 @@ class FlowEvidence:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def __getitem__(self, index: Integers | NDArray[np.bool_]) -> FlowEvidence:
-        return FlowEvidence(*(getattr(self, name)[index] for name in _FLOW_PARTS))
+    def __getitem__(self, index: Index) -> FlowEvidence:
+        return take_rows(self, index)
 
 
-_POINT_PARTS = (
-    *("frame", "world", "image", "whitening", "weight", "loss", "kind", "source", "ends", "shares"),
-    "by_size",
-)
-_FLOW_PARTS = ("frame", "start", "end", "deviation")
+def whiten_across(normals: Floats, deviation: Floats) -> Floats:
+    """Return the whitening (n, 2, 2) [1/px] of places that count only across lines.
+
+    Lines have unit normals (n, 2); the standard deviation (n,) is across them [px].
+    """
+    whitening = np.zeros((len(normals), 2, 2))
+    whitening[:, 0] = normals / deviation[:, None]
+    return whitening
+
+
+def whiten_points(deviation: Floats) -> Floats:
+    """Return the whitening (n, 2, 2) [1/px] of a standard deviation (n,) [px] along each axis."""
+    return np.asarray(np.eye(2) / deviation[:, None, None])
 
 
 def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
@@ -233,12 +192,8 @@ def spread_noise(points: PointEvidence, lasting: float) -> PointEvidence:
 
 def join_evidence(parts: Sequence[PointEvidence]) -> PointEvidence:
     """Return the concatenated evidence, sorted by frame."""
-    arrays = {
-        name: np.concatenate([getattr(part, name) for part in [PointEvidence.none(), *parts]])
-        for name in _POINT_PARTS
-    }
-    order = np.argsort(arrays["frame"], kind="stable")
-    return PointEvidence(**{name: array[order] for name, array in arrays.items()})
+    joined = join_rows([PointEvidence.none(), *parts])
+    return joined[np.argsort(joined.frame, kind="stable")]
 
 
 def bounds(frame: Integers, frames: int) -> Integers:

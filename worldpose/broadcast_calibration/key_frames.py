@@ -7,9 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Floats, Image, Integers
 from data_contracts.broadcast_calibration import KeyFrame
 from data_contracts.keypoints import KeypointDetections
 from data_contracts.match import Side
@@ -17,9 +16,10 @@ from data_contracts.static_calibration import DrawnMarking
 from worldpose.broadcast_calibration.evidence import (
     CLICK,
     FlowEvidence,
-    ObservedPoints,
     PointEvidence,
     join_evidence,
+    whiten_across,
+    whiten_points,
 )
 from worldpose.broadcast_calibration.line_evidence import FieldSamples, find_lines
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
@@ -31,8 +31,8 @@ from worldpose.errors import DegenerateError, InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
+from worldpose.static_calibration.from_paint.proposal import propose_camera
 from worldpose.static_calibration.parameters import CameraEstimate, nearest_on_markings
-from worldpose.static_calibration.proposal import propose_camera
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.sides import (
     INDEPENDENT_S,
@@ -41,16 +41,6 @@ from worldpose.static_calibration.sides import (
     compare_sides,
 )
 from worldpose.tracking.feet import locate_feet
-
-_ITERATIONS = 3
-"""Iterations that match drawn markings and painted lines again [1]."""
-_CENTER_TOLERANCE = 0.1
-"""Largest distance of a proposal's center from the median one, of its distance to the centre spot
-[1]: from one frame alone the distance trades with the focal length."""
-_MIN_PROPOSALS = 2
-"""Minimum proposals with one center [1]."""
-_PLACE_STD = 0.1
-"""Standard deviation of people's places by static cameras, each axis [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +84,7 @@ def propose_key_frames(
         InputError: fewer than two frames have a clear proposal with one center; the people do not
             decide the side, or contradict the stated one.
     """
+    min_proposals = 2
     clear, seen = [], 0
     for number, picture in pictures:
         seen += 1
@@ -104,12 +95,13 @@ def propose_key_frames(
                 clear.append((number, proposal))
     centers = np.array([each.camera.center for _, each in clear]).reshape(-1, 3)
     middle = np.median(centers, axis=0) if len(clear) else np.zeros(3)
-    reach = _CENTER_TOLERANCE * float(np.linalg.norm(middle))
+    # From one frame alone the distance trades with the focal length.
+    reach = 0.1 * float(np.linalg.norm(middle))
     agreed = np.linalg.norm(centers - middle, axis=1) <= reach
-    if np.count_nonzero(agreed) < max(_MIN_PROPOSALS, len(clear) // 2 + 1):
+    if np.count_nonzero(agreed) < max(min_proposals, len(clear) // 2 + 1):
         raise InputError(
             where,
-            expected=f"{_MIN_PROPOSALS} frames or more whose markings show one camera position",
+            expected=f"{min_proposals} frames or more whose markings show one camera position",
             found=f"{len(clear)} clear frames of {seen}, {np.count_nonzero(agreed)} with one "
             "position",
             todo="Click four or more named points in three frames of the clip.",
@@ -130,11 +122,7 @@ def _must_turn(
     people: KnownPeople | None,
     where: str,
 ) -> bool:
-    """Return whether the people stand where they are only after half a turn of the cameras.
-
-    Raises:
-        InputError: they do not decide, or they contradict the stated side.
-    """
+    """Return whether the people stand where they are only after half a turn of the cameras."""
     same, turned = (0.0, 0.0) if people is None else _compare_people(cameras, pitch, people)
     if side is None and abs(same - turned) < MIN_EVIDENCE:
         raise InputError(
@@ -158,20 +146,15 @@ def _must_turn(
 def _compare_people(
     cameras: Mapping[int, Camera], pitch: PitchTemplate, people: KnownPeople
 ) -> tuple[float, float]:
-    """Return how well people agree if the cameras stand as assumed, and after half a turn.
-
-    Args:
-        cameras: cameras of some frames, by number in the video.
-        pitch: the template.
-        people: of the clip.
-    """
+    """Return how well people agree if the cameras stand as assumed, and after half a turn."""
+    place_std = 0.1  # of people's places by static cameras [m]
     total = np.zeros(2)
     for number, camera in cameras.items():
         here = slice(number - people.first, number - people.first + 1)
         found = KeypointDetections.stack([people.detections[here]])
         feet = locate_feet(Camera.stack([camera]), found, pitch)
         places = people.xy[here]
-        noise = np.broadcast_to(_PLACE_STD**2 * np.eye(2), (*places.shape, 2))
+        noise = np.broadcast_to(place_std**2 * np.eye(2), (*places.shape, 2))
         total += compare_sides(
             SeenPeople(camera, feet.xy[:, 0], feet.noise[:, 0]),
             SeenPeople(None, places, noise),
@@ -197,7 +180,7 @@ class Keys:
         wrong: names of outliers among clicks and markings, by frame.
     """
 
-    frames: NDArray[np.int64]
+    frames: Integers
     camera: MovingCamera
     surface: Floats
     clicks: PointEvidence
@@ -216,15 +199,8 @@ def calibrate_keys(
 ) -> Keys:
     """Return the key frames' cameras with one center and principal point.
 
-    Args:
-        pitch: the stadium's template.
-        key_frames: clicks per key frame.
-        image_size: width, height [px].
-        pictures: grey images (height, width) of the key frames, by number; frames without one use
-            their clicks alone.
-        settings: noise, prior.
-        where: clip or file, for messages.
-        first: number of the clip's first frame in its video; key frames have numbers of the video.
+    The images (height, width) are grey; frames without one use their clicks alone. Key frames have
+    the numbers of the video, whose frame `first` is the clip's first.
 
     Raises:
         InputError: no key frame is usable; the message gives the reason for each.
@@ -237,7 +213,7 @@ def calibrate_keys(
     errors = PitchErrors.of(pitch, settings)
     surface = pitch.surface
     clicks = PointEvidence.none()
-    for _ in range(_ITERATIONS):
+    for _ in range(3):
         samples = FieldSamples.of(pitch, errors, surface)
         parts, lines = [], []
         for index, frame in enumerate(found):
@@ -276,11 +252,7 @@ def _calibrate_each(
     settings: BroadcastCalibrationSettings,
     where: str,
 ) -> tuple[dict[int, StaticCalibration], dict[int, str]]:
-    """Return each key frame's camera from its clicks alone, and why others have none, by frame.
-
-    Raises:
-        InputError: no key frame is usable.
-    """
+    """Return each key frame's camera from its clicks alone, and why others have none, by frame."""
     found: dict[int, StaticCalibration] = {}
     refused: dict[int, str] = {}
     for frame, key in clicked.items():
@@ -325,14 +297,7 @@ def _share_center(estimates: Sequence[CameraEstimate]) -> MovingCamera:
 
 
 def _keep_aim(camera: MovingCamera, center: Floats, principal_point: Floats) -> MovingCamera:
-    """Return a single frame with rotation and focal length changed to show the same ground.
-
-    Args:
-        camera: camera with the new center and principal point, but the old rotation and focal
-            length.
-        center: old center (3,) [m].
-        principal_point: old principal point (2,) [px].
-    """
+    """Return a single frame with rotation and focal length changed to show the same ground."""
     before = camera.rotation[0]
     ray = np.append((camera.image_size - 1.0 - 2.0 * principal_point) / 2.0 / camera.focal[0], 1.0)
     down = before.T @ ray
@@ -376,22 +341,16 @@ def _click_evidence(
     points = [point for point in key.markings.points if point.name not in wrong]
     template = {name: number for number, name in enumerate(pitch.points)}
     own = np.array([[template[point.name], -1] for point in points], dtype=np.int64).reshape(-1, 2)
-    one, world = np.ones(own.shape), pitch.positions([point.name for point in points])
-    at_points = PointEvidence.at_points(
-        ObservedPoints(
-            frame=np.full(len(points), index),
-            world=world,
-            image=np.array([point.xy for point in points]).reshape(-1, 2),
-            kind=CLICK,
-            source=np.full(len(points), -1),
-            ends=own,
-            shares=errors.shares(own, one),
-            by_size=errors.displacement_by_size(own, one, world),
-        ),
-        np.full(len(points), settings.click_noise_px),
-        settings.field_weight,
-        settings.loss_scale,
+    at_points = PointEvidence.observe(
+        CLICK,
+        np.full(len(points), index),
+        pitch.positions([point.name for point in points]),
+        np.array([point.xy for point in points]).reshape(-1, 2),
+        whiten_points(np.full(len(points), settings.click_noise_px)),
+        weight=settings.field_weight,
+        loss=settings.loss_scale,
     )
+    at_points = errors.apply(at_points, own, np.ones(own.shape))
     drawn = [
         _drawn_evidence(pitch, marking, index, camera, settings, errors)
         for marking in key.markings.drawn
@@ -427,22 +386,16 @@ def _drawn_evidence(
     names, shares = _locate_on_marking(pitch, marking.name, place)
     points = list(pitch.points)
     ends = np.tile([points.index(name) for name in names], (len(pixels), 1))
-    return PointEvidence.across_lines(
-        ObservedPoints(
-            frame=np.full(len(pixels), index),
-            world=place,
-            image=pixels,
-            kind=CLICK,
-            source=np.full(len(pixels), -1),
-            ends=ends,
-            shares=errors.shares(ends, shares),
-            by_size=errors.displacement_by_size(ends, shares, place),
-        ),
-        normal,
-        np.full(len(pixels), settings.key_frame.drawn_noise_px),
-        settings.field_weight,
-        settings.loss_scale,
+    seen = PointEvidence.observe(
+        CLICK,
+        np.full(len(pixels), index),
+        place,
+        pixels,
+        whiten_across(normal, np.full(len(pixels), settings.key_frame.drawn_noise_px)),
+        weight=settings.field_weight,
+        loss=settings.loss_scale,
     )
+    return errors.apply(seen, ends, shares)
 
 
 def _locate_on_marking(

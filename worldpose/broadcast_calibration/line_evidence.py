@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Flags, Floats, Image
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
-    ObservedPoints,
     PointEvidence,
     bounds,
     join_evidence,
+    whiten_across,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import add_points, empty_equations
@@ -40,21 +38,6 @@ from worldpose.static_calibration.line_samples import (
     white_structures,
 )
 
-_SPACING: Final = 0.25
-"""Spacing of samples in the world [m]."""
-_LINE_WIDTH: Final = 0.12
-"""Width of the paint [m]: the maximum of Law 1, which most pitches have."""
-_CONTRAST: Final = 6.0
-"""Minimum brightness of paint above the grass on either side [levels of 255]."""
-_MIN_SAMPLES: Final = 15
-"""Minimum line samples for a correction of the camera [1]."""
-_FINE_REACH: Final = 3.0
-"""Half width of the second search, after the first has corrected the camera [px]."""
-_SCALES: Final = (12.0, 6.0, 3.0, 1.5, 1.0)
-"""Decreasing scales of the loss of the correction [px]."""
-_STEP_STD: Final = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])
-"""Prior of a frame's correction of rotation [rad] and log focal, standard deviations."""
-
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
@@ -75,16 +58,10 @@ class FieldSamples:
 
     @classmethod
     def of(cls, pitch: PitchTemplate, errors: PitchErrors, surface: Floats) -> FieldSamples:
-        """Return the samples of a pitch with its errors.
-
-        Args:
-            pitch: the template.
-            errors: its errors.
-            surface: (2,) crown and end fall of the surface to search on [m].
-        """
+        """Return a pitch's samples, with errors, on a surface of crown and end fall (2,) [m]."""
         there = pitch.with_surface(surface)
         raised = np.asarray(surface - pitch.surface)
-        return cls(sample_markings(there, _SPACING), white_structures(there), errors, raised)
+        return cls(sample_markings(there, 0.25), white_structures(there), errors, raised)
 
     def lower(self, found: PointEvidence) -> PointEvidence:
         """Return evidence at the places of the template."""
@@ -100,23 +77,17 @@ def find_lines(
     people: Floats | None,
     settings: BroadcastCalibrationSettings,
 ) -> tuple[PointEvidence, MovingCamera]:
-    """Return one frame's painted lines, and its camera corrected by them.
+    """Return the painted lines of a grey image (height, width), and its camera corrected by them.
 
     A first, wide search corrects rotation and zoom; a second, narrow search measures the lines.
-
-    Args:
-        camera: a single frame, approximate.
-        samples: samples of the pitch.
-        picture: grey (height, width).
-        people: boxes (detections, 4) [px] that occlude lines; None = no people.
-        settings: search width, noise, number of samples.
+    Boxes (detections, 4) [px] of people occlude lines; None = no people.
     """
     first = _measure_lines(camera, samples, picture, people, settings, settings.line_search_px)
-    if len(first) < _MIN_SAMPLES:
+    if len(first) < 15:
         return PointEvidence.none(), camera
     corrected = _correct_camera(camera, first)
     return samples.lower(
-        _measure_lines(corrected, samples, picture, people, settings, _FINE_REACH)
+        _measure_lines(corrected, samples, picture, people, settings, 3.0)
     ), corrected
 
 
@@ -129,8 +100,9 @@ def _measure_lines(
     reach: float,
 ) -> PointEvidence:
     """Return bars of paint within reach of one frame's projected lines."""
+    line_width = 0.12  # [m]; the maximum of Law 1, which most pitches have
     lines = _select_near(camera, samples.lines)
-    seen = project_lines(camera.camera[0], lines, _LINE_WIDTH, EXACT_PAINT)
+    seen = project_lines(camera.camera[0], lines, line_width, EXACT_PAINT)
     index = thin_samples(seen, lines, 4.0, settings.line_samples)
     if people is not None and len(index):
         index = index[~_find_hidden(seen.places[index], people, reach)]
@@ -139,7 +111,7 @@ def _measure_lines(
         clear(
             camera.camera[0],
             samples.whites,
-            0.5 * _LINE_WIDTH,
+            0.5 * line_width,
             seen.places[index],
             room,
             lines.marking[index],
@@ -151,24 +123,18 @@ def _measure_lines(
     offsets, variances = _locate_bars(picture, sections, reach)
     found = np.isfinite(offsets)
     chosen = lines[index[found]]
-    world, ends, shares = chosen.points_world, chosen.ends, chosen.shares
     deviation = np.sqrt(variances[found] + settings.line_noise_px**2)
-    return PointEvidence.across_lines(
-        ObservedPoints(
-            frame=np.zeros(int(found.sum()), dtype=np.int64),
-            world=world,
-            image=(sections.places + offsets[:, None] * sections.normals)[found],
-            kind=MARKING,
-            source=chosen.marking,
-            ends=ends,
-            shares=samples.errors.shares(ends, shares),
-            by_size=samples.errors.displacement_by_size(ends, shares, world),
-        ),
-        sections.normals[found],
-        deviation,
-        settings.field_weight,
-        settings.loss_scale,
+    seen_bars = PointEvidence.observe(
+        MARKING,
+        np.zeros(int(found.sum()), dtype=np.int64),
+        chosen.points_world,
+        (sections.places + offsets[:, None] * sections.normals)[found],
+        whiten_across(sections.normals[found], deviation),
+        source=chosen.marking,
+        weight=settings.field_weight,
+        loss=settings.loss_scale,
     )
+    return samples.errors.apply(seen_bars, chosen.ends, chosen.shares)
 
 
 def _locate_bars(picture: Image, sections: CrossSections, reach: float) -> tuple[Floats, Floats]:
@@ -176,15 +142,16 @@ def _locate_bars(picture: Image, sections: CrossSections, reach: float) -> tuple
 
     Of several bars in a section, the strong one near its middle counts.
     """
+    contrast = 6.0  # of paint above the grass on either side [levels of 255]
     count = len(sections.places)
     candidates, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
-    find_bars(picture, sections, np.full(count, reach), _CONTRAST, candidates, strengths)
+    find_bars(picture, sections, np.full(count, reach), contrast, candidates, strengths)
     with np.errstate(divide="ignore"):
         merit = np.log(strengths) - 0.5 * (2.0 * candidates / reach) ** 2
     best = np.where(np.isnan(candidates), -np.inf, merit).argmax(axis=1)
     offsets, variances = np.empty(count), np.empty(count)
     chosen = candidates[np.arange(count), best]
-    fit_bars(picture, sections, chosen, _CONTRAST, offsets, variances)
+    fit_bars(picture, sections, chosen, contrast, offsets, variances)
     return offsets, variances
 
 
@@ -198,7 +165,7 @@ def _select_near(camera: MovingCamera, lines: LineSamples) -> LineSamples:
     return lines[ahead & (np.abs(place + shift) < half).all(axis=-1)]
 
 
-def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.bool_]:
+def _find_hidden(places: Floats, people: Floats, reach: float) -> Flags:
     """Return a mask of the places (n,) in or near a person's box."""
     x, y = places[:, 0, None], places[:, 1, None]
     x0, y0, x1, y1 = people.T
@@ -209,49 +176,19 @@ def _find_hidden(places: Floats, people: Floats, reach: float) -> NDArray[np.boo
 
 def _correct_camera(camera: MovingCamera, lines: PointEvidence) -> MovingCamera:
     """Return a single frame with rotation and focal length fitted to its lines."""
+    std = np.array([3e-3, 3e-3, 1.5e-3, 4e-3])  # prior of the step [rad, 1]
     begin, edges = camera, bounds(lines.frame, 1)
     step = np.zeros(4)
     across = lines.whitening / np.linalg.norm(lines.whitening, axis=(1, 2))[:, None, None]
-    for scale in _SCALES:
+    for scale in (12.0, 6.0, 3.0, 1.5, 1.0):
         equations = empty_equations(1, 5)
         scaled = replace(lines, whitening=across / scale, loss=np.ones(len(lines)))
         points = scaled.arrays(np.full_like(lines.ends, -1))
         add_points(camera.arrays, edges, points, np.zeros((0, 3)), equations)
-        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / _STEP_STD**2)
-        step = step - np.linalg.solve(normal, equations.right[0, :4] + step / _STEP_STD**2)
+        normal = equations.blocks[0, 0, :4, :4] + np.diag(1.0 / std**2)
+        step = step - np.linalg.solve(normal, equations.right[0, :4] + step / std**2)
         camera = begin.take_step(np.append(step, np.zeros(3))[None], np.zeros(5))
     return camera
-
-
-def carry_correction(
-    camera: MovingCamera, begin: MovingCamera, corrected: MovingCamera
-) -> MovingCamera:
-    """Return a frame's camera with the correction of another frame applied.
-
-    Args:
-        camera: a single frame.
-        begin: the other frame before its correction.
-        corrected: the other frame after its correction.
-    """
-    turn = corrected.rotation @ np.swapaxes(begin.rotation, -1, -2)
-    return replace(
-        camera,
-        rotation=turn @ camera.rotation,
-        focal=camera.focal * corrected.focal / begin.focal,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class FollowedLines:
-    """Painted lines detected in all frames, and the corrected cameras.
-
-    Attributes:
-        evidence: evidence of all frames.
-        camera: all frames, with rotation and focal length fitted to their lines.
-    """
-
-    evidence: PointEvidence
-    camera: MovingCamera
 
 
 def follow_lines(
@@ -260,24 +197,25 @@ def follow_lines(
     pictures: Iterable[Image],
     boxes: Floats | None,
     settings: BroadcastCalibrationSettings,
-) -> FollowedLines:
-    """Return the painted lines of all frames; each frame's correction initializes the next.
+) -> tuple[PointEvidence, MovingCamera]:
+    """Return the painted lines of all grey images in order, and the cameras corrected by them.
 
-    Args:
-        camera: all frames, as tracked.
-        samples: samples of the pitch.
-        pictures: grey (height, width), in order.
-        boxes: (frames, detections, 4) [px] of people, which occlude lines; None = no people.
-        settings: search width, noise, number of samples.
+    Each frame's correction initializes the next. Boxes (frames, detections, 4) [px] of people
+    occlude lines; None = no people.
     """
     parts, cameras = [], []
     before = after = camera.frames(slice(0, 1))
     for frame, picture in enumerate(pictures):
         single = camera.frames(slice(frame, frame + 1))
-        begin = carry_correction(single, before, after)
+        turn = after.rotation @ np.swapaxes(before.rotation, -1, -2)
+        begin = replace(
+            single,
+            rotation=turn @ single.rotation,
+            focal=single.focal * after.focal / before.focal,
+        )
         people = None if boxes is None else boxes[frame]
         found, corrected = find_lines(begin, samples, picture, people, settings)
         parts.append(found.in_frame(frame))
         cameras.append(corrected)
         before, after = single, corrected
-    return FollowedLines(join_evidence(parts), join_cameras(cameras))
+    return join_evidence(parts), join_cameras(cameras)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from worldpose.broadcast_calibration.normal_equations import Cameras, Lens
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -36,17 +36,11 @@ class MovingCamera:
     rotation: Floats
     focal: Floats
     distortion: Floats
-    image_size: NDArray[np.int64]
+    image_size: Integers
 
     @classmethod
     def of(cls, camera: Camera, center: ArrayLike, principal_point: ArrayLike) -> MovingCamera:
-        """Return a moving camera with given center and principal point.
-
-        Args:
-            camera: batch (frames,) with the rotations, focal lengths and distortion.
-            center: (3,) [m], world.
-            principal_point: (2,) [px].
-        """
+        """Return a batch (frames,) with another center [m] and principal point [px]."""
         return cls(
             center=np.asarray(center, dtype=np.float64),
             principal_point=np.asarray(principal_point, dtype=np.float64),
@@ -88,7 +82,7 @@ class MovingCamera:
         """Return the lens of a frame for compiled kernels."""
         return Lens(self.principal_point, self.focal[frame], self.distortion[frame])
 
-    def frames(self, index: NDArray[np.int64] | slice) -> MovingCamera:
+    def frames(self, index: Integers | slice) -> MovingCamera:
         """Return some of the frames."""
         return replace(
             self,
@@ -98,12 +92,7 @@ class MovingCamera:
         )
 
     def take_step(self, frame_step: ArrayLike, clip_step: ArrayLike) -> MovingCamera:
-        """Return the camera after a step.
-
-        Args:
-            frame_step: (frames, 7).
-            clip_step: (5,).
-        """
+        """Return the camera after a step of the frames (frames, 7) and of the clip (5,)."""
         step = np.asarray(frame_step, dtype=np.float64)
         shared = np.asarray(clip_step, dtype=np.float64)
         turn = Rigid.from_rotvec(step[:, :3], np.zeros(3)).rotation
@@ -114,26 +103,6 @@ class MovingCamera:
             rotation=turn @ self.rotation,
             focal=self.focal * np.exp(step[:, 3]),
             distortion=self.distortion + step[:, 4:],
-        )
-
-    def between(self, start: int, stop: int, frames: ArrayLike) -> MovingCamera:
-        """Return cameras interpolated between two frames.
-
-        Args:
-            start: index of the first frame.
-            stop: index of the second frame.
-            frames: (n,) interpolation weights, 0 at the first and 1 at the second frame.
-        """
-        share = np.asarray(frames, dtype=np.float64)[:, None]
-        way = Rigid(self.rotation[stop] @ self.rotation[start].T, np.zeros(3)).rotvec
-        turn = Rigid.from_rotvec(share * way, np.zeros(3)).rotation
-        ends = np.log(self.focal[[start, stop]])
-        lens = self.distortion[[start, stop]]
-        return replace(
-            self,
-            rotation=turn @ self.rotation[start],
-            focal=np.exp((1.0 - share[:, 0]) * ends[0] + share[:, 0] * ends[1]),
-            distortion=(1.0 - share) * lens[0] + share * lens[1],
         )
 
 

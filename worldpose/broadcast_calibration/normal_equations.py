@@ -7,15 +7,12 @@ template's points; the matrix is an arrow: a band of frame blocks, and a border 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from data_contracts.arrays import Floats, Integers
 from worldpose.compiled import compile_kernel
-
-_NEAR = 0.5
-"""Minimum depth of a point [m]: a camera in the stands sees none nearer."""
 
 
 class Lens(NamedTuple):
@@ -99,12 +96,7 @@ class NormalEquations(NamedTuple):
 
 
 def empty_equations(frames: int, shared: int) -> NormalEquations:
-    """Return normal equations without any term.
-
-    Args:
-        frames: number of frames.
-        shared: number of unknowns that all frames share.
-    """
+    """Return normal equations without any term, for unknowns of frames and shared ones."""
     return NormalEquations(
         blocks=np.zeros((3, frames, 7, 7)),
         border=np.zeros((frames, 7, shared)),
@@ -118,21 +110,16 @@ def empty_equations(frames: int, shared: int) -> NormalEquations:
 def point_row(
     r: Floats, center: Floats, lens: Lens, world: Floats, image: Floats, jacobian: Floats
 ) -> bool:
-    """Write the pixel (2,) of a point and its derivatives (2, 12); return whether it exists.
+    """Write a point's pixel (2,) and its derivatives (2, 12); return whether the pixel exists.
 
-    Args:
-        r: (3, 3) rotation.
-        center: (3,) [m], world.
-        lens: lens of the frame.
-        world: (3,) [m].
-        image: (2,), written.
-        jacobian: (2, 12), written: by a frame's step, then by the clip's.
+    Derivatives are by a frame's step, then by the clip's.
     """
     d0, d1, d2 = world[0] - center[0], world[1] - center[1], world[2] - center[2]
     x = r[0, 0] * d0 + r[0, 1] * d1 + r[0, 2] * d2
     y = r[1, 0] * d0 + r[1, 1] * d1 + r[1, 2] * d2
     z = r[2, 0] * d0 + r[2, 1] * d1 + r[2, 2] * d2
-    if not z > _NEAR:
+    # A camera in the stands sees no point within half a metre.
+    if not z > 0.5:
         return False
     return direction_row(x, y, z, r, lens, image, jacobian)
 
@@ -189,10 +176,8 @@ def displace_point(points: Points, i: int, paint_offsets: Floats, place: Floats)
 def displacement(points: Points, i: int, one: int) -> tuple[int, float]:
     """Return the row of the paint errors, -1 = none, and a point's displacement by them.
 
-    Args:
-        points: the points.
-        i: number of the point.
-        one: 3 * source + axis; sources are two template points, and two rows of the pitch's size.
+    The number `one` is 3 * source + axis; sources are two template points, and two rows of the
+    pitch's size.
     """
     source, axis = one // 3, one % 3
     if source < 2:
@@ -211,12 +196,8 @@ def add_points(
 ) -> float:
     """Add points to the normal equations and return their cost, half the sum of their losses.
 
-    Args:
-        cameras: the cameras of all frames.
-        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` belong to frame t.
-        points: all points, sorted by frame.
-        paint_offsets: (painted, 3) paint errors of the template's points [standard deviations].
-        equations: the normal equations that the function extends.
+    Points `bounds[t]` to `bounds[t + 1]` belong to frame t; paint errors (painted, 3) of the
+    template's points are in standard deviations.
     """
     center, rotation = cameras.center, cameras.rotation
     image, whitening, weight, loss = points.image, points.whitening, points.weight, points.loss
@@ -299,10 +280,6 @@ def add_points(
     return cost
 
 
-_UNDISTORT: Final = 30
-"""Maximum Newton steps; a lens that displaces the corner by a twentieth takes three or four."""
-
-
 @compile_kernel
 def undistort_point(xd: float, yd: float, k: Floats) -> tuple[float, float, bool]:
     """Undistort the point (xd, yd) of the plane z = 1.
@@ -312,7 +289,8 @@ def undistort_point(xd: float, yd: float, k: Floats) -> tuple[float, float, bool
     """
     far = math.sqrt(xd * xd + yd * yd)
     radius = far
-    for _ in range(_UNDISTORT):
+    # A lens that displaces the corner by a twentieth takes three or four Newton steps.
+    for _ in range(30):
         s = radius * radius
         value = radius * (1.0 + s * (k[0] + s * (k[1] + s * k[2]))) - far
         slope = 1.0 + s * (3.0 * k[0] + s * (5.0 * k[1] + 7.0 * s * k[2]))
@@ -338,16 +316,8 @@ def flow_row(
 ) -> bool:
     """Write the pixel in the second of two frames of a point in the first, and derivatives (2, 16).
 
-    The point is a direction from the center, which both frames share.
-
-    Args:
-        principal: (2,) [px].
-        focal: (2,) [px].
-        rotation: (2, 3, 3).
-        distortion: (2, 3).
-        start: (2,) [px].
-        image: (2,), written.
-        jacobian: (2, 16), written: by the first frame's step, the second's, the principal point.
+    The point is a direction from the center, which both frames share. Derivatives are by the first
+    frame's step, the second's, and the principal point.
     """
     xd, yd = (start[0] - principal[0]) / focal[0], (start[1] - principal[1]) / focal[0]
     k = distortion[0]
@@ -395,11 +365,7 @@ def flow_row(
 def add_flow(cameras: Cameras, bounds: Integers, flow: Flow, equations: NormalEquations) -> float:
     """Add followed points to the normal equations and return their cost; see `add_points`.
 
-    Args:
-        cameras: cameras of all frames.
-        bounds: (frames + 1,); points `bounds[t]` to `bounds[t + 1]` begin in frame t.
-        flow: followed points, sorted by frame.
-        equations: the normal equations that the function extends.
+    Points `bounds[t]` to `bounds[t + 1]` begin in frame t.
     """
     principal, focal = cameras.principal_point, cameras.focal
     rotation, distortion = cameras.rotation, cameras.distortion

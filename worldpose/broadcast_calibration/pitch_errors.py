@@ -12,18 +12,16 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.pitch import PitchSpec
 from worldpose.broadcast_calibration.evidence import PointEvidence
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
-from worldpose.pitch.template import PitchTemplate, law_points, surface_shape
+from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import PitchTemplate, surface_shape
 
 SIZES: Final = ("length", "width", "crown", "end_fall")
 """Entries of pitch.json that a clip's fit estimates."""
-_PRIOR_COUNT = 6.0
-"""Coordinates that the prior spread of the paint is worth in its estimate [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class PitchErrors:
         size: length, width of the pitch [m].
     """
 
-    surveyed: NDArray[np.bool_]
+    surveyed: Flags
     survey_m: float
     paint_m: float
     size_m: Floats
@@ -76,24 +74,23 @@ class PitchErrors:
         """Standard deviations (points,) of each point, each axis [m]."""
         return np.where(self.surveyed, self.survey_m, self.paint_m)
 
-    def shares(self, ends: Integers, shares: Floats) -> Floats:
-        """Return displacements (n, 2) [m] of places per standard deviation of their points.
+    def apply(self, points: PointEvidence, ends: Integers, shares: Floats) -> PointEvidence:
+        """Return evidence with the errors of the points (n, 2) that define its places, -1 = none.
 
-        Args:
-            ends: (n, 2) indices of the points; -1 = none.
-            shares: (n, 2) displacement of the place by these points [m/m].
+        The shares (n, 2) are displacements of the places by these points [m/m].
         """
-        return np.where(ends >= 0, self.point_m[ends] * shares, 0.0)
+        return replace(
+            points,
+            ends=ends,
+            shares=np.where(ends >= 0, self.point_m[ends] * shares, 0.0),
+            by_size=self.displacement_by_size(ends, shares, points.world),
+        )
 
     def displacement_by_size(self, ends: Integers, shares: Floats, world: Floats) -> Floats:
         """Return displacements (n, 2, 3) [m] of places per standard deviation of the pitch's size.
 
-        The first row is by length, width and crown, the second by the end fall.
-
-        Args:
-            ends: (n, 2) indices of the points that define a place; -1 = none.
-            shares: (n, 2) displacement of the place by these points [m/m].
-            world: (n, 3) the places [m], world.
+        The first row is by length, width and crown, the second by the end fall. The places (n, 3)
+        [m] are defined by points (n, 2), -1 = none, with shares (n, 2) [m/m].
         """
         weight = np.where(ends >= 0, shares, 0.0)
         moved = np.zeros((len(world), 2, 3))
@@ -110,19 +107,16 @@ class PitchErrors:
         """Return the errors with the spread of the paint that a fit shows.
 
         MacKay's fixed point: the sum of squared offsets over the number of coordinates that the
-        evidence determines.
-
-        Args:
-            offsets: (n, 3) estimated paint errors [standard deviations].
-            variance: (n, 3) their posterior variance [standard deviations^2].
-            points: (n,) indices of the template's points.
+        evidence determines. The offsets (n, 3) of the points (n,) are in standard deviations, as is
+        their posterior variance (n, 3).
         """
+        prior = 6.0  # coordinates that the prior spread of the paint is worth
         chosen = ~self.surveyed[points]
         if not chosen.any():
             return self
         squares = float((offsets[chosen] ** 2).sum())
         determined = float((1.0 - variance[chosen]).sum())
-        factor = (_PRIOR_COUNT + squares) / (_PRIOR_COUNT + determined)
+        factor = (prior + squares) / (prior + determined)
         return replace(self, paint_m=max(self.paint_m * float(np.sqrt(factor)), self.survey_m))
 
 

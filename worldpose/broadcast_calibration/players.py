@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from data_contracts.arrays import Floats, Integers
-from worldpose.broadcast_calibration.evidence import PLAYER, ObservedPoints, PointEvidence
+from worldpose.broadcast_calibration.evidence import PLAYER, PointEvidence, whiten_points
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.broadcast_calibration.settings import BroadcastCalibrationSettings
 from worldpose.errors import InputError
@@ -23,14 +22,6 @@ BONES: Final = np.array(
     ]
 )
 """A tree over the 17 joints of COCO: J - 1 bones."""
-_MIN_SIMILARITY: Final = 0.05
-"""Minimum similarity of a pair [1]: a twentieth of shared area, or random bones."""
-_MIN_JOINTS: Final = 6
-"""Minimum joints present on both sides of a pair [1]."""
-_DEFAULT_SHARE: Final = 0.05
-"""Default keypoint deviation without an estimate, relative to the person's height in the image."""
-_MAX_LAG_S: Final = 1.0
-"""Maximum correlation time of errors [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +53,7 @@ class People:
     def later(self, frames: float) -> People:
         """Return these keypoints with joints of later frames, interpolated linearly.
 
-        Joints beyond the clip's ends are missing.
-
-        Args:
-            frames: shift [frame]; below zero = earlier.
+        Joints beyond the clip's ends are missing. A shift [frame] below zero = earlier.
         """
         if frames == 0.0:
             return self
@@ -126,12 +114,8 @@ def boxes_of(keypoints: Floats) -> Floats:
 def similarity(projected: Floats, detected: Floats) -> Floats:
     """Return the similarity of projected and detected people (persons, detections) [-1..1] (M4).
 
-    Intersection over union of the boxes about all keypoints, times the mean cosine between
-    corresponding bones, over the bones that both have. 0 with too few common joints.
-
-    Args:
-        projected: (persons, 17, 2) [px].
-        detected: (detections, 17, 2) [px].
+    Intersection over union of the boxes about all keypoints (n, 17, 2) [px], times the mean cosine
+    between corresponding bones, over the bones that both have. 0 with too few common joints.
     """
     overlap = box_iou(boxes_of(projected), boxes_of(detected))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -142,7 +126,7 @@ def similarity(projected: Floats, detected: Floats) -> Floats:
         mean = np.where(known, cosine, 0.0).sum(-1) / np.maximum(known.sum(-1), 1)
     one_seen, two_seen = (np.asarray(np.isfinite(p).all(-1)) for p in (projected, detected))
     both = one_seen[:, None] & two_seen[None]
-    alike = np.where(both.sum(-1) >= _MIN_JOINTS, overlap * mean, 0.0)
+    alike = np.where(both.sum(-1) >= 6, overlap * mean, 0.0)
     return np.where(np.isfinite(alike), alike, 0.0)
 
 
@@ -155,7 +139,8 @@ def match(camera: MovingCamera, people: People) -> Matches:
     for frame in range(frames):
         alike = similarity(projected[frame], people.keypoints[frame])
         for person, detection in zip(*linear_sum_assignment(-alike), strict=True):
-            if alike[person, detection] > _MIN_SIMILARITY:
+            # A twentieth of shared area, or random bones.
+            if alike[person, detection] > 0.05:
                 value = float(alike[person, detection])
                 rows.append((frame, int(person), int(detection), value))
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
@@ -173,12 +158,6 @@ def player_evidence(
 
     A keypoint's deviation is a share of the person's height in the image, and its weight falls with
     the correlation time of the errors; the clip's residuals give both.
-
-    Args:
-        camera: all frames, approximate.
-        people: joints and keypoints.
-        matches: pairs of persons and detections.
-        settings: weight and loss.
     """
     world = people.joints[matches.frame, matches.person]
     image = people.keypoints[matches.frame, matches.detection]
@@ -193,17 +172,15 @@ def player_evidence(
     known = np.isfinite(scaled).all(axis=-1)
     frame = np.repeat(matches.frame[:, None], image.shape[1], axis=1)[known]
     deviation = noise.share * np.repeat(tall[:, None], image.shape[1], axis=1)[known]
-    evidence = PointEvidence.at_points(
-        ObservedPoints(
-            frame=frame,
-            world=world[known],
-            image=image[known],
-            kind=PLAYER,
-            source=np.repeat(matches.person[:, None], image.shape[1], axis=1)[known],
-        ),
-        np.maximum(deviation, 0.5),
-        settings.player_weight / noise.frames,
-        settings.loss_scale,
+    evidence = PointEvidence.observe(
+        PLAYER,
+        frame,
+        world[known],
+        image[known],
+        whiten_points(np.maximum(deviation, 0.5)),
+        source=np.repeat(matches.person[:, None], image.shape[1], axis=1)[known],
+        weight=settings.player_weight / noise.frames,
+        loss=settings.loss_scale,
     )
     return evidence, noise
 
@@ -212,7 +189,7 @@ def _estimate_noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise
     """Return spread and correlation time of residuals (n, 17, 2), relative to heights."""
     known = scaled[np.isfinite(scaled)]
     if len(known) < 100:
-        return PlayerNoise(_DEFAULT_SHARE, 1.0)
+        return PlayerNoise(0.05, 1.0)
     share = max(1.4826 * float(np.median(np.abs(known))), 1e-3)
     bounded = np.clip(scaled, -3.0 * share, 3.0 * share)
     persons = int(matches.person.max()) + 1
@@ -221,7 +198,8 @@ def _estimate_noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise
     }
     power = float(np.nanmean(bounded**2))
     total = 1.0
-    for lag in range(1, max(1, round(_MAX_LAG_S * fps)) + 1):
+    # Errors are correlated over one second at most.
+    for lag in range(1, max(1, round(1.0 * fps)) + 1):
         later = np.array(
             [where.get(int(key), -1) for key in (matches.frame + lag) * persons + matches.person]
         )
@@ -238,15 +216,6 @@ def _estimate_noise(scaled: Floats, matches: Matches, fps: float) -> PlayerNoise
 
 _MAX_OFFSET: Final = 25.0
 """Maximum offset of the search [frame]."""
-_COARSE_FRAMES: Final = 80
-"""Maximum sample frames in the search over all offsets [1]."""
-_FINE_FRAMES: Final = 400
-"""Maximum sample frames about the best offset [1]."""
-_TYPICAL_SHARE: Final = 0.03
-"""Typical keypoint error, as a share of the person's height in the image [1]; the loss scale is
-three times this."""
-_CORRELATION_S: Final = 0.3
-"""Correlation time of one person's errors [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,43 +228,30 @@ class FeedOffset:
         standard_error: standard error of the offset [frame]; infinite without motion.
         determined: whether the best offset lies inside the search range, with a standard error
             below half a frame.
-        tried: (n,) tested offsets [frame].
-        cost: (n,) mean loss of a matched keypoint at each.
         pairs: number of matched people, over all frames.
     """
 
     frames: float
     standard_error: float
     determined: bool
-    tried: Floats
-    cost: Floats
     pairs: int
 
 
 def estimate_feed_offset(
     camera: MovingCamera, people: People, *, reach: float = _MAX_OFFSET
 ) -> FeedOffset:
-    """Return the clock offset between the feed and the static cameras.
+    """Return the clock offset between the feed and the static cameras, up to a reach [frame].
 
     For every integer offset the function matches people again and evaluates the loss of their
     keypoint residuals; a parabola through the best offset and its neighbours gives the minimum. The
     camera must be independent of these players, or it has absorbed the offset: give one fitted to
     markings alone.
-
-    Args:
-        camera: all frames of the clip, from markings and followed points.
-        people: joints of the static cameras at the clip's assumed frames, and keypoints of the
-            clip.
-        reach: maximum offset to either side [frame].
     """
     whole = np.arange(-np.floor(reach), np.floor(reach) + 1.0)
-    some, every = (
-        np.arange(0, len(camera), -(-len(camera) // most))
-        for most in (_COARSE_FRAMES, _FINE_FRAMES)
-    )
+    some, every = (np.arange(0, len(camera), -(-len(camera) // most)) for most in (80, 400))
     coarse = np.array([_mean_loss(camera, people, offset, some)[0] for offset in whole])
     if not np.isfinite(coarse).any():
-        return FeedOffset(np.nan, np.inf, False, whole, coarse, 0)
+        return FeedOffset(np.nan, np.inf, False, 0)
     best = float(whole[int(np.nanargmin(coarse))])
     # Joints between integer frames would be means of two, with less noise: a parabola through
     # integer offsets avoids this bias.
@@ -308,18 +264,18 @@ def estimate_feed_offset(
     left, here, right = fine[middle - 1 : middle + 2] if inside else (np.nan,) * 3
     bend = left - 2.0 * here + right
     if not bend > 0.0:
-        return FeedOffset(np.nan, np.inf, False, near, fine, pairs)
+        return FeedOffset(np.nan, np.inf, False, pairs)
     offset = float(near[middle] + 0.5 * (left - right) / bend)
     # Half a loss of one unit is one standard deviation; a person counts once per correlation time.
     stride = -(-len(camera) // len(every))
-    independent = pairs / max(1.0, _CORRELATION_S * people.fps / stride)
+    independent = pairs / max(1.0, 0.3 * people.fps / stride)
     error = float(np.sqrt(1.0 / (0.5 * bend * independent)))
     determined = error < 0.5
-    return FeedOffset(offset if determined else np.nan, error, determined, near, fine, pairs)
+    return FeedOffset(offset if determined else np.nan, error, determined, pairs)
 
 
 def _mean_loss(
-    camera: MovingCamera, people: People, offset: float, frames: NDArray[np.int64]
+    camera: MovingCamera, people: People, offset: float, frames: Integers
 ) -> tuple[float, int]:
     """Return the mean loss of a keypoint at an offset, and the number of pairs."""
     at = frames + int(offset)
@@ -337,7 +293,8 @@ def _mean_loss(
     tall = np.ptp(np.nan_to_num(boxes_of(image)).reshape(-1, 2, 2)[..., 1], axis=-1)
     single = seen.camera[pairs.frame]
     off = single.project(world) - image
-    off = off / np.maximum(_TYPICAL_SHARE * tall, 0.5)[:, None, None]
+    # The typical keypoint error is 3 % of a person's height.
+    off = off / np.maximum(0.03 * tall, 0.5)[:, None, None]
     squared = (off**2).sum(axis=-1)
     squared = squared[np.isfinite(squared)]
     if not len(squared):

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.records import Record
@@ -44,18 +43,11 @@ class Prior:
     distortion_std: Floats
 
 
-def build_prior(
-    settings: BroadcastPrior, focal: NDArray[np.float64], image_size: NDArray[np.int64]
-) -> Prior:
-    """Return the prior of frames with given approximate focal lengths.
+def build_prior(settings: BroadcastPrior, focal: Floats, image_size: Integers) -> Prior:
+    """Return the prior of frames with given approximate focal lengths (frames,) [px].
 
     All frames have one lens: its departure from the prior lasts for the whole clip, so that the
     frames count as one together, however many there are.
-
-    Args:
-        settings: means and standard deviations.
-        focal: (frames,) [px], approximate.
-        image_size: (2,) width, height [px].
     """
     width = float(image_size[0])
     middle = 0.5 * (image_size - 1.0)
@@ -87,13 +79,8 @@ def add_smoothness(camera: MovingCamera, spread: Floats, blocks: Floats, right: 
     """Add squared second differences to the normal equations and return their cost.
 
     The derivatives assume a small rotation between neighbouring frames: a fast pan has a hundredth
-    of a radian per frame.
-
-    Args:
-        camera: all frames.
-        spread: (7,) standard deviation of a second difference; infinite = free.
-        blocks: (3, frames, 7, 7), added to.
-        right: (frames, 7), added to.
+    of a radian per frame. The spread (7,) of a second difference is infinite where free; the blocks
+    (3, frames, 7, 7) and the right side (frames, 7) are added to.
     """
     used = np.flatnonzero(np.isfinite(spread))
     if len(camera) < 3 or not len(used):
@@ -112,11 +99,6 @@ def add_smoothness(camera: MovingCamera, spread: Floats, blocks: Floats, right: 
     return 0.5 * float((gone**2).sum())
 
 
-_MAX_ROTATION_CHANGE: Final = 2e-3
-"""Largest plausible second difference of the rotation at 50 frames per second [rad]: it bridges
-frames without evidence and does not affect others."""
-_MIN_CHANGE: Final = np.array([1e-5, 1e-5, 1e-4, 1e-4])
-"""Minimum deviation of a second difference of log focal, k1, k2, k3."""
 _WINDOW_S: Final = 0.2
 """Smoothing window of tracked focal lengths before differencing [s]."""
 
@@ -148,14 +130,11 @@ class Weights(Record):
 
 
 def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
-    """Return the deviation (7,) of second differences in a tracked clip.
-
-    Args:
-        camera: all frames, as tracked.
-        fps: frames per second.
-    """
+    """Return the deviation (7,) of second differences in a tracked clip."""
+    min_change = np.array([1e-5, 1e-5, 1e-4, 1e-4])  # log focal, k1, k2, k3
     spread = np.full(FRAME_SIZE, np.inf)
-    spread[:3] = _MAX_ROTATION_CHANGE * (50.0 / fps) ** 2
+    # At 50 frames per second: it bridges frames without evidence and does not affect others.
+    spread[:3] = 2e-3 * (50.0 / fps) ** 2
     width = max(1, round(_WINDOW_S * fps))
     if len(camera) < 3 * width:
         spread[3:] = 1.0
@@ -164,7 +143,7 @@ def estimate_smoothness(camera: MovingCamera, fps: float) -> Floats:
     lens = np.median(np.abs(camera.distortion), axis=0)
     # The deviation of k3 uses at least the size of k2.
     lens[2] = max(lens[2], lens[1])
-    spread[3:] = np.maximum(np.concatenate([[change], change * LENS_POWERS * lens]), _MIN_CHANGE)
+    spread[3:] = np.maximum(np.concatenate([[change], change * LENS_POWERS * lens]), min_change)
     return spread
 
 
@@ -173,10 +152,6 @@ def correlation_time(camera: MovingCamera, fps: float) -> float:
 
     The correlation time is the sum of the autocorrelation: this number of consecutive frames has
     the information of one independent frame.
-
-    Args:
-        camera: all frames, as tracked.
-        fps: frames per second.
     """
     width = max(1, round(_WINDOW_S * fps))
     if len(camera) < 3 * width:
@@ -202,13 +177,10 @@ def _zoom_changes(camera: MovingCamera, width: int) -> Floats:
 def estimate_flow_share(
     links: Chain, key_frames: Integers, deviation: float, drift: float
 ) -> float:
-    """Return the factor on a followed point's loss [0..1].
+    """Return the factor on a followed point's loss [0..1], with its deviation [px].
 
-    Args:
-        links: a tracked clip; without a gap between key frames, `drift` applies.
-        key_frames: their numbers, rising.
-        deviation: deviation of a followed point's motion [px].
-        drift: tracking error after one frame, growing with the square root of frames [px].
+    Without a gap between key frames, the drift [px] applies: the tracking error after one frame,
+    growing with the square root of frames.
     """
     points = np.array([kept.sum() for kept in links.kept])
     if not len(points) or points.max() == 0:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Image, Integers
 from data_contracts.broadcast_calibration import FRAME_STATUS
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
@@ -27,19 +25,6 @@ from worldpose.broadcast_calibration.settings import BroadcastCalibrationSetting
 from worldpose.broadcast_calibration.tracking import Chain
 from worldpose.broadcast_calibration.uncertainty import Uncertainty
 from worldpose.pitch.template import PitchTemplate
-
-_MIN_LINES: Final = 30
-"""Minimum line samples that determine a frame's camera [1]."""
-_MIN_PLAYERS: Final = 3
-"""Minimum players that determine a frame's camera [1]."""
-_MAX_PICKS: Final = 5
-"""Maximum number of proposed key frames."""
-_MAX_OFFSET: Final = 0.5
-"""Clock offset above which the report warns [frame]."""
-_GRID: Final = 4.0
-"""Grid spacing of places on the pitch for expected errors [m]."""
-_MAX_PAINT_ERROR_M: Final = 0.3
-"""Spread of markings about the Laws that asks for a review [m]: no painter errs by that much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +56,7 @@ class BroadcastReport:
         reasons: why a person must review the clip; empty if not necessary.
     """
 
-    status: NDArray[np.uint8]
+    status: Image
     reprojection_error: Floats
     marking_rms: Floats
     player_rms: Floats
@@ -139,15 +124,7 @@ def report_calibration(
     settings: BroadcastCalibrationSettings,
     first: int,
 ) -> BroadcastReport:
-    """Return the report of a calibrated clip.
-
-    Args:
-        tracked: key frames, tracked cameras and followed points.
-        fit: the joint fit.
-        pitch: the template.
-        settings: thresholds.
-        first: number of the clip's first frame in its video, for messages.
-    """
+    """Return the report of a calibrated clip."""
     camera, points, keys, links = fit.camera, fit.points, tracked.keys, tracked.chain
     frames = len(camera)
     off, across = _residuals(camera, points)
@@ -194,38 +171,27 @@ def report_calibration(
     )
 
 
-def _frame_status(
-    tracked: TrackedClip, line_count: Integers, player_count: Integers
-) -> NDArray[np.uint8]:
+def _frame_status(tracked: TrackedClip, line_count: Integers, player_count: Integers) -> Image:
     """Return the main evidence of each frame (frames,), an index into `FRAME_STATUS`."""
     status = np.full(len(line_count), FRAME_STATUS.index("bridged"), dtype=np.uint8)
     determined = tracked.chain.determined
     linked = np.append(determined, False) | np.append(False, determined)
     status[linked] = FRAME_STATUS.index("followed")
-    status[player_count >= _MIN_PLAYERS] = FRAME_STATUS.index("players")
-    status[line_count >= _MIN_LINES] = FRAME_STATUS.index("lines")
+    status[player_count >= 3] = FRAME_STATUS.index("players")
+    status[line_count >= 30] = FRAME_STATUS.index("lines")
     status[tracked.keys.frames] = FRAME_STATUS.index("key_frame")
     return status
 
 
 def _review_reasons(
     expected: Floats,
-    status: NDArray[np.uint8],
+    status: Image,
     keys: Keys,
     pitch: PitchFit,
     settings: BroadcastCalibrationSettings,
     first: int,
 ) -> list[str]:
-    """Return why a person must review the clip, apart from its clock.
-
-    Args:
-        expected: (frames,) expected image error [px].
-        status: (frames,) main evidence.
-        keys: key frames, used and refused.
-        pitch: the pitch that the fit shows.
-        settings: thresholds.
-        first: number of the clip's first frame in its video.
-    """
+    """Return why a person must review the clip, apart from its clock."""
     reasons = []
     share = float(np.mean(expected > settings.weak_error_px))
     if share > 0.05:
@@ -235,7 +201,8 @@ def _review_reasons(
     bridged = int((status == FRAME_STATUS.index("bridged")).sum())
     if bridged:
         reasons.append(f"{bridged} frames have no evidence and follow their neighbours")
-    if pitch.paint_m > _MAX_PAINT_ERROR_M:
+    # No painter errs by 0.3 m.
+    if pitch.paint_m > 0.3:
         reasons.append(
             f"markings differ from the Laws by {pitch.paint_m:.2f} m per axis: the pitch has "
             "another size, or clicks have wrong names"
@@ -253,7 +220,7 @@ def expected_errors(camera: MovingCamera, uncertainty: Uncertainty, pitch: Pitch
     Each error is the root mean square over the visible places; NaN if the frame shows none.
     """
     half = 0.5 * np.array([pitch.length, pitch.width])
-    x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, _GRID) for h in half))
+    x, y = np.meshgrid(*(np.arange(-h, h + 1e-9, 4.0) for h in half))
     places = np.stack([x.ravel(), y.ravel(), pitch.height(x.ravel(), y.ravel())], axis=-1)
     expected = np.full(len(camera), np.nan)
     pixel, rows = np.empty(2), np.empty((2, 12))
@@ -286,7 +253,7 @@ def _describe_offset(
     )
     if settings.feed_offset == "correct":
         return f"{sentence}: corrected", False
-    beyond = abs(offset.frames) - 2.0 * offset.standard_error > _MAX_OFFSET
+    beyond = abs(offset.frames) - 2.0 * offset.standard_error > 0.5
     todo = (
         f": lower the clip's broadcast_offset_frames by {offset.frames:.2f}, or set "
         "broadcast_calibration.feed_offset=correct"
@@ -302,7 +269,7 @@ def _residuals(camera: MovingCamera, points: PointEvidence) -> tuple[Floats, Flo
     return white / np.maximum(scale, 1e-12), white
 
 
-def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: int) -> Floats:
+def _rms(off: Floats, points: PointEvidence, chosen: Flags, frames: int) -> Floats:
     count = np.bincount(points.frame[chosen], minlength=frames)
     total = np.bincount(points.frame[chosen], off[chosen] ** 2, minlength=frames)
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
@@ -310,10 +277,11 @@ def _rms(off: Floats, points: PointEvidence, chosen: NDArray[np.bool_], frames: 
 
 def _select_picks(expected: Floats) -> tuple[int, ...]:
     """Return the frames of largest expected error, at a distance from one another."""
+    most = 5
     left = np.where(np.isfinite(expected), expected, -1.0)
-    apart = max(1, len(expected) // (2 * _MAX_PICKS))
+    apart = max(1, len(expected) // (2 * most))
     picks: list[int] = []
-    while len(picks) < _MAX_PICKS and left.max() > 0.0:
+    while len(picks) < most and left.max() > 0.0:
         best = int(left.argmax())
         picks.append(best)
         left[max(0, best - apart) : best + apart + 1] = -1.0
@@ -335,10 +303,6 @@ def median_residuals(camera: MovingCamera, points: PointEvidence) -> tuple[float
 
     Residuals of painted lines are distances across them, of inliers. Residuals of people are means
     over a person's keypoints per frame, which average out keypoint errors but not camera errors.
-
-    Args:
-        camera: all frames.
-        points: the evidence.
     """
     off = pixel_residuals(camera, points)
     lines = points.kind == MARKING

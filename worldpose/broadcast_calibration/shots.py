@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Final
 
 import cv2
 import numpy as np
@@ -13,35 +12,6 @@ import numpy as np
 from data_contracts.arrays import Image
 from worldpose.broadcast_calibration.tracking import Followed, follow
 from worldpose.errors import InputError
-
-_POINTS: Final = 200
-"""Approximate number of points followed between two frames [1]."""
-_GRASS: Final = ((25, 35, 25), (95, 255, 255))
-"""Hue [2 deg], saturation and value [1/255] of grass in sun, shade and floodlight."""
-_STATISTICS_S: Final = 0.5
-"""Interval between frames for grass and people statistics [s]."""
-_MIN_SHOT_S: Final = 1.0
-"""Minimum duration of a shot [s]; shorter parts belong to a transition between two shots."""
-_MAX_PREVIEWS: Final = 8
-"""Maximum preview frames per shot [1]."""
-_MAX_CHANGE: Final = 30.0
-"""Mean change of brightness that separates two shots without followed points [1/255]."""
-_RATE_HZ: Final = 25.0
-"""Approximate sampling rate of frames [Hz]; it limits the accuracy of cuts."""
-_CUT_SHARE: Final = 0.25
-"""Minimum share of homography inliers within a shot, as in calibration [1]."""
-_MIN_TRANSITION_S: Final = 0.1
-"""Minimum duration of a transition, such as a wipe or a dissolve [s]: a shot between two is a
-replay."""
-_MIN_DURATION_S: Final = 4.0
-"""Minimum clip duration [s]."""
-_MIN_GRASS_SHARE: Final = 0.5
-"""Minimum median share of grass in frames of a main camera [1]."""
-_MAX_PERSON_HEIGHT: Final = 0.35
-"""Maximum median height of the tallest region on the grass, in image heights [1]: people are a
-tenth in a main camera, half and more in other cameras."""
-_MIN_PAN: Final = 0.25
-"""Minimum pan per clip, in image widths [1]: 7 degrees at a usual focal length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +58,7 @@ class _Course:
         grass, tallest = grass_and_people(picture)
         if len(self.grass) % self.every == 0:
             self.pictures.append(picture)
-            if len(self.pictures) > _MAX_PREVIEWS:
+            if len(self.pictures) > 8:
                 del self.pictures[1::2]
                 self.every *= 2
         self.grass.append(grass)
@@ -111,8 +81,10 @@ def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iter
             damaged frame, which ends a shot.
         fps: frames per second.
     """
-    stride = max(1, round(fps / _RATE_HZ))
-    interval = max(1, round(_STATISTICS_S * fps / stride))
+    min_shot_s = 1.0  # shorter parts belong to a transition between two shots
+    # The stride limits the accuracy of cuts.
+    stride = max(1, round(fps / 25.0))
+    interval = max(1, round(0.5 * fps / stride))
     course: _Course | None = None
     before: Image | None = None
     shot: _Course | None = None
@@ -123,7 +95,7 @@ def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iter
             continue
         same, moved = (False, 0.0) if before is None else _measure_motion(before, picture)
         if course is not None and not same:
-            if course.last - course.first >= _MIN_SHOT_S * fps:
+            if course.last - course.first >= min_shot_s * fps:
                 if shot is not None:
                     yield _shot(shot, shot_before, course.first, fps, stride)
                     shot_before = shot.last
@@ -144,15 +116,13 @@ def find_shots(pictures: Iterable[tuple[int, Image | None]], fps: float) -> Iter
 
 
 def grass_and_people(picture: Image) -> tuple[float, float]:
-    """Return the share of grass [1] and the height of the tallest region on it [1].
+    """Return the share of grass [1] and the height of the tallest region on it [1] in an RGB image.
 
     The height is in image heights: that of the tallest connected region that is not green within
     the convex hull of the grass.
-
-    Args:
-        picture: RGB (height, width, 3), small.
     """
-    green = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), *map(np.array, _GRASS))
+    grass_hsv = ((25, 35, 25), (95, 255, 255))  # in sun, shade and floodlight
+    green = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), *map(np.array, grass_hsv))
     kernel = np.ones((3, 3), np.uint8)
     # Remove green specks in the stands.
     grass = cv2.morphologyEx(green, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
@@ -176,11 +146,11 @@ def _measure_motion(before: Image, picture: Image | None) -> tuple[bool, float]:
         np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         for each in (before, picture)
     ]
-    (followed,) = follow(grey, None, _POINTS)
+    (followed,) = follow(grey, None, 200)
     if np.isnan(followed.inlier_share):
         change = np.abs(grey[1].astype(np.float64) - grey[0]).mean()
-        return bool(change < _MAX_CHANGE), 0.0
-    if followed.inlier_share < _CUT_SHARE:
+        return bool(change < 30.0), 0.0
+    if followed.inlier_share < 0.25:
         return False, 0.0
     motion = np.median(followed.end[:, 0] - followed.start[:, 0])
     return True, float(motion) / picture.shape[1]
@@ -188,20 +158,23 @@ def _measure_motion(before: Image, picture: Image | None) -> tuple[bool, float]:
 
 def _shot(course: _Course, before: int | None, after: int | None, fps: float, stride: int) -> Shot:
     """Return a finished shot; gaps to the neighbouring shots indicate wipes."""
+    min_duration_s = 4.0
     count = course.last - course.first + 1
     grass, tallest = float(np.median(course.grass)), float(np.median(course.tallest))
     pan, seconds = course.right - course.left, count / fps
     # Neighbouring samples are a stride apart, in a shot and across a cut.
-    wipe = _MIN_TRANSITION_S * fps + stride
+    wipe = 0.1 * fps + stride
     sides = (
         before is not None and course.first - before > wipe,
         after is not None and after - course.last > wipe,
     )
+    # People are a tenth of the image high in a main camera, half and more in others.
+    # Seven degrees at a usual focal length.
     faults = {
-        f"shorter than {_MIN_DURATION_S:g} s": seconds < _MIN_DURATION_S,
-        "too little grass": grass < _MIN_GRASS_SHARE,
-        "people too large": tallest > _MAX_PERSON_HEIGHT,
-        "hardly a pan": pan < _MIN_PAN,
+        f"shorter than {min_duration_s:g} s": seconds < min_duration_s,
+        "too little grass": grass < 0.5,
+        "people too large": tallest > 0.35,
+        "hardly a pan": pan < 0.25,
         "between two wipes, as replays are": all(sides),
     }
     unfit = tuple(fault for fault, found in faults.items() if found)
@@ -209,28 +182,18 @@ def _shot(course: _Course, before: int | None, after: int | None, fps: float, st
 
 
 def find_cuts(followed: Sequence[Followed], share: float) -> list[int]:
-    """Return the first frames of new shots.
-
-    Args:
-        followed: points between all neighbouring frames.
-        share: minimum share of them consistent with one homography within a shot [1].
-    """
+    """Return the first frames of new shots, where less than a share of points is followed."""
     return [number + 1 for number, pair in enumerate(followed) if pair.inlier_share < share]
 
 
 def require_one_shot(
     followed: Sequence[Followed], share: float, where: str, first: int = 0
 ) -> None:
-    """Raise InputError if a clip has several shots.
-
-    Args:
-        followed: points between all neighbouring frames.
-        share: as in `find_cuts`.
-        where: clip or file, for the message.
-        first: number of the first frame in its video.
+    """Raise InputError if a clip has several shots; see `find_cuts`.
 
     Raises:
-        InputError: the clip has cuts; the message lists their frames.
+        InputError: the clip has cuts; the message lists their frames, by their numbers in the
+            video.
     """
     cuts = find_cuts(followed, share)
     if cuts:

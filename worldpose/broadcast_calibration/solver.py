@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.broadcast_calibration.evidence import FlowEvidence, PointEvidence, bounds
 from worldpose.broadcast_calibration.moving_camera import CLIP_SIZE, FRAME_SIZE, MovingCamera
 from worldpose.broadcast_calibration.normal_equations import (
@@ -23,13 +21,6 @@ from worldpose.broadcast_calibration.priors import Prior, add_smoothness
 from worldpose.errors import DegenerateError
 from worldpose.geometry.optimize.banded import BandedFactor
 from worldpose.geometry.optimize.levenberg_marquardt import Schedule, minimize
-
-_START_DAMPING: Final = 1e-4
-_MAX_DAMPING: Final = 1e9
-_TOLERANCE: Final = 1e-7
-"""Relative decrease of the cost that ends the iterations."""
-_SIZE_ENTRIES: Final = np.array([0, 1, 2, 5])
-"""Places of length, width, crown and end fall in the last two rows of the paint errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +47,11 @@ class Problem:
     smoothness: Floats = field(default_factory=lambda: np.full(FRAME_SIZE, np.inf))
     flow_weight: float = 1.0
     flow_loss: float = np.inf
-    free_frame: NDArray[np.bool_] = field(default_factory=lambda: np.ones(FRAME_SIZE, np.bool_))
-    free_clip: NDArray[np.bool_] = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
-    known: NDArray[np.bool_] | None = None
+    free_frame: Flags = field(default_factory=lambda: np.ones(FRAME_SIZE, np.bool_))
+    free_clip: Flags = field(default_factory=lambda: np.ones(CLIP_SIZE, np.bool_))
+    known: Flags | None = None
 
-    def fixed_mask(self, frames: int) -> NDArray[np.bool_]:
+    def fixed_mask(self, frames: int) -> Flags:
         """Return the mask of every frame's fixed parameters (frames, 7)."""
         held = np.broadcast_to(~self.free_frame, (frames, FRAME_SIZE))
         return held if self.known is None else held | self.known
@@ -82,14 +73,10 @@ class Problem:
         return len(self.painted) + 2 * (self.size_row >= 0)
 
     def of_size(self, rows: Floats) -> Floats:
-        """Return the entries (4,) of length, width, crown and end fall in rows of paint errors.
-
-        Args:
-            rows: (paint_count, 3).
-        """
+        """Return length, width, crown and end fall (4,) of paint errors (paint_count, 3)."""
         if self.size_row < 0:
             return np.zeros(4)
-        return np.asarray(rows[self.size_row :].ravel()[_SIZE_ENTRIES])
+        return np.asarray(rows[self.size_row :].ravel()[np.array([0, 1, 2, 5])])
 
     @cached_property
     def ends(self) -> Integers:
@@ -113,31 +100,31 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The camera of least cost, and the course of the iterations.
+    """A camera, and the course of the iterations to it.
 
     Attributes:
-        camera: camera of least cost.
+        camera: all frames.
         paint_offsets: (painted, 3) offsets of painted template points from the survey, then of the
             pitch's size, if it is not known [standard deviations].
-        cost: final cost.
+        equations: equations at this camera.
         costs: cost after every iteration.
-        equations: equations at the final camera.
     """
 
     camera: MovingCamera
     paint_offsets: Floats
-    cost: float
-    costs: tuple[float, ...]
     equations: Equations
+    costs: tuple[float, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """Cost of the camera."""
+        return self.equations.cost
 
 
 def equations_at(camera: MovingCamera, paint_offsets: Floats, problem: Problem) -> Equations:
     """Return cost, gradient and Gauss-Newton matrix of a problem, linearized at `camera`.
 
-    Args:
-        camera: all frames.
-        paint_offsets: (painted, 3) offsets of painted template points [standard deviations].
-        problem: evidence, smoothness and priors.
+    The paint has offsets (painted, 3) [standard deviations].
     """
     frames = len(camera)
     shared = CLIP_SIZE + paint_offsets.size
@@ -164,62 +151,37 @@ def equations_at(camera: MovingCamera, paint_offsets: Floats, problem: Problem) 
 def solve(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
     """Return the camera of least cost near a start.
 
-    Args:
-        camera: the start.
-        problem: evidence, smoothness and priors.
-        iterations: at most.
-
     Raises:
         DegenerateError: the matrix is singular: a parameter has neither evidence nor prior.
     """
 
-    def step(state: _State, damping: float) -> _State:
+    def step(state: Solution, damping: float) -> Solution:
         frame, shared = _solve_step(state.equations.system, damping)
         camera = state.camera.take_step(frame, shared[:CLIP_SIZE])
         paint_offsets = state.paint_offsets + shared[CLIP_SIZE:].reshape(state.paint_offsets.shape)
-        return _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
+        return Solution(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
 
     paint_offsets = np.zeros((problem.paint_count, 3))
-    start = _State(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
+    start = Solution(camera, paint_offsets, equations_at(camera, paint_offsets, problem))
     schedule = Schedule(
-        damping=_START_DAMPING,
+        damping=1e-4,
         decrease=6.0,
         min_damping=1e-10,
-        max_damping=_MAX_DAMPING,
+        max_damping=1e9,
         iterations=iterations,
-        converged=lambda before, after: 0.0 < before - after < _TOLERANCE * after,
+        converged=lambda before, after: 0.0 < before - after < 1e-7 * after,
     )
     found = minimize(start, step, schedule)
-    last = found.state
-    return Solution(last.camera, last.paint_offsets, last.cost, found.costs, last.equations)
+    return replace(found.state, costs=found.costs)
 
 
 def displace(points: PointEvidence, problem: Problem, paint_offsets: Floats) -> PointEvidence:
-    """Return evidence whose places have the estimated paint errors and size of the pitch.
-
-    Args:
-        points: evidence of the problem.
-        problem: problem with the rows of the paint errors.
-        paint_offsets: (painted, 3) [standard deviations].
-    """
+    """Return evidence whose places have the estimated paint errors (painted, 3) and pitch size."""
     padded = np.concatenate([paint_offsets, np.zeros((1, 3))])
     world = points.world + (points.shares[..., None] * padded[problem.ends]).sum(axis=1)
     if problem.size_row >= 0:
         world += (points.by_size * paint_offsets[problem.size_row :]).sum(axis=1)
     return replace(points, world=world)
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """A camera and paint errors (painted, 3), with the equations there."""
-
-    camera: MovingCamera
-    paint_offsets: Floats
-    equations: Equations
-
-    @property
-    def cost(self) -> float:
-        return self.equations.cost
 
 
 def factorize(blocks: Floats) -> BandedFactor:
@@ -296,8 +258,6 @@ def _remove_fixed(problem: Problem, system: NormalEquations) -> None:
 
 RATE = 1e-3
 """Learning rate of every parameter [its unit; thousands of pixels for the principal point] (M5)."""
-_DECAY = (0.9, 0.999)
-_EPSILON = 1e-8
 
 
 def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution:
@@ -305,12 +265,8 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
 
     Parameters are those of the solver: rotations in radians, logarithms of focal lengths,
     distortion, metres. The principal point is in units of 1,000 px.
-
-    Args:
-        camera: the start.
-        problem: evidence, smoothness and priors.
-        iterations: number of iterations.
     """
+    decay = (0.9, 0.999)
     frames = len(camera) * FRAME_SIZE
     paint_offsets = np.zeros((problem.paint_count, 3))
     size = frames + CLIP_SIZE + paint_offsets.size
@@ -321,14 +277,14 @@ def descend(camera: MovingCamera, problem: Problem, iterations: int) -> Solution
     costs = [here.cost]
     for iteration in range(1, iterations + 1):
         gradient = unit * np.concatenate([here.system.right.ravel(), here.system.right_corner])
-        mean = _DECAY[0] * mean + (1.0 - _DECAY[0]) * gradient
-        square = _DECAY[1] * square + (1.0 - _DECAY[1]) * gradient**2
-        first = mean / (1.0 - _DECAY[0] ** iteration)
-        second = square / (1.0 - _DECAY[1] ** iteration)
-        step = -RATE * unit * first / (np.sqrt(second) + _EPSILON)
+        mean = decay[0] * mean + (1.0 - decay[0]) * gradient
+        square = decay[1] * square + (1.0 - decay[1]) * gradient**2
+        first = mean / (1.0 - decay[0] ** iteration)
+        second = square / (1.0 - decay[1] ** iteration)
+        step = -RATE * unit * first / (np.sqrt(second) + 1e-8)
         shared = step[frames:]
         camera = camera.take_step(step[:frames].reshape(-1, FRAME_SIZE), shared[:CLIP_SIZE])
         paint_offsets = paint_offsets + shared[CLIP_SIZE:].reshape(paint_offsets.shape)
         here = equations_at(camera, paint_offsets, problem)
         costs.append(here.cost)
-    return Solution(camera, paint_offsets, here.cost, tuple(costs), here)
+    return Solution(camera, paint_offsets, here, tuple(costs))

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Flags, Floats, Image, Singles
 from worldpose.broadcast_calibration.moving_camera import MovingCamera, join_cameras
 from worldpose.broadcast_calibration.normal_equations import (
     Flow,
@@ -37,9 +36,9 @@ class Chain:
     """
 
     camera: MovingCamera
-    kept: list[NDArray[np.bool_]]
+    kept: list[Flags]
     residual: list[Floats]
-    determined: NDArray[np.bool_]
+    determined: Flags
     drift: Floats
 
 
@@ -49,13 +48,7 @@ def chain(
     """Return the cameras of all frames, tracked from each key frame to the next.
 
     At the next key frame the tracked camera differs from the calibrated one by the drift, which is
-    distributed linearly over the frames between them.
-
-    Args:
-        key_frames: indices of the key frames, rising.
-        keys: cameras of the key frames, in that order.
-        followed: points between all neighbouring frames.
-        outlier: maximum modified z-score of an inlier.
+    distributed linearly over the frames between them. Inliers have smaller z-scores than `outlier`.
     """
     frames = len(followed) + 1
     cameras: list[MovingCamera | None] = [None] * frames
@@ -120,44 +113,46 @@ def _direction_error(one: MovingCamera, other: MovingCamera) -> float:
     return float(np.sqrt(np.nanmean((off**2).sum(axis=-1)))) if np.isfinite(off).any() else np.inf
 
 
-_SCALES: Final = (20.0, 5.0, 1.5, 0.6, 0.6)
-"""Decreasing scales of the loss [px]."""
 LENS_POWERS: Final = np.array([1.6, 1.0, 1.0])
 """Powers of the focal length that k1, k2 and k3 of a zoom lens grow with."""
-_MIN_FOLLOWED: Final = 8
-"""Minimum points for rotation and zoom [1]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """The camera of the second of two frames.
-
-    Attributes:
-        camera: two frames: the given one, and the next.
-        residual: (n, 2) residual of the followed points, predicted minus observed [px]; NaN where
-            there is no prediction.
-        determined: whether the points determine the motion.
-    """
+class Turned(NamedTuple):
+    """The camera of the second of two frames."""
 
     camera: MovingCamera
+    """Two frames: the given one, and the next."""
     residual: Floats
+    """(n, 2) of the followed points, predicted minus observed [px]; NaN without a prediction."""
     determined: bool
+    """Whether the points determine the motion."""
 
 
 def turn(camera: MovingCamera, followed: Followed) -> Turned:
-    """Return the next frame's rotation, zoom and lens from one frame's camera.
-
-    Args:
-        camera: a single frame.
-        followed: its points in the next frame.
-    """
+    """Return the next frame's rotation, zoom and lens from one frame's camera."""
     both = replace(
         camera,
         rotation=np.repeat(camera.rotation, 2, axis=0),
         focal=np.repeat(camera.focal, 2),
         distortion=np.repeat(camera.distortion, 2, axis=0),
     )
-    return _fit_turn(both, followed)
+    if len(followed.start) < 8:
+        return Turned(both, np.full((len(followed.start), 2), np.nan), False)
+    bounds = np.array([0, len(followed.start), len(followed.start)])
+    ones = np.ones(len(followed.start))
+    # The median motion is a robust start.
+    x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
+    both = _move_second(both, np.array([-y, x, 0.0, 0.0]))
+    for scale in (20.0, 5.0, 1.5, 0.6, 0.6):
+        equations = empty_equations(2, 5)
+        flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
+        add_flow(both.arrays, bounds, flow, equations)
+        normal = equations.blocks[0, 1, :4, :4]
+        normal = normal + 1e-9 * np.diag(np.diag(normal))
+        if not np.linalg.cond(normal) < 1e12:
+            return Turned(both, flow_residuals(both, followed), False)
+        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :4])))
+    return Turned(both, flow_residuals(both, followed), True)
 
 
 def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
@@ -178,38 +173,15 @@ def flow_residuals(both: MovingCamera, followed: Followed) -> Floats:
 def modified_z_scores(residual: Floats) -> Floats:
     """Return each point's modified z-score (n,), the larger of both axes (M6).
 
-    The score is 0.6745 times the distance from the median, divided by the median of these distances
-    (Iglewicz and Hoaglin, 1993). It is NaN where the residual is missing.
-
-    Args:
-        residual: (n, 2) [px].
+    The score is 0.6745 times the distance of the residual (n, 2) [px] from the median, divided by
+    the median of these distances (Iglewicz and Hoaglin, 1993). It is NaN where the residual is
+    missing.
     """
     if not np.isfinite(residual).any():
         return np.full(len(residual), np.nan)
     off = np.abs(residual - np.nanmedian(residual, axis=0))
     spread = np.maximum(np.nanmedian(off, axis=0), 1e-6)
     return np.asarray((0.6745 * off / spread).max(axis=-1))
-
-
-def _fit_turn(both: MovingCamera, followed: Followed) -> Turned:
-    """Return the second of two frames with fitted rotation and zoom."""
-    if len(followed.start) < _MIN_FOLLOWED:
-        return Turned(both, np.full((len(followed.start), 2), np.nan), False)
-    bounds = np.array([0, len(followed.start), len(followed.start)])
-    ones = np.ones(len(followed.start))
-    # The median motion is a robust start.
-    x, y = np.median(followed.end - followed.start, axis=0) / float(both.focal[0])
-    both = _move_second(both, np.array([-y, x, 0.0, 0.0]))
-    for scale in _SCALES:
-        equations = empty_equations(2, 5)
-        flow = Flow(followed.start, followed.end, scale * ones, 1.0, 1.0)
-        add_flow(both.arrays, bounds, flow, equations)
-        normal = equations.blocks[0, 1, :4, :4]
-        normal = normal + 1e-9 * np.diag(np.diag(normal))
-        if not np.linalg.cond(normal) < 1e12:
-            return Turned(both, flow_residuals(both, followed), False)
-        both = _move_second(both, np.asarray(-np.linalg.solve(normal, equations.right[1, :4])))
-    return Turned(both, flow_residuals(both, followed), True)
 
 
 def _move_second(both: MovingCamera, step: Floats) -> MovingCamera:
@@ -241,20 +213,6 @@ def _residuals(
 
 
 _WINDOW: Final = (21, 21)
-_LEVELS: Final = 4
-"""Levels of the pyramid: motion up to 150 px per frame."""
-_MAX_RETURN_ERROR: Final = 0.3
-"""Maximum forward-backward error [px]."""
-_CELLS: Final = (16, 9)
-"""Columns and rows of cells, each with its share of the points."""
-_MIN_STRENGTH: Final = 0.002
-"""Minimum strength of a corner, relative to the strongest in the frame [1]."""
-_BOX_MARGIN: Final = 0.15
-"""Margin around a person's box, relative to its height [1]."""
-_INLIER_DISTANCE: Final = 1.5
-"""Maximum inlier distance of a homography [px]."""
-_MIN_POINTS: Final = 12
-"""Minimum points to decide on a cut [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,16 +232,11 @@ class Followed:
 
 
 def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list[Followed]:
-    """Return the points followed between all neighbouring frames.
+    """Return the points followed between all neighbouring grey frames (height, width).
 
     The function selects new corners in every frame, evenly over the image, so that errors do not
     accumulate along a track. Pyramidal Lucas-Kanade runs forward and backward; points with a large
-    forward-backward error are dropped.
-
-    Args:
-        pictures: grey (height, width), in order.
-        boxes: (frames, detections, 4) x0 y0 x1 y1 [px] of people, which move; NaN = missing.
-        points: approximate number of points.
+    forward-backward error are dropped. People in boxes (frames, detections, 4) [px] move.
     """
     followed: list[Followed] = []
     before: Image | None = None
@@ -296,33 +249,34 @@ def follow(pictures: Iterable[Image], boxes: Floats | None, points: int) -> list
 
 
 def _follow(before: Image, after: Image, people: Floats | None, points: int) -> Followed:
+    fewest = 12  # points to decide on a cut
+    levels = 4  # of the pyramid: motion up to 150 px per frame
     start = _corners(before, people, points)
-    if len(start) < _MIN_POINTS:
+    if len(start) < fewest:
         return Followed(np.empty((0, 2)), np.empty((0, 2)), float("nan"))
     end, found, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, start, start.copy(), winSize=_WINDOW, maxLevel=_LEVELS
+        before, after, start, start.copy(), winSize=_WINDOW, maxLevel=levels
     )
     returned, back, _ = cv2.calcOpticalFlowPyrLK(
-        after, before, end, end.copy(), winSize=_WINDOW, maxLevel=_LEVELS
+        after, before, end, end.copy(), winSize=_WINDOW, maxLevel=levels
     )
     size = np.array([before.shape[1], before.shape[0]])
     # Near the border the window extends beyond the image.
     inside = ((end > _WINDOW[0] / 2) & (end < size - 1 - _WINDOW[0] / 2)).all(axis=-1)
-    same = np.linalg.norm(returned - start, axis=-1) < _MAX_RETURN_ERROR
+    same = np.linalg.norm(returned - start, axis=-1) < 0.3
     kept = (found[:, 0] == 1) & (back[:, 0] == 1) & same & inside
     matched_start, matched_end = start[kept].astype(np.float64), end[kept].astype(np.float64)
     searched = float(inside.sum())
-    if len(matched_start) < _MIN_POINTS or searched < _MIN_POINTS:
-        return Followed(
-            matched_start, matched_end, 0.0 if searched >= _MIN_POINTS else float("nan")
-        )
-    _, agree = cv2.findHomography(matched_start, matched_end, cv2.RANSAC, _INLIER_DISTANCE)
+    if len(matched_start) < fewest or searched < fewest:
+        return Followed(matched_start, matched_end, 0.0 if searched >= fewest else float("nan"))
+    _, agree = cv2.findHomography(matched_start, matched_end, cv2.RANSAC, 1.5)
     share = 0.0 if agree is None else float(agree.sum()) / searched
     return Followed(matched_start, matched_end, share)
 
 
-def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.float32]:
+def _corners(picture: Image, people: Floats | None, points: int) -> Singles:
     """Return corners (n, 2) [px], the strongest of each image cell, outside people's boxes."""
+    cells = (16, 9)  # columns and rows, each with its share of the points
     half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     strength = cv2.cornerMinEigenVal(half, 5)
     margin = _WINDOW[0] // 2
@@ -330,19 +284,19 @@ def _corners(picture: Image, people: Floats | None, points: int) -> NDArray[np.f
     strength[:, :margin] = strength[:, -margin:] = 0.0
     for x0, y0, x1, y1 in np.empty((0, 4)) if people is None else people:
         if np.isfinite(x0 + y0 + x1 + y1):
-            away = _BOX_MARGIN * (y1 - y0) + margin
+            away = 0.15 * (y1 - y0) + margin
             left, right = max(0.5 * (x0 - away), 0.0), max(0.5 * (x1 + away), 0.0)
             top, bottom = max(0.5 * (y0 - away), 0.0), max(0.5 * (y1 + away), 0.0)
             strength[int(top) : int(bottom) + 1, int(left) : int(right) + 1] = 0.0
     peaks = strength == cv2.dilate(strength, np.ones((7, 7), np.uint8))
-    peaks &= strength > max(_MIN_STRENGTH * float(strength.max()), 1e-7)
+    peaks &= strength > max(0.002 * float(strength.max()), 1e-7)
     v, u = np.nonzero(peaks)
     height, width = half.shape
-    cell = (u * _CELLS[0] // width) + _CELLS[0] * (v * _CELLS[1] // height)
+    cell = (u * cells[0] // width) + cells[0] * (v * cells[1] // height)
     order = np.lexsort((-strength[v, u], cell))
     cell = cell[order]
     first = np.searchsorted(cell, cell)
-    each = max(1, round(points / (_CELLS[0] * _CELLS[1])))
+    each = max(1, round(points / (cells[0] * cells[1])))
     chosen = order[np.arange(len(cell)) - first < each]
     # The center of a half-resolution pixel is between two full-resolution pixels.
     return np.stack([2 * u[chosen] + 0.5, 2 * v[chosen] + 0.5], axis=-1).astype(np.float32)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from data_contracts.arrays import Floats, Integers
@@ -22,13 +23,7 @@ from worldpose.broadcast_calibration.normal_equations import (
 )
 from worldpose.broadcast_calibration.solver import Problem, Solution, factorize
 from worldpose.compiled import compile_kernel
-
-_FIRST_LENS_ENTRY: Final = 3
-"""Parameters of a frame's step before those of its lens."""
-_MAX_INTERVALS: Final = 64
-"""Maximum intervals per clip with a common error of lens second differences [1]."""
-_CELL_M: Final = 3.0
-"""Cell size within which a marking has one common paint error [m]."""
+from worldpose.geometry.cameras import camera_arrays, camera_from_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +56,31 @@ def static_covariance(camera: MovingCamera, uncertainty: Uncertainty) -> Floats:
     order = [3, FRAME_SIZE + 3, FRAME_SIZE + 4, 4, 5, 6]
     chain[:, range(6, size), order] = 1.0
     return np.asarray(chain @ uncertainty.frame @ np.swapaxes(chain, -1, -2))
+
+
+def moving_arrays(moving: MovingCamera, uncertainty: Uncertainty) -> dict[str, NDArray[Any]]:
+    """Return the stored arrays of a moving camera and its covariance, by name."""
+    covariance = uncertainty.frame
+    return {
+        **camera_arrays(moving.camera),
+        "image_size": moving.image_size,
+        "center": moving.center,
+        "covariance": covariance[:, :FRAME_SIZE, :FRAME_SIZE],
+        "shared_covariance": covariance[:, :FRAME_SIZE, FRAME_SIZE:],
+        "clip_covariance": uncertainty.clip,
+    }
+
+
+def moving_from_arrays(arrays: Mapping[str, ArrayLike]) -> tuple[MovingCamera, Uncertainty]:
+    """Return the moving camera of stored arrays, and its covariance."""
+    names = ("covariance", "shared_covariance", "clip_covariance")
+    own, across, shared = (np.asarray(arrays[name]) for name in names)
+    whole = np.empty((len(own), FRAME_SIZE + CLIP_SIZE, FRAME_SIZE + CLIP_SIZE))
+    whole[:, :FRAME_SIZE, :FRAME_SIZE] = own
+    whole[:, :FRAME_SIZE, FRAME_SIZE:] = across
+    whole[:, FRAME_SIZE:, :FRAME_SIZE] = np.swapaxes(across, -1, -2)
+    whole[:, FRAME_SIZE:, FRAME_SIZE:] = shared
+    return MovingCamera.from_batch(camera_from_arrays(arrays)), Uncertainty(whole)
 
 
 def compute_uncertainty(
@@ -124,14 +144,10 @@ def compute_uncertainty(
 
 
 def lasting_samples(points: PointEvidence, off: Floats) -> float:
-    """Return how many samples of lines count as one, by their residuals [1].
+    """Return how many samples of lines count as one, by their residuals (n, 2) [px].
 
     The mean over all pieces of markings of the squared mean residual, over that of independent
     samples.
-
-    Args:
-        points: evidence, on the estimated pitch.
-        off: (n, 2) residuals [px].
     """
     lines = np.flatnonzero(points.kind == MARKING)
     if not len(lines):
@@ -146,7 +162,8 @@ def lasting_samples(points: PointEvidence, off: Floats) -> float:
 
 def _cells(points: PointEvidence) -> Integers:
     """Return the kind, marking or person, and piece of the marking (n, 4) of each point."""
-    cell = np.floor(points.world[:, :2] / _CELL_M).astype(np.int64)
+    # Within 3 m a marking has one common paint error.
+    cell = np.floor(points.world[:, :2] / 3.0).astype(np.int64)
     cell[points.kind == PLAYER] = 0
     return np.column_stack([points.kind, points.source, cell])
 
@@ -206,9 +223,9 @@ def _lens_gradients(problem: Problem, frames: int, lasting: float) -> Floats:
     One column per lens parameter and interval of about `lasting` frames, for an error of one
     standard deviation; none without correlation.
     """
-    length = max(round(lasting), -(-frames // _MAX_INTERVALS))
+    length = max(round(lasting), -(-frames // 64))
     numbers = np.flatnonzero(np.isfinite(problem.smoothness) & problem.free_frame)
-    numbers = numbers[numbers >= _FIRST_LENS_ENTRY]
+    numbers = numbers[numbers >= 3]
     starts = range(0, frames - 2, length) if lasting > 1.0 else range(0)
     # Intervals longer than the correlation time have a smaller common error.
     common = np.sqrt(min(1.0, lasting / length))
@@ -283,10 +300,6 @@ def _add_gradients(
                     by_shared[5 + 3 * row + one % 3, column] += moved
 
 
-_SIGNIFICANCE = 1e-3
-"""Significance level of the test that clips have one center [1]."""
-
-
 @dataclass(frozen=True, eq=False)
 class PooledCenter:
     """Common camera center of several clips.
@@ -305,12 +318,7 @@ class PooledCenter:
 
 
 def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> PooledCenter:
-    """Return the covariance-weighted mean of several clips' centers.
-
-    Args:
-        centers: (3,) each [m], world.
-        covariances: (3, 3) each [m^2].
-    """
+    """Return the mean of several clips' centers (3,) [m], weighted by covariances (3, 3) [m^2]."""
     information = [np.linalg.inv(covariance) for covariance in covariances]
     whole = np.linalg.inv(np.sum(information, axis=0))
     middle = whole @ np.sum([i @ c for i, c in zip(information, centers, strict=True)], axis=0)
@@ -318,7 +326,7 @@ def pool_centers(centers: Sequence[Floats], covariances: Sequence[Floats]) -> Po
         [(c - middle) @ i @ (c - middle) for c, i in zip(centers, information, strict=True)]
     )
     freedom = 3 * (len(centers) - 1)
-    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, _SIGNIFICANCE))
+    agree = freedom == 0 or bool(squared.sum() < chdtri(freedom, 1e-3))
     nothing = np.full(3, np.nan)
     return PooledCenter(middle if agree else nothing, np.asarray(whole), agree, np.sqrt(squared))
 
@@ -329,11 +337,6 @@ def drawn_to(
     """Return a clip's cameras conditioned on the pooled center, and their covariance.
 
     Rotation, focal length and distortion follow the center by their covariance with it.
-
-    Args:
-        camera: all frames of the clip.
-        uncertainty: its covariance.
-        pooled: common center of consistent clips, this clip included.
     """
     known = uncertainty.frame
     place = slice(FRAME_SIZE, FRAME_SIZE + 3)

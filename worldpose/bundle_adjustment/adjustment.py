@@ -33,6 +33,7 @@ from worldpose.bundle_adjustment.problems import (
     camera_knowledge,
     estimate_noise,
     estimate_variance_factor,
+    keypoint_information,
     markings_problem,
     players_problem,
 )
@@ -46,16 +47,8 @@ from worldpose.bundle_adjustment.uncertainty import (
 )
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
-from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian
 from worldpose.triangulation.passes import triangulate_joints
 
-_OTHER_PEOPLE: Final = (
-    "refused: this camera shows other people than the other cameras under the same ids"
-)
-_PASSES: Final = 3
-"""Iterations of solution and noise estimation; the third changes little."""
-_MIN_VARIANCE_FACTOR: Final = 0.01
-"""Smallest factor on the prior variance of given cameras [1]: a tenth of its deviations."""
 _SMALL_RIG: Final = 4
 """Maximum cameras of a rig in which cameras with a covariance change together or not at all [1]:
 each joint of a held-out person then has at most three other views, whose errors do not average
@@ -82,9 +75,6 @@ class BundleAdjustment:
         motion: (cameras, 3) motion of the accepted cameras: of the center [m], of the axes [rad],
             of the focal length [1]; 0 where refused.
         refused: (cameras,) batch as it would be without held-out validation.
-        iterations: iterations of the last solution.
-        converged: whether the last solution converged.
-        observations: keypoints in the adjustment [1].
     """
 
     clip: Clip
@@ -100,9 +90,6 @@ class BundleAdjustment:
     evidence: Evidence
     motion: Floats
     refused: Camera
-    iterations: int
-    converged: bool
-    observations: int
 
 
 def adjust_cameras(
@@ -125,6 +112,7 @@ def adjust_cameras(
     Note:
         B1-B3; paper section "Bundle Adjustment".
     """
+    other = "refused: this camera shows other people than the other cameras under the same ids"
     proposed = propose_frames(
         clip, settings.max_frames, settings.min_frame_gap_s, settings.min_views
     )
@@ -138,8 +126,7 @@ def adjust_cameras(
     clip = learn_confidence(clip, np.union1d(used, judged))
     adjuster = _Adjuster(clip, settings, used, judged, placed)
     count = len(clip.clicks)
-    observed = adjuster.observations
-    if settings.evidence == "markings_and_players" and not len(observed.points):
+    if settings.evidence == "markings_and_players" and not len(adjuster.observations.points):
         return _refuse_all(clip, "no person has enough inlier cameras", proposed, used, judged)
     if settings.evidence == "markings" and not any(c.inlier.any() for c in clip.clicks):
         return _refuse_all(clip, "no camera has a clicked marking", proposed, used, judged)
@@ -178,7 +165,7 @@ def adjust_cameras(
         covariance=np.where(fixed[:, None, None], clip.covariance, own),
         accepted=~fixed,
         reasons=tuple(
-            _OTHER_PEOPLE
+            other
             if other_people[c]
             else _explain_decision(
                 first, c, not fixed[c], settings, objection, adjuster.stand_alone[c]
@@ -194,19 +181,11 @@ def adjust_cameras(
         evidence=evidence,
         motion=motion,
         refused=freely.cameras,
-        iterations=last.iterations,
-        converged=last.converged,
-        observations=len(observed.image),
     )
 
 
 def camera_motion(before: Camera, after: Camera) -> Floats:
-    """Return the motion of cameras: (cameras, 3) of center [m], axes [rad], focal length [1].
-
-    Args:
-        before: (cameras,) batch.
-        after: (cameras,) batch.
-    """
+    """Return the motion (cameras, 3) of cameras: of center [m], axes [rad] and focal length [1]."""
     turned = before.cam_from_world.rotation @ after.cam_from_world.rotation.swapaxes(1, 2)
     # Use the chord: the trace loses half of the digits of a small angle.
     chord = np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
@@ -261,7 +240,7 @@ class _Adjuster:
     def _learn(self) -> None:
         """Estimate the keypoint noise, and the factor on the stated variance of calibration."""
         other_people, settings = self.other_people, self.settings
-        for _ in range(_PASSES):
+        for _ in range(3):
             observed = _select_observations(
                 self.observations, ~other_people[self.observations.camera_of]
             )
@@ -278,7 +257,7 @@ class _Adjuster:
             )
         # A stated covariance never shrinks; the prior of given cameras may. Update only once: after
         # more updates, one camera that shows other people would free all the others.
-        min_factor = np.where(self.clip.given, _MIN_VARIANCE_FACTOR, 1.0)
+        min_factor = np.where(self.clip.given, 0.01, 1.0)
         self.variance_factor = self.variance_factor * np.maximum(
             estimate_variance_factor(problem, rough), min_factor
         )
@@ -369,7 +348,7 @@ class _Adjuster:
         """
         if self.clip.given.all() and self.settings.evidence == "markings_and_players":
             points = self.observations.points
-            weight = self._keypoint_information(adjusted.cameras)
+            weight = keypoint_information(adjusted.cameras, self.observations)
             origin = np.median(points, axis=0)
             return relative_covariance(
                 adjusted.camera_covariance, adjusted.cameras, weight, origin
@@ -382,20 +361,6 @@ class _Adjuster:
             information / factor,
             np.sqrt(factor) * response,
         )
-
-    def _keypoint_information(self, cameras: Camera) -> Floats:
-        """Return keypoint information on a step of each camera (cameras, 12, 12), people fixed."""
-        observed = self.observations
-        count = len(cameras.focal)
-        information = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
-        for c in range(count):
-            rows = observed.camera_of == c
-            points = observed.points[observed.point_of[rows]]
-            _, by_step = project_with_jacobian(cameras[c], points)
-            by_step = by_step / observed.noise[rows][:, None, None]
-            by_step = by_step[np.isfinite(by_step).all(axis=(1, 2))]
-            information[c] = np.einsum("nai,naj->ij", by_step, by_step)
-        return information
 
     def held_out_errors(self, fixed: Flags | None) -> HeldOutErrors:
         """Return held-out errors by cameras adjusted without each group; None = initial cameras."""
@@ -442,11 +407,7 @@ def _select_observations(observed: Observations, kept: Flags) -> Observations:
     kept = kept & (
         np.bincount(observed.point_of[kept], minlength=len(observed.points))[observed.point_of] > 1
     )
-    used, number = np.unique(observed.point_of[kept], return_inverse=True)
-    rows = {
-        name: getattr(observed, name)[kept] for name in Observations._fields if name != "points"
-    }
-    return Observations(points=observed.points[used], **(rows | {"point_of": number}))
+    return observed.select(kept)
 
 
 def _merge_cameras(changed: Flags, new: Camera, old: Camera) -> Camera:
@@ -492,11 +453,7 @@ def _describe_motion(motion: Floats) -> str:
 
 
 def _refuse_all(
-    clip: Clip,
-    reason: str,
-    proposed: Integers,
-    used: Integers,
-    judged: Integers,
+    clip: Clip, reason: str, proposed: Integers, used: Integers, judged: Integers
 ) -> BundleAdjustment:
     """Return the clip's cameras unchanged, with one reason for all of them."""
     count = len(clip.clicks)
@@ -512,10 +469,7 @@ def _refuse_all(
         judged=clip.detections.frame[judged],
         noise=KeypointNoise(),
         verdict=Verdict(np.zeros(count, dtype=np.int64), nan, nan, np.zeros(count)),
-        evidence=Evidence(0.0, 0.0, 0.0, 0.0, 0.0),
+        evidence=Evidence(0.0, 0.0, 0.0),
         motion=np.zeros((count, 3)),
         refused=clip.cameras,
-        iterations=0,
-        converged=True,
-        observations=0,
     )

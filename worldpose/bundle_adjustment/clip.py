@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.keypoints import KeypointDetections
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rows import take_rows
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.triangulation.passes import triangulate_joints
@@ -131,6 +132,12 @@ class Observations(NamedTuple):
     noise: Floats
     """(n,) stated standard deviation per axis [px]."""
 
+    def select(self, kept: Flags) -> Observations:
+        """Return the observations (n,) that are kept, with renumbered points."""
+        used, number = np.unique(self.point_of[kept], return_inverse=True)
+        rows = take_rows(self, kept, "points")
+        return rows._replace(points=self.points[used], point_of=number)
+
 
 def keypoints_by_person(detections: KeypointDetections) -> tuple[Floats, Floats]:
     """Return keypoints (frames, cameras, persons, 17, 2) and their confidence, by person.
@@ -151,14 +158,9 @@ def keypoints_by_person(detections: KeypointDetections) -> tuple[Floats, Floats]
 def select_observations(
     clip: Clip, frames: Integers, people: Flags, cameras: Camera, min_views: int
 ) -> Observations:
-    """Return the keypoints of joints with enough inlier cameras.
+    """Return the keypoints of joints with enough inlier cameras, in some frames (k,) of a clip.
 
-    Args:
-        clip: the clip.
-        frames: (k,) indices of its frames.
-        people: (persons,) or (k, persons) bool, persons to include.
-        cameras: (cameras,) batch that predicts the size of people in the image.
-        min_views: minimum inlier cameras of a joint.
+    People are (persons,) or (k, persons); the cameras predict their size in the image.
     """
     image, confidence = keypoints_by_person(clip.detections[frames])
     joints = clip.joints[frames]
@@ -185,14 +187,10 @@ def select_observations(
 
 
 def learn_confidence(clip: Clip, frames: Integers) -> Clip:
-    """Return the clip with the noise of its detector in its confidences.
+    """Return the clip with the noise of its detector in some frames (k,) in its confidences.
 
     The variance of a keypoint is then the stated one over its confidence, and triangulation treats
     cameras as exact, because adjustment must see their errors.
-
-    Args:
-        clip: the clip.
-        frames: (k,) indices of frames to learn the noise from.
     """
     settings, detections = clip.triangulation, clip.detections
     if settings.learn_noise and len(frames):
@@ -247,12 +245,6 @@ def project_joints(
     return predicted.reshape((*shape, 2)).swapaxes(0, 1), noise
 
 
-_CELL: Final = 8.0
-"""Side of a pitch cell [m]: a quarter of the width that a static camera sees."""
-_SATURATION: Final = 17.0
-"""Keypoints of one cell in one camera after which further ones count half [1]: one person."""
-
-
 def propose_frames(
     clip: Clip,
     count: int,
@@ -260,7 +252,7 @@ def propose_frames(
     min_views: int,
     taken: Integers | None = None,
 ) -> Integers:
-    """Return indices of the most informative frames for all cameras, ascending.
+    """Return indices of the most informative frames for all cameras, ascending (B1).
 
     Each frame adds keypoints of joints with enough views to cells of the pitch, per camera; further
     keypoints of a cell have diminishing value (the sum of logarithms). A greedy search takes the
@@ -272,9 +264,6 @@ def propose_frames(
         gap: minimum time between two of them [s].
         min_views: minimum inlier cameras of a joint.
         taken: (k,) indices to exclude.
-
-    Note:
-        B1.
     """
     offered = _count_keypoints(clip, min_views)
     left: Flags = np.asarray(offered.any(axis=1))
@@ -283,7 +272,7 @@ def propose_frames(
     chosen: list[int] = []
     while len(chosen) < count and left.any():
         rest = np.flatnonzero(left)
-        gain = np.log1p(offered[rest] / (_SATURATION + collected)).sum(axis=1)
+        gain = np.log1p(offered[rest] / (17.0 + collected)).sum(axis=1)
         best = int(rest[np.argmax(gain)])
         chosen.append(best)
         collected += offered[best]
@@ -299,7 +288,7 @@ def _count_keypoints(clip: Clip, min_views: int) -> Floats:
     number = good.sum(axis=-1)
     place = np.where(good[..., None], clip.joints, 0.0)[..., :2].sum(axis=-2)
     place /= np.maximum(number, 1)[..., None]
-    cell = np.floor(place / _CELL).astype(np.int64)
+    cell = np.floor(place / 8.0).astype(np.int64)
     _, cell_of = np.unique(cell.reshape(-1, 2), axis=0, return_inverse=True)
     cell_of = cell_of.reshape(number.shape)
     frames, cameras, _ = clip.detections.detection_index.shape

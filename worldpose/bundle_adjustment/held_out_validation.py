@@ -13,17 +13,13 @@ from worldpose.bundle_adjustment.clip import Clip, keypoints_by_person, project_
 from worldpose.bundle_adjustment.problems import MEDIAN_SQUARED, camera_knowledge, known_covariance
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution, solve
-from worldpose.bundle_adjustment.uncertainty import Similarity, align_points
+from worldpose.bundle_adjustment.uncertainty import align_points
 from worldpose.compiled import map_in_threads
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.static_calibration.parameters import SIZE
 from worldpose.triangulation.passes import triangulate_joints
 from worldpose.triangulation.person_offsets import StatedErrors, stated_errors
-
-_INTERVALS: Final = 4
-"""Intervals of the time; the errors of a held-out person in one of them count as one
-observation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +46,10 @@ def held_out_errors(
     people: Flags,
     robust_scale: float,
 ) -> HeldOutErrors:
-    """Return the errors of keypoints against joints from the other cameras.
+    """Return the errors of held-out people's keypoints against joints from the other cameras.
 
-    Args:
-        clip: keypoints and their persons.
-        cameras: (cameras,) batch to validate.
-        frames: (k,) indices of frames.
-        people: (k, persons) bool, held-out people.
-        robust_scale: robust scale of Cauchy's loss [standard deviations].
+    The people (k, persons) are those held out in each of the frames (k,); the loss is Cauchy's at a
+    scale [standard deviations].
     """
     detections = clip.detections[frames]
     index = np.where(people[:, None], detections.detection_index, -1).astype(np.int16)
@@ -84,21 +76,10 @@ def held_out_errors(
     return HeldOutErrors(loss, error, joints)
 
 
-def triangulate_without(clip: Clip, cameras: Camera, camera: int, frames: Integers) -> Floats:
-    """Return joints (k, persons, 17, 3) [m], world, triangulated without one camera.
-
-    Args:
-        clip: keypoints and their persons.
-        cameras: (cameras,) batch.
-        camera: the camera to leave out.
-        frames: (k,) indices of frames.
-    """
-    return _triangulate(clip, cameras, camera, clip.detections[frames])
-
-
 def _triangulate(
     clip: Clip, cameras: Camera, camera: int | None, detections: KeypointDetections
 ) -> Floats:
+    """Return joints (k, persons, 17, 3) [m], world, triangulated without one camera, if any."""
     others = detections.detection_index.copy()
     if camera is not None:
         others[:, camera] = -1
@@ -148,11 +129,6 @@ def judge_cameras(verdict: Verdict, alone: Flags, min_judges: int) -> tuple[Flag
     Well calibrated cameras move by hundredths of a pixel, and their loss falls or rises by chance.
     A camera that is judged alone is confirmed only beyond that; within it, it agrees with the
     others as it is. Other cameras are confirmed unless their loss rises, and never found to agree.
-
-    Args:
-        verdict: held-out errors before and after the change of all cameras.
-        alone: (cameras,) bool, cameras that need no evidence of all together.
-        min_judges: minimum held-out keypoints of a camera [1].
     """
     enough = verdict.judges >= min_judges
     with np.errstate(invalid="ignore"):
@@ -162,17 +138,13 @@ def judge_cameras(verdict: Verdict, alone: Flags, min_judges: int) -> tuple[Flag
 
 
 def _significance(fall: Floats) -> float:
-    """Return the mean decrease of the loss over its standard error [1]; 0 if unknown.
-
-    Args:
-        fall: (frames, ..., persons, 17) decrease [1]; NaN without data. A person in a quarter of
-            the time is one observation, since detector errors last.
-    """
+    """Return the mean decrease of the loss over its standard error [1]; 0 if unknown."""
+    intervals = 4  # errors of a person in one interval count as one observation
     told = np.isfinite(fall)
-    part = np.arange(len(fall)) * _INTERVALS // max(len(fall), 1)
+    part = np.arange(len(fall)) * intervals // max(len(fall), 1)
     groups = []
     for person in range(fall.shape[-2]):
-        for each in range(_INTERVALS):
+        for each in range(intervals):
             inside = fall[part == each, ..., person, :][told[part == each, ..., person, :]]
             if len(inside):
                 groups.append(float(inside.mean()))
@@ -190,61 +162,27 @@ class Evidence:
         gain: relative decrease of the loss [1]; negative if it rises.
         significance: decrease of the loss over its standard error [1].
         shift: common shift of people [m].
-        turn: common rotation of people [rad].
-        scale: common growth of people [1].
     """
 
     gain: float
     significance: float
     shift: float
-    turn: float
-    scale: float
 
 
 def pool_evidence(before: HeldOutErrors, after: HeldOutErrors, cameras: Flags) -> Evidence:
-    """Return the result of all held-out people together.
-
-    Args:
-        before: errors with the initial cameras.
-        after: errors with changed cameras.
-        cameras: (cameras,) bool, cameras whose keypoints count.
-    """
+    """Return the result of all held-out people together, in the images of some cameras."""
     fall = (before.loss - after.loss)[:, cameras]
     told = np.isfinite(fall)
     gain = 0.0
     if told.any():
         gain = float(fall[told].sum() / max(before.loss[:, cameras][told].sum(), 1e-12))
-    moved = common_motion(before.joints, after.joints)
-    both = np.isfinite(before.joints[..., 0]) & np.isfinite(after.joints[..., 0])
+    both = np.isfinite(before.joints).all(axis=-1) & np.isfinite(after.joints).all(axis=-1)
+    moved = align_points(before.joints[both], after.joints[both])
     shift = 0.0
     if both.any():
         center = before.joints[both].mean(axis=0)
         shift = float(np.linalg.norm(moved.move_points(center) - center))
-    turn = float(np.arccos(np.clip((np.trace(moved.rotation) - 1.0) / 2.0, -1.0, 1.0)))
-    return Evidence(gain, _significance(fall), shift, turn, moved.scale - 1.0)
-
-
-def common_motion(before: Floats, after: Floats) -> Similarity:
-    """Return the common similarity transform of joints (..., 3)."""
-    both = np.isfinite(before).all(axis=-1) & np.isfinite(after).all(axis=-1)
-    return align_points(before[both], after[both])
-
-
-_SIZE: Final = len(PARAMETERS)
-_LIMIT: Final = 4.0
-"""Median squared error, over the stated variance of noise and calibration, from which on a camera
-is estimated again from the other cameras' people [1]: twice the stated error, as for one correct
-camera in thirty."""
-_MIN_STEP: Final = 9.0
-"""Squared step to that estimate in stated standard deviations, per parameter, from which on the
-calibration is distrusted [1]: three of them in every direction."""
-_VARIANCE_FACTOR: Final = 16.0
-"""Factor on the variances of a camera during this estimate [1]: people outweigh the prior where
-they carry information; elsewhere the camera stays."""
-_SCALES: Final = (30.0, 3.0)
-"""Scales of the loss, one after the other [standard deviations]: the first allows a far step."""
-_MIN_KEYPOINTS: Final = 20
-"""Minimum keypoints for a contradiction [1]: one person, hardly more than once."""
+    return Evidence(gain, _significance(fall), shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +202,7 @@ class Contradictions:
     @classmethod
     def none(cls, count: int) -> Contradictions:
         """Return the result for cameras without contradictions."""
-        return cls(np.ones(count), np.zeros((count, _SIZE)), np.zeros(count, dtype=np.bool_))
+        return cls(np.ones(count), np.zeros((count, SIZE)), np.zeros(count, dtype=np.bool_))
 
 
 def find_contradictions(
@@ -275,13 +213,12 @@ def find_contradictions(
 ) -> Contradictions:
     """Return the cameras that disagree with all others far beyond their stated errors.
 
-    Args:
-        clip: cameras and people.
-        frames: (k,) indices of frames.
-        held: errors of people in every camera against joints from the other cameras.
-        settings: the prior of given cameras.
+    The errors are those of people in some frames (k,) against joints from the other cameras.
     """
-    image, weight = keypoints_by_person(clip.detections[frames])
+    fewest = 20  # one person, hardly more than once
+    limit = 4.0  # twice the stated error, as for one correct camera in thirty
+    detections = clip.detections[frames]
+    image, weight = keypoints_by_person(detections)
     joints = clip.joints[frames]
     _, noise = project_joints(clip.cameras, joints, weight, clip.triangulation)
     known = known_covariance(clip, settings)
@@ -294,20 +231,20 @@ def find_contradictions(
     information, free = camera_knowledge(clip, settings)
     for c in range(len(known)):
         told = np.isfinite(squared[:, c])
-        if told.sum() < _MIN_KEYPOINTS or np.median(squared[:, c][told]) < _LIMIT * MEDIAN_SQUARED:
+        if told.sum() < fewest or np.median(squared[:, c][told]) < limit * MEDIAN_SQUARED:
             continue
-        points = triangulate_without(clip, clip.cameras, c, frames)
+        points = _triangulate(clip, clip.cameras, c, detections)
         used = np.isfinite(points[..., 0]) & (weight[:, c] > 0.0)
         used &= np.isfinite(place[:, c])
         used &= np.isfinite(clip.cameras[c].project(points)).all(axis=-1)
         number = int(used.sum())
-        if number < _MIN_KEYPOINTS:
+        if number < fewest:
             found.other_people[c] = True
             continue
         problem = Problem(
             cameras=clip.cameras[c : c + 1],
             free=free[c : c + 1],
-            camera_information=information[c : c + 1] / _VARIANCE_FACTOR,
+            camera_information=information[c : c + 1] / 16.0,
             points=points[used],
             point_information=np.full(number, np.inf),
             point_of=np.arange(number),
@@ -322,12 +259,13 @@ def find_contradictions(
             continue
         off = placed.cameras[0].project(problem.points) - problem.image
         left = float(np.median((off**2).sum(axis=1) * problem.weight))
-        if left > _LIMIT * MEDIAN_SQUARED:
+        if left > limit * MEDIAN_SQUARED:
             found.other_people[c] = True
             continue
         step = placed.offset[0]
         squared_step = float(step @ information[c] @ step) / int(free[c].sum())
-        if squared_step > _MIN_STEP:
+        # Three standard deviations in every direction.
+        if squared_step > 9.0:
             found.offset[c], found.variance_factor[c] = step, squared_step
     return found
 
@@ -335,7 +273,8 @@ def find_contradictions(
 def _place_camera(problem: Problem, settings: BundleAdjustmentSettings) -> Solution | None:
     """Return the camera fitted to these points; None if it cannot image all of them."""
     offset = None
-    for scale in _SCALES:
+    # The first scale allows a far step.
+    for scale in (30.0, 3.0):
         loss = np.full(len(problem.points), scale)
         try:
             placed = solve(replace(problem, scale=loss), settings.solver, offset, covariance=False)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from data_contracts.arrays import Flags, Floats, Integers
+from data_contracts.arrays import Floats, Integers
 from data_contracts.cameras import LensCalibration
 from data_contracts.keypoints import KeypointDetections
 from worldpose.bundle_adjustment.clip import Observations
@@ -26,41 +26,18 @@ from worldpose.bundle_adjustment.people_views import (
     find_walkers,
     refusal,
 )
-from worldpose.bundle_adjustment.problems import KeypointNoise, estimate_noise
+from worldpose.bundle_adjustment.problems import (
+    KeypointNoise,
+    estimate_noise,
+    keypoint_information,
+    residuals,
+)
 from worldpose.bundle_adjustment.solver import Solution
 from worldpose.bundle_adjustment.uncertainty import Similarity, relative_covariance
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.static_calibration.parameters import project_with_jacobian
+from worldpose.static_calibration.boards import image_coverage
 from worldpose.triangulation.noise_model import PERSONAL, PROPORTIONS, STATURE
-
-UNKNOWN_FOCAL: Final = 0.1
-"""Relative deviation of a focal length from which several are tried [1]."""
-FOCAL_FACTORS: Final = (1.0, 0.7, 1.4, 2.0, 0.5)
-"""Factors on such a focal length [1]."""
-PASSES: Final = 3
-"""Alternations of adjustment and estimation of noise [1]."""
-MIN_SHARE: Final = 0.8
-"""Least keypoints that a result explains, by the most of all results [1]."""
-MAX_POSITION_STD: Final = 0.1
-"""Largest standard deviation of a camera's position, by its distance from the people [1]."""
-STEP_S: Final = 0.2
-"""Time over which the speed of an ankle is measured [s]."""
-STILL_M_S: Final = 0.4
-"""Speed of an ankle below which its foot stands [m/s]."""
-ANKLE: Final = 0.045
-"""Height of a standing foot's ankle above the ground, by the stature [1]."""
-FOOT_STD_M: Final = 0.03
-"""Its standard deviation [m]; a foot that rolls off lifts its ankle."""
-LEAN_STD: Final = 0.07
-"""Standard deviation of the mean lean of people who walk, about each axis [rad]."""
-MAX_SPREAD: Final = 0.06
-"""Largest deviation of a proportion that tells the stature [1]: detectors place hips and shoulders
-at various breadths."""
-OFFSET_M: Final = 0.024
-"""Distance of a detector's joint from the joint's centre, per axis [m]."""
-HELD_OUT: Final = 2
-"""Intervals of time, each of which is held out once [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +111,7 @@ def locate_cameras(
     Note:
         Five-point algorithm: Nister, IEEE PAMI 26(6), 2004.
     """
+    max_std = 0.1  # by the distance from the people
     names = [lens.id for lens in lenses]
     if len(names) < 2 or detections.confidence.shape[1:2] != (len(names),):
         raise refusal(names, "two cameras or more, each with 2D poses", f"{len(names)} with a lens")
@@ -141,27 +119,21 @@ def locate_cameras(
     start = _search(lenses, tracks)
     frames = start.observed.frame_of
     adjusted, observed, noise = _adjust_with_noise(start, lenses)
-    relative = _relative_std(adjusted, observed, noise)
+    relative = _relative_std(adjusted, observed)
     distance = np.linalg.norm(adjusted.cameras.center - np.median(observed.points, axis=0), axis=1)
     for name, std, far in zip(names, relative[:, 0], distance, strict=True):
-        if not std <= MAX_POSITION_STD * far:
+        if not std <= max_std * far:
             raise refusal(
                 [name],
-                f"people who determine its position within {100 * MAX_POSITION_STD:.0f} % of "
-                "their distance",
+                f"people who determine its position within {100 * max_std:.0f} % of their distance",
                 f"{100 * std / far:.0f} %",
             )
     people = _People.of(observed, detections.frame if len(detections.frame) else None, fps)
     scale, scale_std = people.scale(adjusted.cameras, known)
     world = people.orient(scale)
-    share = np.array([1.0 / 64.0] * len(names))
-    size = adjusted.cameras.image_size
-    for c in range(len(names)):
-        fields = np.clip((8 * observed.image[observed.camera_of == c] / size[c]).astype(int), 0, 7)
-        share[c] *= len(np.unique(fields, axis=0))
-    std = relative.copy()
-    std[:, 0] *= scale
-    off = _distances(adjusted.cameras, observed)
+    shown = [observed.image[observed.camera_of == c] for c in range(len(names))]
+    std = relative * [scale, 1.0, 1.0]
+    off = np.linalg.norm(residuals(adjusted.cameras, observed.points, observed), axis=1)
     return CamerasFromPeople(
         cameras=world.similarity.move_cameras(adjusted.cameras),
         std=std,
@@ -174,21 +146,17 @@ def locate_cameras(
         keypoints=np.bincount(observed.camera_of, minlength=len(names)),
         residual_px=_by_camera(off, observed.camera_of, len(names)),
         held_out_px=_held_out(adjusted, observed, lenses, noise, frames),
-        coverage=share,
+        coverage=np.array(list(map(image_coverage, shown, adjusted.cameras.image_size))),
         noise=noise,
     )
 
 
 def _search(lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> Start:
-    """Return the first poses that explain most keypoints best.
-
-    Raises:
-        InputError: none does.
-    """
-    unknown = [one.focal_std_px > UNKNOWN_FOCAL * one.focal_px for one in lenses]
+    """Return the first poses that explain most keypoints best."""
+    unknown = [one.focal_std_px > 0.1 * one.focal_px for one in lenses]
     found: list[tuple[float, int, Start]] = []
     errors: list[InputError] = []
-    for factor in FOCAL_FACTORS if any(unknown) else (1.0,):
+    for factor in (1.0, 0.7, 1.4, 2.0, 0.5) if any(unknown) else (1.0,):
         tried = [
             one.model_copy(update={"focal_px": factor * one.focal_px}) if free else one
             for one, free in zip(lenses, unknown, strict=True)
@@ -206,7 +174,7 @@ def _search(lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> St
     if not found:
         raise errors[0]
     most = max(count for _, count, _ in found)
-    enough = [one for one in found if one[1] >= MIN_SHARE * most]
+    enough = [one for one in found if one[1] >= 0.8 * most]
     return min(enough, key=lambda one: one[0])[2]
 
 
@@ -215,7 +183,7 @@ def _adjust_with_noise(
 ) -> tuple[Solution, Observations, KeypointNoise]:
     """Return the adjustment with the noise that the keypoints have."""
     cameras, observed, noise = start.cameras, start.observed, KeypointNoise()
-    for _ in range(PASSES):
+    for _ in range(3):
         adjusted = adjust(cameras, observed, lenses, noise)
         observed = observed._replace(points=adjusted.points)
         noise = estimate_noise(adjusted.cameras, adjusted.points, observed, LOSS_SCALE)
@@ -227,34 +195,17 @@ def _adjust_with_noise(
     return adjusted, observed, noise
 
 
-def _relative_std(adjusted: Solution, observed: Observations, noise: KeypointNoise) -> Floats:
+def _relative_std(adjusted: Solution, observed: Observations) -> Floats:
     """Return the deviations (cameras, 3) of position, orientation and focal length.
 
     Relative to all cameras and people together: no keypoint tells their common place and size.
     """
-    count = len(adjusted.cameras.focal)
-    information = np.zeros((count, 12, 12))
-    for c in range(count):
-        rows = observed.camera_of == c
-        points = adjusted.points[observed.point_of[rows]]
-        _, by_step = project_with_jacobian(adjusted.cameras[c], points)
-        by_step = by_step / observed.noise[rows][:, None, None]
-        information[c] = np.einsum("nai,naj->ij", by_step, by_step)
+    information = keypoint_information(adjusted.cameras, observed._replace(points=adjusted.points))
     origin = np.median(adjusted.points, axis=0)
     own, _ = relative_covariance(adjusted.camera_covariance, adjusted.cameras, information, origin)
     variance = np.diagonal(own, axis1=1, axis2=2)
     parts = [variance[:, 3:6].sum(axis=1), variance[:, :3].sum(axis=1), variance[:, 6]]
     return np.asarray(np.sqrt(np.stack(parts, axis=1)))
-
-
-def _distances(cameras: Camera, observed: Observations) -> Floats:
-    """Return the distance of each keypoint from its joint (n,) [px]."""
-    off = np.empty(len(observed.image))
-    for c in range(len(cameras.focal)):
-        rows = observed.camera_of == c
-        shown = cameras[c].project(observed.points[observed.point_of[rows]])
-        off[rows] = np.linalg.norm(shown - observed.image[rows], axis=1)
-    return off
 
 
 def _by_camera(off: Floats, camera_of: Integers, count: int) -> Floats:
@@ -274,31 +225,22 @@ def _held_out(
 
     Joints of the held-out frames come from all cameras, which are not adjusted to them.
     """
+    intervals = 2  # of time, each held out once
     count = len(lenses)
-    edges = np.quantile(np.unique(frames), np.linspace(0.0, 1.0, HELD_OUT + 1)[1:-1])
+    edges = np.quantile(np.unique(frames), np.linspace(0.0, 1.0, intervals + 1)[1:-1])
     group = np.searchsorted(edges, frames, side="right")
     off, camera_of = [], []
     observed = observed._replace(points=adjusted.points)
-    for held in range(HELD_OUT):
+    for held in range(intervals):
         try:
-            other = _part(observed, group != held)
-            judged = _part(observed, group == held)
+            other, judged = observed.select(group != held), observed.select(group == held)
             cameras = adjust(adjusted.cameras, other, lenses, noise).cameras
             joints = adjust(cameras, judged, lenses, noise, fixed=True)
         except InputError:
             return np.full(count, np.nan)
-        off.append(_distances(joints.cameras, judged._replace(points=joints.points)))
+        off.append(np.linalg.norm(residuals(joints.cameras, joints.points, judged), axis=1))
         camera_of.append(judged.camera_of)
     return _by_camera(np.concatenate(off), np.concatenate(camera_of), count)
-
-
-def _part(observed: Observations, kept: Flags) -> Observations:
-    """Return the observations of some frames; a joint's are kept or left out together."""
-    used, number = np.unique(observed.point_of[kept], return_inverse=True)
-    rows = {
-        name: getattr(observed, name)[kept] for name in Observations._fields if name != "points"
-    }
-    return Observations(points=observed.points[used], **(rows | {"point_of": number}))
 
 
 def _mean_direction(vectors: Floats) -> Floats:
@@ -341,7 +283,8 @@ class _People(NamedTuple):
     def _stature(self, person: int) -> float:
         found, weight = [], []
         for each in PROPORTIONS:
-            if each.spread > MAX_SPREAD:
+            # Detectors place hips and shoulders at various breadths.
+            if each.spread > 0.06:
                 continue
             lengths = []
             for ends in each.ends:
@@ -352,7 +295,7 @@ class _People(NamedTuple):
             if len(known):
                 found.append(float(np.median(known)) / each.share)
                 # A detector's label is not the joint's centre.
-                offset = (OFFSET_M / (each.share * STATURE[0])) ** 2 * each.offsets
+                offset = (0.024 / (each.share * STATURE[0])) ** 2 * each.offsets
                 weight.append(1.0 / (each.spread**2 + PERSONAL**2 + offset))
         return float(np.average(found, weights=weight))
 
@@ -376,13 +319,15 @@ class _People(NamedTuple):
         lean = (trunk + legs) / np.linalg.norm(trunk + legs)
         # A person bent at the hips is not upright: trunk and legs then disagree.
         bent = float(np.arccos(np.clip(trunk @ legs, -1.0, 1.0)))
-        lean_std = float(np.hypot(LEAN_STD, 0.5 * bent))
+        # Mean lean of people who walk [rad].
+        lean_std = float(np.hypot(0.07, 0.5 * bent))
         up = lean
         feet = self._standing_feet(ankles)
         for _ in range(5):
             spread = feet - (feet.mean(axis=0) if len(feet) else 0.0)
             off = spread @ up
-            weight = 1.0 / (FOOT_STD_M**2 + (off / 3.0) ** 2)
+            # 3 cm: a foot that rolls off lifts its ankle.
+            weight = 1.0 / (0.03**2 + (off / 3.0) ** 2)
             level = np.eye(3) - np.outer(up, up)
             information = level @ (weight * spread.T) @ spread @ level + level / lean_std**2
             slope = level @ (spread.T @ (weight * off) + (up - lean) / lean_std**2)
@@ -393,7 +338,8 @@ class _People(NamedTuple):
         middle = np.median(places, axis=0)
         lowest = ankles.reshape(-1, 3) @ up
         ground = np.median(feet @ up) if len(feet) else np.nanquantile(lowest, 0.05)
-        height = ANKLE * scale * self.stature()
+        # Height of a standing foot's ankle, by the stature.
+        height = 0.045 * scale * self.stature()
         origin = middle + (ground - height - middle @ up) * up
         x = np.linalg.svd((places - middle) @ (np.eye(3) - np.outer(up, up)))[2][0]
         x = x - (x @ up) * up
@@ -406,18 +352,16 @@ class _People(NamedTuple):
         )
 
     def _standing_feet(self, ankles: Floats) -> Floats:
-        """Return the mean ankle (n, 3) [m] of each time that a foot stands.
-
-        Args:
-            ankles: (frames, persons, 2, 3) [m].
-        """
+        """Return the mean ankle (n, 3) [m] of each time that a foot stands."""
         time = self.frames / self.fps
-        half = max(1, round(0.5 * STEP_S / float(np.median(np.diff(time)))))
+        # The speed of an ankle is measured over 0.2 s.
+        half = max(1, round(0.5 * 0.2 / float(np.median(np.diff(time)))))
         if len(time) <= 2 * half:
             return np.empty((0, 3))
         gap = (time[2 * half :] - time[: -2 * half])[:, None, None]
         moved = np.linalg.norm(ankles[2 * half :] - ankles[: -2 * half], axis=-1)
-        still = np.nan_to_num(moved / gap, nan=np.inf) < STILL_M_S
+        # A foot with a slower ankle stands.
+        still = np.nan_to_num(moved / gap, nan=np.inf) < 0.4
         found = []
         for person, side in np.ndindex(still.shape[1:]):
             rows = np.flatnonzero(still[:, person, side]) + half

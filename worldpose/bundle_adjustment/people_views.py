@@ -29,65 +29,28 @@ from worldpose.triangulation.noise_model import STATURE
 
 JOINTS: Final = np.arange(5, 17)
 """Joints of COCO-17 that are used: those of the face are labelled differently by every detector."""
-MIN_CONFIDENCE: Final = 0.3
-"""Least confidence of a keypoint that is used [1]."""
-MAX_FRAMES: Final = 120
-"""Most frames that are used, evenly spread; more add time and little information [frame]."""
 MIN_FRAMES: Final = 20
 """Least frames in which two cameras show a person [frame]."""
-BUFFER_S: Final = 0.5
-"""Longest gap in a person's track in one camera [s]."""
-MAX_TRACKS: Final = 5
-"""Most people of a camera who are compared; the longest seen [1]."""
-MIN_MOTION: Final = 0.25
-"""Least distance that a person walks in a camera's images, in heights of the person there [1]."""
-START_NOISE_M: Final = 0.05
-"""Distance of a joint from where another camera sees it up to which both agree, at the start [m]:
-two standard deviations of a detector."""
 MIN_AGREEMENT: Final = 0.5
 """Least share of joints that agree for two views to be of one person [1]."""
 SAMPLE: Final = 400
 """Most joints of a person in the random search for a pose [1]."""
 DRAWS: Final = 300
 """Draws of this search [1]; half of the joints being right, 150 of 5 have none wrong in 99 %."""
-STARTS: Final = 3
-"""Pairs of cameras from which the search starts; the best result counts [1]."""
-NOISE: Final = (1.5, 0.02)
-"""Assumed standard deviation of a keypoint per axis: [px], and [m] on the person."""
 GROSS: Final = 20.0
 """Standard deviations from which a keypoint is another person's [1]."""
 LOSS_SCALE: Final = 3.0
 """Standard deviations beyond which a keypoint counts less (Cauchy's loss) [1]."""
-SOLVER: Final = SolverSettings(max_iterations=100, min_cost_change=1e-6)
-FIXED: Final = 1e12
-"""Information that fixes a number: a step of a micrometre costs one [1/m^2]."""
 
 
 def refusal(names: Sequence[str], expected: str, found: str) -> InputError:
-    """Return the error of people who do not determine cameras.
-
-    Args:
-        names: the cameras.
-        expected: what would determine them.
-        found: what is there.
-    """
+    """Return the error of people who do not determine cameras."""
     return InputError(
         f"cameras from people: {', '.join(names) or 'none'}",
         expected=expected,
         found=found,
         todo="Film one person, seen as a whole, who walks through the whole scene for half a "
         "minute in front of all cameras at once, or click markings.",
-    )
-
-
-def _camera(lens: LensCalibration) -> Camera:
-    """Return a camera with this lens at the origin."""
-    return Camera(
-        focal=np.array([lens.focal_px, lens.focal_px]),
-        principal_point=np.array(lens.principal_point_px),
-        distortion=np.array(lens.distortion),
-        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
-        image_size=np.array(lens.image_size, dtype=np.int64),
     )
 
 
@@ -99,22 +62,23 @@ def find_walkers(
     Raises:
         InputError: a camera shows no person for long enough, or no person walks.
     """
+    min_motion = 0.25
     every = []
     for c, name in enumerate(names):
         points = np.where(
-            (detections.confidence[:, c] > MIN_CONFIDENCE)[..., None],
+            (detections.confidence[:, c] > 0.3)[..., None],
             detections.keypoints[:, c],
             np.nan,
         ).astype(np.float64)[:, :, JOINTS]
         tracks = _track(points, fps)
         if not tracks:
             raise refusal([name], f"a person for {MIN_FRAMES} frames or more", "none")
-        every.append(tracks[:MAX_TRACKS])
+        every.append(tracks[:5])
     farthest = max(_walking_distance(track) for tracks in every for track in tracks)
-    if farthest < MIN_MOTION:
+    if farthest < min_motion:
         raise refusal(
             names,
-            f"a person who walks for {MIN_MOTION:g} heights of the person in an image",
+            f"a person who walks for {min_motion:g} heights of the person in an image",
             f"people who stand still: they move by {farthest:.2f} heights at most",
         )
     return every
@@ -122,7 +86,7 @@ def find_walkers(
 
 def _track(points: Floats, fps: float) -> list[Floats]:
     """Return people (frames, 12, 2) of points (frames, detections, 12, 2), the longest first."""
-    tracker = BoxTracker(0.0, round(BUFFER_S * fps))
+    tracker = BoxTracker(0.0, round(0.5 * fps))
     tracks: dict[int, Floats] = {}
     for frame, people in enumerate(points):
         there = np.flatnonzero(np.isfinite(people[..., 0]).sum(axis=1) >= len(JOINTS) // 2)
@@ -190,7 +154,7 @@ class Views:
 
     def __init__(self, lenses: Sequence[LensCalibration], tracks: list[list[Floats]]) -> None:
         self.records, self.names = lenses, [lens.id for lens in lenses]
-        self.lenses = Camera.stack([_camera(lens) for lens in lenses])
+        self.lenses = Camera.stack([Camera.from_lens(lens) for lens in lenses])
         frames = tracks[0][0].shape[0]
         some = sum(np.stack([_frames(one) for one in each]).any(axis=0) for each in tracks) >= 2
         rows = np.flatnonzero(some)
@@ -198,18 +162,17 @@ class Views:
             raise refusal(
                 self.names, f"people in two cameras at once for {MIN_FRAMES} frames", f"{len(rows)}"
             )
-        take = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_FRAMES)).round())
+        # More frames add time and little information.
+        take = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), 120)).round())
         self.rows = rows[take.astype(np.int64)]
         self.frames = frames
         self.pixels = [[one[self.rows] for one in each] for each in tracks]
         self.planes = [
             [self.lenses[c].normalize(one) for one in each] for c, each in enumerate(self.pixels)
         ]
+        # Two standard deviations of a detector, 5 cm.
         self.limits = [
-            [
-                START_NOISE_M / STATURE[0] * _height(one) / float(self.lenses.focal[c, 0])
-                for one in each
-            ]
+            [0.05 / STATURE[0] * _height(one) / float(self.lenses.focal[c, 0]) for one in each]
             for c, each in enumerate(self.pixels)
         ]
 
@@ -229,7 +192,7 @@ class Views:
             )
         errors: list[InputError] = []
         found = []
-        for pair in good[:STARTS]:
+        for pair in good[:3]:
             try:
                 found.append(self._grow(pair))
             except InputError as error:
@@ -306,12 +269,7 @@ class Views:
         return [(int(i), int(j)) for i, j in chosen if share[i, j] >= MIN_AGREEMENT]
 
     def _grow(self, pair: _Pair) -> Start:
-        """Return all cameras, added to a pair one by one, the one with the most joints first.
-
-        Raises:
-            InputError: a camera shares no person with the others, or no keypoint agrees with the
-                cameras.
-        """
+        """Return all cameras, added to a pair one by one, the one with the most joints first."""
         a, b = pair.cameras
         poses = {a: Rigid(np.eye(3), np.zeros(3)), b: pair.pose}
         shown = [{a: i, b: j} for i, j in pair.people]
@@ -434,14 +392,8 @@ class Views:
         shown: list[dict[int, int]],
         poses: dict[int, Rigid],
     ) -> Observations:
-        """Return the keypoints of all joints that two cameras show, without gross errors.
-
-        Args:
-            order: numbers of the cameras; an observation's camera is its place here.
-            cameras: these cameras.
-            shown: each person's track by camera.
-            poses: the cameras' poses.
-        """
+        """Return the keypoints of all joints that two cameras show, without gross errors."""
+        noise_of = (1.5, 0.02)
         joints = np.stack([self._joints(person, poses) for person in shown], axis=1)
         image = np.full((*joints.shape[:-1], len(order), 2), np.nan)
         noise = np.full(image.shape[:-1], np.nan)
@@ -451,7 +403,7 @@ class Views:
                 if camera not in person:
                     continue
                 track = self.pixels[camera][person[camera]]
-                noise[:, p, :, k] = np.hypot(NOISE[0], NOISE[1] * _height(track) / STATURE[0])
+                noise[:, p, :, k] = np.hypot(noise_of[0], noise_of[1] * _height(track) / STATURE[0])
                 off = np.linalg.norm(places[:, p] - track, axis=-1)
                 near = off < GROSS * noise[:, p, :, k]
                 image[:, p, :, k] = np.where(near[..., None], track, np.nan)
@@ -459,16 +411,10 @@ class Views:
         seen &= (seen.sum(axis=-1) >= 2)[..., None]
         frame, person_of, joint, camera_of = np.nonzero(seen)
         used = seen.any(axis=-1)
-        number = np.cumsum(used).reshape(used.shape) - 1
+        point = (np.cumsum(used).reshape(used.shape) - 1)[frame, person_of, joint]
+        frame_of = self.rows[frame]
         return Observations(
-            points=joints[used],
-            point_of=number[frame, person_of, joint],
-            camera_of=camera_of,
-            frame_of=self.rows[frame],
-            person_of=person_of,
-            joint_of=joint,
-            image=image[seen],
-            noise=noise[seen],
+            joints[used], point, camera_of, frame_of, person_of, joint, image[seen], noise[seen]
         )
 
 
@@ -481,22 +427,15 @@ def adjust(
     fixed: bool = False,
     covariance: bool = False,
 ) -> Solution:
-    """Return cameras and joints adjusted to the keypoints.
+    """Return cameras and joints adjusted to the keypoints, or the joints alone.
 
     The first camera stays where it is, and the second one at its distance: no keypoint tells the
-    world frame.
-
-    Args:
-        cameras: (cameras,) batch at the start.
-        observed: keypoints.
-        lenses: prior of focal lengths and principal points.
-        noise: scale and correlation of the keypoints' errors.
-        fixed: adjust the joints alone.
-        covariance: compute the covariance of the cameras.
+    world frame. Lenses are the prior of focal lengths and principal points.
 
     Raises:
         InputError: the keypoints do not determine the cameras.
     """
+    fixed_information = 1e12  # a step of a micrometre costs one [1/m^2]
     count = len(lenses)
     free = np.zeros((count, 12), dtype=np.bool_)
     information = np.zeros((count, 12, 12))
@@ -513,9 +452,9 @@ def adjust(
     free[0, :6] = False
     away = cameras[1].cam_from_world.rotation @ (cameras.center[0] - cameras.center[1])
     away = away / np.linalg.norm(away)
-    information[1, 3:6, 3:6] += FIXED * np.outer(away, away)
+    information[1, 3:6, 3:6] += fixed_information * np.outer(away, away)
     if fixed:
-        information += FIXED * FIXED * np.eye(12)
+        information += fixed_information * fixed_information * np.eye(12)
     variance = (observed.noise * noise.scale) ** 2 * noise.correlation
     problem = Problem(
         cameras=cameras,
@@ -530,4 +469,6 @@ def adjust(
         scale=np.full(len(variance), LOSS_SCALE / np.sqrt(noise.correlation)),
         names=tuple(lens.id for lens in lenses),
     )
-    return solve(problem, SOLVER, covariance=covariance)
+    return solve(
+        problem, SolverSettings(max_iterations=100, min_cost_change=1e-6), covariance=covariance
+    )

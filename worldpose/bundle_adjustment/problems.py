@@ -12,22 +12,12 @@ from worldpose.bundle_adjustment.clip import Clip, Observations
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
 from worldpose.bundle_adjustment.solver import Problem, Solution
 from worldpose.geometry.cameras import Camera
-from worldpose.static_calibration.parameters import PARAMETERS
+from worldpose.static_calibration.parameters import SIZE, project_with_jacobian
 
 MEDIAN_SQUARED: Final = 2.0 * np.log(2.0)
 """Median squared length of a standard Gaussian in two dimensions [1]."""
-_SIZE: Final = len(PARAMETERS)
-_UNINFORMATIVE: Final = 100.0 * np.array(
-    [1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0]
-)
-"""Standard deviations of an uninformative prior [rad, m, 1, px, 1]; they only keep the system
-regular. A hundredth of them would already constrain the lens."""
 MARKINGS_SOLVER: Final = SolverSettings(max_iterations=500, min_cost_change=1e-6)
 """For ill-conditioned directions as long and flat as those of a lens determined by six clicks."""
-
-
-_MEDIAN_WEIGHT: Final = 10.0
-"""Weight of the median over all cameras, in directions [1]: as many as one camera has."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +46,8 @@ def players_problem(
 
     Clicks, painted lines and priors enter as the Gaussian posterior of calibration, people as free
     points under Cauchy's loss. The correlation divides an observation's weight, so that twenty
-    frames with the same detector error count as few.
-
-    Args:
-        clip: cameras with their covariance.
-        observed: keypoints.
-        noise: their scale and correlation.
-        fixed: (cameras,) bool, fixed cameras.
-        settings: robust scale, and the prior of given cameras.
-        variance_factor: (cameras,) factor on the variance that calibration states [1].
+    frames with the same detector error count as few. The variance that calibration states is
+    multiplied by a factor (cameras,) [1].
     """
     information, free = camera_knowledge(clip, settings)
     information = information / np.reshape(variance_factor, (-1, 1, 1))
@@ -92,31 +75,24 @@ def estimate_variance_factor(problem: Problem, adjusted: Solution) -> Floats:
     calibration allows, the calibration was overconfident. The squared step in stated standard
     deviations is divided by the number of these directions (MacKay 1992), shrunk towards the median
     of all cameras.
-
-    Args:
-        problem: the adjust problem, with the variances that the factor multiplies.
-        adjusted: its solution.
     """
+    weight = 10.0  # in directions: as many as one camera has
     count = len(problem.free)
     step = adjusted.offset
     squared = np.einsum("ci,cij,cj->c", step, problem.camera_information, step)
-    blocks = adjusted.camera_covariance.reshape(count, _SIZE, count, _SIZE)
+    blocks = adjusted.camera_covariance.reshape(count, SIZE, count, SIZE)
     own = blocks[np.arange(count), :, np.arange(count)]
     kept = np.einsum("cij,cji->c", problem.camera_information, own)
     told = np.maximum(problem.free.sum(axis=1) - kept, 0.0)
     # Use the median: a camera that shows other people must not free all the others.
     overall = float(np.median((squared + 1.0) / (told + 1.0)))
-    return np.asarray((squared + _MEDIAN_WEIGHT * overall) / (told + _MEDIAN_WEIGHT))
+    return np.asarray((squared + weight * overall) / (told + weight))
 
 
 def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSettings) -> Problem:
-    """Return the adjustment of cameras to clicks alone, all parameters free, without a prior.
-
-    Args:
-        clip: cameras and clicks.
-        fixed: (cameras,) bool, fixed cameras.
-        settings: noise of clicks.
-    """
+    """Return the adjustment of cameras to clicks alone, all parameters free, without a prior."""
+    # In rad, m, 1, px, 1; a hundredth of it would already constrain the lens.
+    spread = 100.0 * np.array([1.0] * 3 + [100.0] * 3 + [1.0, 300.0, 300.0, 3.0, 30.0, 300.0])
     clicked = [np.flatnonzero(clicks.inlier) for clicks in clip.clicks]
     points = [clicks.points_world[i] for clicks, i in zip(clip.clicks, clicked, strict=True)]
     image = [clicks.points_image[i] for clicks, i in zip(clip.clicks, clicked, strict=True)]
@@ -124,8 +100,8 @@ def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSetting
     has = np.array([len(i) > 0 for i in clicked])
     return Problem(
         cameras=clip.cameras,
-        free=np.repeat((has & ~fixed)[:, None], _SIZE, axis=1),
-        camera_information=np.tile(np.diag(_UNINFORMATIVE**-2.0), (len(has), 1, 1)),
+        free=np.repeat((has & ~fixed)[:, None], SIZE, axis=1),
+        camera_information=np.tile(np.diag(spread**-2.0), (len(has), 1, 1)),
         points=world,
         point_information=np.full(len(world), np.inf),
         point_of=np.arange(len(world)),
@@ -138,12 +114,7 @@ def markings_problem(clip: Clip, fixed: Flags, settings: BundleAdjustmentSetting
 
 
 def camera_knowledge(clip: Clip, settings: BundleAdjustmentSettings) -> tuple[Floats, Flags]:
-    """Return the prior information (cameras, 12, 12) on a step, and free parameters (cameras, 12).
-
-    Args:
-        clip: cameras with their covariance.
-        settings: the prior of given cameras.
-    """
+    """Return the prior information (cameras, 12, 12) on a step, and the free ones (cameras, 12)."""
     known = known_covariance(clip, settings)
     information = np.zeros_like(known)
     free: Flags = np.diagonal(known, axis1=1, axis2=2) > 0.0
@@ -158,18 +129,13 @@ def camera_knowledge(clip: Clip, settings: BundleAdjustmentSettings) -> tuple[Fl
 
 
 def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> Floats:
-    """Return the prior covariance (cameras, 12, 12) of a step by the camera's source.
-
-    Args:
-        clip: cameras; the prior of given ones scales with their distance to people.
-        settings: that prior, and factors on the stated deviations of calibration.
-    """
+    """Return the prior covariance (cameras, 12, 12) of a step by the camera's source."""
     count = len(clip.covariance)
     distance = clip.distance
     usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 1.0
     distance = np.where(np.isfinite(distance), distance, usual)
     given = settings.given
-    spread = np.zeros((count, _SIZE))
+    spread = np.zeros((count, SIZE))
     spread[:, :3] = given.rotation_rad
     spread[:, 3:6] = given.center * distance[:, None]
     spread[:, 6] = given.focal
@@ -177,42 +143,45 @@ def known_covariance(clip: Clip, settings: BundleAdjustmentSettings) -> Floats:
     factor = np.where(on_lines, settings.lines_uncertainty, settings.clicks_uncertainty)
     return np.where(
         clip.given[:, None, None],
-        spread[:, :, None] ** 2 * np.eye(_SIZE),
+        spread[:, :, None] ** 2 * np.eye(SIZE),
         factor[:, None, None] ** 2 * clip.covariance,
     )
 
 
 def residuals(cameras: Camera, points: Floats, observed: Observations) -> Floats:
-    """Return projected minus observed (n, 2) in stated standard deviations [1].
-
-    Args:
-        cameras: (cameras,) batch.
-        points: (points, 3) [m], world.
-        observed: keypoints of these points.
-    """
+    """Return projected minus observed pixels (n, 2) of keypoints at points (points, 3) [m]."""
     off = np.empty_like(observed.image)
     for c in range(len(cameras.focal)):
         rows = observed.camera_of == c
         off[rows] = cameras[c].project(points[observed.point_of[rows]]) - observed.image[rows]
-    return off / observed.noise[:, None]
+    return off
+
+
+def keypoint_information(cameras: Camera, observed: Observations) -> Floats:
+    """Return the information of keypoints on a step of each camera (cameras, 12, 12).
+
+    The points are fixed, and the noise is as stated.
+    """
+    information = np.zeros((len(cameras.focal), SIZE, SIZE))
+    for c in range(len(information)):
+        rows = observed.camera_of == c
+        _, by_step = project_with_jacobian(cameras[c], observed.points[observed.point_of[rows]])
+        by_step = by_step / observed.noise[rows][:, None, None]
+        by_step = by_step[np.isfinite(by_step).all(axis=(1, 2))]
+        information[c] = np.einsum("nai,naj->ij", by_step, by_step)
+    return information
 
 
 def estimate_noise(
     cameras: Camera, points: Floats, observed: Observations, robust_scale: float
 ) -> KeypointNoise:
-    """Return the scale and the correlation of the keypoints' errors.
+    """Return the scale and the correlation of the errors of keypoints of adjusted points.
 
     The scale comes from the median; every point takes three degrees of freedom out of its
     observations. The correlation is the squared length of the sum of a joint's residuals over time,
     in one camera, over the sum of their squared lengths; 1 for independent residuals.
-
-    Args:
-        cameras: (cameras,) batch, adjusted.
-        points: (points, 3) [m], world, adjusted.
-        observed: keypoints of these points.
-        robust_scale: robust scale of Cauchy's loss [standard deviations].
     """
-    off = residuals(cameras, points, observed)
+    off = residuals(cameras, points, observed) / observed.noise[:, None]
     views = np.bincount(observed.point_of, minlength=len(points))[observed.point_of]
     squared = (off**2).sum(axis=1) / (1.0 - 1.5 / np.maximum(views, 2))
     scale = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,12 +90,7 @@ def adjustment_arrays(
 def marking_errors(clip: Clip, cameras: Camera) -> Floats:
     """Return the root mean square error per axis (cameras,) [px] of clicks used in calibration.
 
-    Args:
-        clip: its clicks.
-        cameras: (cameras,) batch.
-
-    Returns:
-        NaN for cameras without such clicks.
+    It is NaN for cameras without such clicks.
     """
     errors = np.full(len(clip.clicks), np.nan)
     for c, clicks in enumerate(clip.clicks):
@@ -104,13 +99,6 @@ def marking_errors(clip: Clip, cameras: Camera) -> Floats:
             off = pixels - clicks.points_image[clicks.inlier]
             errors[c] = np.sqrt(np.mean(off**2))
     return errors
-
-
-_WHOLE: Final = 0.5
-"""Share of outliers among a person's keypoints in one image from which all are listed together [1]:
-another person, or a left-right swap."""
-_BLOCK: Final = 256
-"""Frames at a time: limits the memory, not the result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,22 +145,18 @@ class ClickReview:
 def keypoint_outliers(
     clip: Clip, cameras: Camera, noise: KeypointNoise, limit: float, longest: int
 ) -> KeypointOutliers:
-    """Return the keypoints that disagree with the joints from all cameras.
+    """Return the keypoints that disagree with the joints from all cameras, the worst first.
 
-    Args:
-        clip: keypoints and their persons.
-        cameras: (cameras,) batch, adjusted.
-        noise: noise of keypoints, as measured.
-        limit: Mahalanobis distance from which a keypoint is listed [1].
-        longest: maximum number of entries.
+    They are those beyond a Mahalanobis distance; the list has a maximum length.
     """
+    block = 256  # frames at a time: limits the memory, not the result
     last = len(clip.detections.frame)
 
     def find(first: int) -> Floats:
-        frames = np.arange(first, min(first + _BLOCK, last))
+        frames = np.arange(first, min(first + block, last))
         return _find_outliers(clip, cameras, noise, limit, frames)
 
-    parts = list(map_in_threads(find, range(0, last, _BLOCK)))
+    parts = list(map_in_threads(find, range(0, last, block)))
     rows = np.concatenate([np.empty((0, 5)), *parts])
     order = np.lexsort((*rows[:, 3::-1].T, -rows[:, 4]))[:longest]
     frame, camera, person, joint = rows[order, :4].astype(np.int64).T
@@ -190,7 +174,8 @@ def _find_outliers(
     off = np.linalg.norm(predicted - image, axis=-1) / (noise.scale * stated)
     off[~np.isfinite(off)] = np.nan
     wrong = off > limit
-    together = wrong.sum(axis=-1) > _WHOLE * np.maximum(np.isfinite(off).sum(axis=-1), 2)
+    # Most keypoints of another person, or after a left-right swap, are outliers.
+    together = wrong.sum(axis=-1) > 0.5 * np.maximum(np.isfinite(off).sum(axis=-1), 2)
     f, c, p = np.nonzero(together)
     middle = np.nanmedian(off[together], axis=-1) if len(f) else np.empty(0)
     whole = np.column_stack([frames[f], c, p, np.full(len(f), -1), middle])
@@ -206,11 +191,7 @@ def review_clicks(
 ) -> ClickReview:
     """Return every clicked point's residual and its Mahalanobis distance.
 
-    Args:
-        clicks: clicks of every camera.
-        cameras: (cameras,) batch, adjusted.
-        covariance: (cameras, 12, 12) covariance of a step; all zero for a given camera.
-        click_noise: standard deviation per axis [px].
+    A given camera has a covariance of zero; the noise of a click is per axis [px].
     """
     camera: list[int] = []
     name: list[str] = []

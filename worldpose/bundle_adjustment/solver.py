@@ -26,9 +26,6 @@ from worldpose.static_calibration.parameters import step_camera
 
 BLOCK: Final = 256
 """Points eliminated at a time: their rows for 18 cameras (1.3 MB) stay in the cache."""
-_MIN_SHARE: Final = 0.1
-"""Minimum share of a camera in the weakest direction for a message to name it, relative to an equal
-share of all cameras [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +70,6 @@ class Solution:
         offset: (cameras, 12) steps from the problem's cameras to these.
         points: (points, 3) [m], world.
         cost: robust sum of squares with priors.
-        iterations: number of steps tried.
         converged: whether the last step gained less than `min_cost_change`.
         camera_covariance: (12 cameras, 12 cameras) covariance of steps from the solution, the
             points being free; zero for fixed parameters, empty if not requested.
@@ -83,7 +79,6 @@ class Solution:
     offset: Floats
     points: Floats
     cost: float
-    iterations: int
     converged: bool
     camera_covariance: Floats
 
@@ -139,7 +134,6 @@ def solve(
         offset=last.offset,
         points=last.points,
         cost=last.cost,
-        iterations=found.iterations,
         converged=found.converged,
         camera_covariance=spread,
     )
@@ -222,11 +216,7 @@ class _System:
         return covariance
 
     def _solve(self, matrix: Floats, right: Floats) -> Floats:
-        """Return the solution, computed with scaling: units differ by many powers of 10.
-
-        Raises:
-            InputError: the system is singular.
-        """
+        """Return the solution, computed with scaling: units differ by many powers of 10."""
         diagonal = np.diag(matrix)
         if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
             raise InternalError("bundle adjustment", "normal equations that are not finite")
@@ -244,7 +234,7 @@ class _System:
         weakest = np.linalg.eigh(scaled)[1][:, 0]
         share = np.zeros(self.columns.shape)
         share.ravel()[self.free] = weakest**2
-        moving = np.flatnonzero(share.sum(axis=1) > _MIN_SHARE / len(share))
+        moving = np.flatnonzero(share.sum(axis=1) > 0.1 / len(share))
         if len(moving) == len(share):
             found = "that all of them can move together without any residual"
         else:

@@ -30,8 +30,6 @@ from worldpose.static_calibration.settings import LineRefinementSettings
 
 SIMILARITY: Final = 7
 """Degrees of freedom: translation, rotation, scale."""
-_ITERATIONS: Final = 10
-"""Reweighted alignments; the last change by less than a micrometre."""
 
 
 @dataclass(frozen=True)
@@ -61,27 +59,18 @@ class Similarity:
 
 
 def align_points(points: Floats, targets: Floats) -> Similarity:
-    """Return the similarity transform that brings points to their targets.
+    """Return the similarity transform that brings points (n, 3) [m] to their targets (n, 3) [m].
 
     The weight of a pair depends on its distance over the median distance (Cauchy's weight), so that
-    a person or a joint that really moved has little influence.
-
-    Args:
-        points: (n, 3) [m].
-        targets: (n, 3) [m].
-
-    Returns:
-        The identity for fewer than three pairs, or for pairs on one line, which leave it
-        undetermined.
-
-    Note:
-        Umeyama, PAMI 1991.
+    a person or a joint that really moved has little influence. The result is the identity for fewer
+    than three pairs, or for pairs on one line (Umeyama, PAMI 1991).
     """
     identity = Similarity(1.0, np.eye(3), np.zeros(3))
     if len(points) < 3:
         return identity
     weight, found = np.ones(len(points)), identity
-    for _ in range(_ITERATIONS):
+    # The last ones change less than a micrometre.
+    for _ in range(10):
         share = weight / weight.sum()
         center, target = share @ points, share @ targets
         away, off = points - center, targets - target
@@ -100,12 +89,8 @@ def align_points(points: Floats, targets: Floats) -> Similarity:
 def similarity_steps(cameras: Camera, origin: Floats) -> Floats:
     """Return the steps (cameras, 12, 7) of cameras that follow a similarity transform.
 
-    Its parameters are a translation [m], a rotation about `origin` [rad] and the logarithm of a
-    scale about `origin`; steps are in the order of `PARAMETERS`.
-
-    Args:
-        cameras: (cameras,) batch.
-        origin: (3,) [m], world.
+    Its parameters are a translation [m], a rotation about the origin (3,) [rad] and the logarithm
+    of a scale about it; steps are in the order of `PARAMETERS`.
     """
     pose = cameras.cam_from_world
     steps = np.zeros((len(pose.rotation), 12, SIMILARITY))
@@ -153,22 +138,6 @@ def relative_covariance(
     return 0.5 * (own + own.swapaxes(1, 2)), 0.5 * (common + common.T)
 
 
-_SPACING: Final = 0.25
-"""Spacing of samples along painted lines [m]."""
-_LINE_WIDTH: Final = LineRefinementSettings().line_width_m
-_APART: Final = 8.0
-"""Minimum distance of two independent samples in an image [px]: the width of a bar across a
-line."""
-_MOST: Final = 700
-"""Samples per image, approximately [1]."""
-_NOISE: Final = 0.1
-"""Standard deviation of a sample across its line [px]. With it, and the true errors of a survey,
-the response predicts the displacement of people by all cameras to 0.6 of 6 mm on simulated matches;
-0.3 predicts two thirds of it, 0.03 the same."""
-_SHIFT: Final = LineRefinementSettings().line_shift_px
-"""Standard deviation of the shift of a whole line in one image [px]; no other camera shares it."""
-
-
 def survey_response(clip: Clip, survey_error: float) -> Floats:
     """Return the response (cameras, 12, unknowns) of calibrated cameras to survey errors.
 
@@ -187,20 +156,25 @@ def survey_response(clip: Clip, survey_error: float) -> Floats:
         Zero for cameras not calibrated on lines; no unknowns without a pitch, else three per point
         of the template.
     """
+    # This noise predicts the displacement of people by all cameras to 0.6 of 6 mm in simulation.
+    noise_px = 0.1
     count = len(clip.covariance)
     if clip.pitch is None or clip.on_lines is None or not clip.on_lines.any():
         return np.zeros((count, clip.covariance.shape[1], 0))
-    samples = sample_markings(clip.pitch, _SPACING)
-    noise = replace(EXACT_PAINT, points_m=survey_error, shift_px=_SHIFT)
+    samples = sample_markings(clip.pitch, 0.25)
+    noise = replace(
+        EXACT_PAINT, points_m=survey_error, shift_px=LineRefinementSettings().line_shift_px
+    )
     response = np.zeros((count, clip.covariance.shape[1], 3 * len(clip.pitch.points)))
     for c in np.flatnonzero(clip.on_lines).tolist():
-        seen = project_lines(clip.cameras[c], samples, _LINE_WIDTH, noise)
-        seen = seen[thin_samples(seen, samples, _APART, _MOST)]
+        seen = project_lines(clip.cameras[c], samples, LineRefinementSettings().line_width_m, noise)
+        # Independent samples are as far apart as the width of a bar across a line.
+        seen = seen[thin_samples(seen, samples, 8.0, 700)]
         unknowns, column = np.unique(seen.unknowns, return_inverse=True)
         by_paint = np.zeros((len(seen.places), len(unknowns)))
-        np.add.at(by_paint, (np.arange(len(by_paint))[:, None], column), seen.by_paint / _NOISE)
+        np.add.at(by_paint, (np.arange(len(by_paint))[:, None], column), seen.by_paint / noise_px)
         known = by_paint.T @ by_paint + np.eye(len(unknowns))
-        met = by_paint.T @ seen.by_camera[:, :-2] / _NOISE
+        met = by_paint.T @ seen.by_camera[:, :-2] / noise_px
         moved = clip.covariance[c] @ np.linalg.solve(known, met).T
         response[c][:, unknowns[unknowns >= 0]] = moved[:, unknowns >= 0]
         response[c] /= max(1.0, _explained_share(clip.covariance[c], response[c]))
@@ -238,12 +212,6 @@ def _explained_share(covariance: Floats, response: Floats) -> float:
     return float(np.linalg.norm(np.linalg.solve(factor, response[free] / size[:, None]), ord=2))
 
 
-_DISTANCE: Final = 60.0
-"""Distance of the points whose image motion makes parameters comparable [m]."""
-_NAMED: Final = 0.25
-"""Share of the largest component from which a parameter is named [1]."""
-
-
 @dataclass(frozen=True, eq=False)
 class WeakDirection:
     """Direction in which people and markings constrain a camera least.
@@ -258,19 +226,16 @@ class WeakDirection:
 
 
 def weak_direction(camera: Camera, covariance: Floats) -> WeakDirection:
-    """Return the direction of largest variance.
+    """Return the direction of largest variance of a single camera's step.
 
     Parameters are scaled by the image motion of each alone; along a weak direction these motions
     cancel.
-
-    Args:
-        camera: a single camera.
-        covariance: (12, 12) covariance of a step.
     """
+    units = (" rad",) * 3 + (" m",) * 3 + ("", " px", " px", "", "", "")
     width, height = camera.image_size
     across, down = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 6))
     rays = camera.unproject(np.stack([across, down], axis=-1).reshape(-1, 2))
-    seen = rays.origins + _DISTANCE * rays.directions
+    seen = rays.origins + 60.0 * rays.directions
     _, by_step = project_with_jacobian(camera, seen[np.isfinite(seen).all(axis=1)])
     pixels = np.sqrt(np.nanmean((by_step**2).sum(axis=1), axis=0))
     values, vectors = np.linalg.eigh(covariance * np.outer(pixels, pixels))
@@ -278,10 +243,7 @@ def weak_direction(camera: Camera, covariance: Floats) -> WeakDirection:
     if not step.any():
         return WeakDirection(step, "not known")
     moved = np.abs(vectors[:, -1])
-    named = np.flatnonzero(moved > _NAMED * moved.max())
+    named = np.flatnonzero(moved > 0.25 * moved.max())
     named = named[np.argsort(-moved[named], kind="stable")]
-    parts = [f"{PARAMETERS[k]} {step[k]:+.2g}{_UNITS[k]}" for k in named]
+    parts = [f"{PARAMETERS[k]} {step[k]:+.2g}{units[k]}" for k in named]
     return WeakDirection(step, ", ".join(parts))
-
-
-_UNITS: Final = (" rad",) * 3 + (" m",) * 3 + ("", " px", " px", "", "", "")

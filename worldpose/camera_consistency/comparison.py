@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Integers
 from worldpose.camera_consistency.hypotheses import STATED, Hypothesis
 from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.compiled import compile_kernel, map_in_threads
@@ -19,42 +18,16 @@ from worldpose.tracking.epipolar import associate
 from worldpose.tracking.ray_matching import match_greedily, ray_affinity
 from worldpose.tracking.settings import TrackingSettings
 
-Ints = NDArray[np.int64]
-
-HEIGHTS: Final = (-0.4, 2.2)
-"""Accepted mean heights of a person's joints above the ground [m]."""
 ORBITS_DEG: Final = (105.0, 215.0, 50.0, 320.0, 160.0, 270.0)
 """Rotations of a camera about the people that leave only chance matches [degree]."""
 JOINT_NOISES: Final = (0.015, 0.025, 0.04, 0.06, 0.08)
 """Candidate standard deviations of a detector's joint on the body [m]."""
-KEPT: Final = 0.75
-"""Share of the maximum number of matches that the chosen noise must keep."""
 MIN_JOINTS = 6
 """Minimum number of common joints of two detections."""
-_MIN_SINE = 0.08
-"""Minimum sine of the angle between two rays: nearly parallel rays meet everywhere."""
-_CLIP = 16.0
-"""Largest squared deviation of one joint: an outlier counts no more."""
 _EARLY_JOINTS, _EARLY_LIMIT = 4, 13.0
 """After this number of joints a pair with a larger mean squared deviation is rejected."""
-_WIDTH = 1.5
-"""Deviation at which a match counts 61 %: the noise is uncertain by a factor of about two."""
-_SIZE_RANGE = (0.15, 1.1)
-"""Accepted root mean square distance of a person's joints from their mean [m]: about 0.45 for a
-standing adult, more along nearly parallel rays."""
-MIN_ANGLE: Final = 0.03
-"""Minimum angle between the rays of two cameras to the people for a comparison [rad]: a centimetre
-across the rays is 0.3 m along them."""
 PIVOT_RANGE: Final = (3.0, 150.0)
 """Range of distances of the pivot of rotation from the camera [m]."""
-SAME_PIXELS: Final = 1.5
-"""Distance below which keypoints of two videos are the same [px]: compression moves them."""
-SAME_SHARE: Final = 0.015
-"""The same as a share of a person's height in the image."""
-UNCERTAIN: Final = 2.0
-"""Factor on the standard deviation of a camera's rays that widens the gate around each person."""
-IN_VIEW: Final = 0.7
-"""Share of a person's joints in the image from which on a camera should detect the person."""
 
 
 class View(NamedTuple):
@@ -125,13 +98,9 @@ class Comparison:
     ) -> None:
         """Sample frames and convert their detections to rays.
 
-        Args:
-            cameras: batch (cameras,).
-            pixel_noise: (cameras,) standard deviation of a keypoint and of the calibration [px].
-            keypoints: (frames, cameras, detections, 17, 2) [px]; NaN where not found.
-            ground: whether people stand on z = 0.
-            settings: frames and noise.
-            joint_noise: standard deviation of a detector's joint on the body [m].
+        The noise (cameras,) [px] is that of keypoints and of the calibration. Keypoints (frames,
+        cameras, detections, 17, 2) [px] are NaN where not found; on the ground, people stand at z =
+        0; the joint noise is that of a joint on the body [m].
         """
         self.cameras = cameras
         self.count = int(cameras.batch_shape[0])
@@ -143,7 +112,7 @@ class Comparison:
         self.held_out = np.setdiff1d(places, self.search) if len(places) > 3 else places
         self._everywhere = places
         self._ground = ground
-        self._heights = HEIGHTS if ground else (-math.inf, math.inf)
+        self._heights = (-0.4, 2.2) if ground else (-math.inf, math.inf)
         self._joint_noise = joint_noise
         self._pixel_noise = pixel_noise
         self._keypoints = [_pack(keypoints[:, c]) for c in range(self.count)]
@@ -152,14 +121,8 @@ class Comparison:
             [np.isfinite(v.rays[..., 0]).any(axis=-1).sum(axis=1).mean() for v in self.views]
         )
 
-    def view(self, c: int, hypothesis: Hypothesis, frames: Ints | None = None) -> View:
-        """Return the rays of camera `c` under a hypothesis.
-
-        Args:
-            c: the camera.
-            hypothesis: its correction.
-            frames: (n,) frames of the rays, -1 = none; None = the sampled ones.
-        """
+    def view(self, c: int, hypothesis: Hypothesis, frames: Integers | None = None) -> View:
+        """Return a camera's rays under a hypothesis, in frames (n,), -1 = none, or sampled ones."""
         camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
         points = self._keypoints[c if hypothesis.source is None else hypothesis.source]
         frames = self.times(hypothesis) if frames is None else frames
@@ -171,11 +134,11 @@ class Comparison:
         spread = np.full(points.shape[:2], self._pixel_noise[c] / float(camera.focal.mean()))
         return View(rays, np.array(camera.center), spread)
 
-    def times(self, hypothesis: Hypothesis) -> Ints:
+    def times(self, hypothesis: Hypothesis) -> Integers:
         """Return the camera's frame at each sampled frame under a hypothesis; -1 = none."""
         return self.sample if hypothesis.time is None else hypothesis.time
 
-    def scores(self, view: View, partner: View, at: Ints, there: Ints) -> Floats:
+    def scores(self, view: View, partner: View, at: Integers, there: Integers) -> Floats:
         """Return the matches (n,) of two views at pairs of their frames; -1 = no frame."""
         # Contiguous: numba compiles a kernel again for every other memory layout.
         times = np.ascontiguousarray(at), np.ascontiguousarray(there)
@@ -237,7 +200,8 @@ class Comparison:
         if not np.isfinite(depth):
             depth = float(np.linalg.norm(_meeting_place(view, partner) - view.center))
         apart = float(np.linalg.norm(view.center - partner.center))
-        return apart < MIN_ANGLE * float(np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]))
+        # A centimetre across rays at 0.03 rad is 0.3 m along them.
+        return apart < 0.03 * float(np.clip(depth, PIVOT_RANGE[0], PIVOT_RANGE[1]))
 
     def fit_noise(self) -> None:
         """Choose the least joint noise with nearly as much agreement as the best one.
@@ -261,7 +225,8 @@ class Comparison:
             return above
 
         totals = [sum(each) for each in zip(*map_in_threads(above_chance, pairs), strict=True)]
-        enough = np.array(totals) >= KEPT * max(totals)
+        # The chosen noise keeps three quarters of the most matches.
+        enough = np.array(totals) >= 0.75 * max(totals)
         self._joint_noise = JOINT_NOISES[int(np.argmax(enough))]
 
     def same_video(self, a: int, b: int) -> bool:
@@ -278,19 +243,15 @@ class Comparison:
             common = np.isfinite(apart).sum(axis=-1) >= MIN_JOINTS
             mean = np.where(common, np.nansum(apart, axis=-1), np.inf)
             mean = mean / np.maximum(1, np.isfinite(apart).sum(axis=-1))
-            near = mean < np.maximum(SAME_PIXELS, SAME_SHARE * height)[:, None]
+            # Compression moves keypoints.
+            near = mean < np.maximum(1.5, 0.015 * height)[:, None]
             same += int(near.any(axis=1).sum())
             people += min(len(first), len(second))
             frames += 1
         return frames >= 3 and same >= 0.7 * people
 
     def people(self, among: Sequence[int], views: int = 2) -> list[Floats]:
-        """Return the people (persons, 17, 3) [m] that cameras agree on, frame by frame.
-
-        Args:
-            among: the cameras.
-            views: least number of cameras with a view of each person.
-        """
+        """Return the people (persons, 17, 3) [m] that cameras agree on, frame by frame."""
         found = []
         most = max(self.views[c].rays.shape[1] for c in among)
         centers = np.stack([self.views[c].center for c in among])
@@ -312,9 +273,8 @@ class Comparison:
     ) -> tuple[float, float, int]:
         """Return the agreement of a camera with people detected by others.
 
-        Returns:
-            Share of the camera's detections that match these people, share of the people in its
-            image that it detected, and their number [person-frames].
+        The share of the camera's detections that match these people, the share of the people in its
+        image that it detected, and their number [person-frames].
         """
         camera = self.cameras[c] if hypothesis.camera is None else hypothesis.camera
         view = self.view(c, hypothesis)
@@ -327,24 +287,18 @@ class Comparison:
             rays = view.rays[n][None]
             # An uncertain pose may shift all people off their detections.
             distance = np.linalg.norm(np.nanmean(joints, axis=1) - view.center, axis=-1)
-            gates = gate + UNCERTAIN * float(view.spread[n].max(initial=0.0)) * distance
+            gates = gate + 2.0 * float(view.spread[n].max(initial=0.0)) * distance
             weights = np.isfinite(rays[..., 0]).astype(np.float64)
             detections += int((weights.sum(axis=-1) >= MIN_JOINTS).sum())
             if not len(joints):
                 continue
-            affinity = ray_affinity(
-                joints,
-                view.center[None],
-                rays,
-                weights,
-                gates[None],
-                MIN_JOINTS,
-            )
+            center, gates = view.center[None], gates[None]
+            affinity = ray_affinity(joints, center, rays, weights, gates, MIN_JOINTS)
             index = match_greedily(affinity)[0]
             matched += int((index >= 0).sum())
             image = camera.project(joints.reshape(-1, 3)).reshape(*joints.shape[:2], 2)
             inside = ((image >= 0.0) & (image < camera.image_size)).all(axis=-1)
-            visible = inside.sum(axis=1) >= IN_VIEW * np.isfinite(joints[..., 0]).sum(axis=1)
+            visible = inside.sum(axis=1) >= 0.7 * np.isfinite(joints[..., 0]).sum(axis=1)
             expected += int(visible.sum())
             found += int((visible & (index >= 0)).sum())
         return matched / max(1, detections), found / max(1, expected), expected
@@ -366,13 +320,8 @@ def _orbit(view: View, partner: View, degrees: Sequence[float]) -> Iterator[View
     """
     pivot = _meeting_place(view, partner)
     for angle in np.radians(degrees):
-        turn = np.array(
-            [
-                [math.cos(angle), -math.sin(angle), 0.0],
-                [math.sin(angle), math.cos(angle), 0.0],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        cosine, sine = math.cos(angle), math.sin(angle)
+        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         rays = np.ascontiguousarray(view.rays @ turn.T)
         yield view._replace(rays=rays, center=pivot + turn @ (view.center - pivot))
 
@@ -408,9 +357,9 @@ def _pack(keypoints: Floats) -> Floats:
 @compile_kernel
 def pair_scores(
     view: View,
-    frames: Ints,
+    frames: Integers,
     partner: View,
-    partner_frames: Ints,
+    partner_frames: Integers,
     heights: tuple[float, float],
     joint_noise: float,
 ) -> Floats:
@@ -420,16 +369,12 @@ def pair_scores(
     assignment is greedy, best first.
 
     Args:
-        view: view of the first camera.
+        view: of the first camera.
         frames: (n,) its compared frames; -1 = none.
         partner: view of the second camera.
-        partner_frames: (n,) frame of the second camera for each of `frames`.
-        heights: lowest and highest mean height of a person's joints [m]; infinite where the
-            ground is unknown.
+        partner_frames: (n,) its frame for each of `frames`.
+        heights: lowest and highest mean height of a person's joints [m]; infinite = unknown ground.
         joint_noise: standard deviation of a detector's joint, on the body [m].
-
-    Returns:
-        (n,) sums of matches [1].
     """
     scores = np.zeros(len(frames))
     for n in range(len(frames)):
@@ -480,6 +425,7 @@ def _weights(
     joint_noise: float,
 ) -> Floats:
     """Return the match weight, 0 to 1, of each pair of a detection in a and one in b, (a, b)."""
+    min_sine = 0.08  # nearly parallel rays meet everywhere
     count_a, joints, _ = rays_a.shape
     count_b = rays_b.shape[0]
     weights = np.zeros((count_a, count_b))
@@ -497,7 +443,7 @@ def _weights(
                 vx, vy, vz = rays_b[j, joint, 0], rays_b[j, joint, 1], rays_b[j, joint, 2]
                 cosine = ux * vx + uy * vy + uz * vz
                 squared = 1.0 - cosine * cosine
-                if not squared > _MIN_SINE * _MIN_SINE:  # also NaN
+                if not squared > min_sine * min_sine:  # also NaN
                     continue
                 along_u = bx * ux + by * uy + bz * uz
                 along_v = bx * vx + by * vy + bz * vz
@@ -512,13 +458,14 @@ def _weights(
                 points[count, 0] = center_a[0] + s * ux - 0.5 * dx
                 points[count, 1] = center_a[1] + s * uy - 0.5 * dy
                 points[count, 2] = center_a[2] + s * uz - 0.5 * dz
-                total += min(_CLIP, (dx * dx + dy * dy + dz * dz) / variance)
+                total += min(16.0, (dx * dx + dy * dy + dz * dz) / variance)
                 count += 1
                 if count == _EARLY_JOINTS and total > _EARLY_LIMIT * _EARLY_JOINTS:
                     break
             if count < MIN_JOINTS:
                 continue
-            weight = math.exp(-0.5 * total / count / _WIDTH**2)
+            # At 1.5 deviations a match counts 61 %: the noise is known to a factor of two.
+            weight = math.exp(-0.5 * total / count / 1.5**2)
             if weight > 0.05 and _is_person(points[:count], heights):
                 weights[i, j] = weight
     return weights
@@ -527,6 +474,7 @@ def _weights(
 @compile_kernel
 def _is_person(points: Floats, heights: tuple[float, float]) -> bool:
     """Return whether joints (n, 3) [m] have a person's size and height above the ground."""
+    size_range = (0.15, 1.1)  # [m]; 0.45 for a standing adult, more along nearly parallel rays
     n = len(points)
     x = y = z = xx = 0.0
     for k in range(n):
@@ -535,5 +483,5 @@ def _is_person(points: Floats, heights: tuple[float, float]) -> bool:
         z += points[k, 2] / n
     for k in range(n):
         xx += ((points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2 + (points[k, 2] - z) ** 2) / n
-    low, high = _SIZE_RANGE
+    low, high = size_range
     return low * low <= xx <= high * high and heights[0] <= z <= heights[1]

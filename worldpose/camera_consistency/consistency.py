@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
@@ -18,11 +17,6 @@ from worldpose.camera_consistency.settings import ConsistencySettings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.static_calibration.parameters import project_with_jacobian
-
-GIVEN_TILT: Final = 0.003
-"""Largest plausible rotation error of a given camera [rad]."""
-MIN_FOCAL_ERROR: Final = 0.03
-"""Minimum logarithm of a focal length's ratio that is a fault."""
 
 
 def check_consistency(
@@ -54,6 +48,8 @@ def check_consistency(
     Raises:
         InputError: the shapes do not fit together.
     """
+    min_focal_error = 0.03  # of the logarithm
+    given_tilt = 0.003  # largest plausible rotation error of a given camera [rad]
     keypoints, confidence = detections.keypoints, detections.confidence
     if keypoints.shape != (*confidence.shape, 2) or cameras.batch_shape != confidence.shape[1:2]:
         raise InputError(
@@ -69,15 +65,15 @@ def check_consistency(
     points[~(np.asarray(confidence[part]) > 0.0)] = np.nan
     if count < 2 or not len(points):
         return Consistency((), (), tuple(range(count)), np.zeros((count, count)))
-    given, tilt = np.ones(count, dtype=np.bool_), np.full(count, GIVEN_TILT)
-    focal_error, noise = np.full(count, MIN_FOCAL_ERROR), np.full(count, settings.pixel_noise_px)
+    given, tilt = np.ones(count, dtype=np.bool_), np.full(count, given_tilt)
+    focal_error, noise = np.full(count, min_focal_error), np.full(count, settings.pixel_noise_px)
     if covariance is not None:
         known = [bool(np.isfinite(each).all()) for each in covariance]
         given = np.logical_not(known)
         for c in (place for place in range(count) if known[place]):
             deviation = np.sqrt(np.diagonal(covariance[c]))
-            tilt[c] = max(GIVEN_TILT, 3.0 * float(deviation[:3].max()))
-            focal_error[c] = max(MIN_FOCAL_ERROR, 4.0 * float(deviation[6]))
+            tilt[c] = max(given_tilt, 3.0 * float(deviation[:3].max()))
+            focal_error[c] = max(min_focal_error, 4.0 * float(deviation[6]))
             noise[c] = math.hypot(noise[c], _calibration_noise(cameras[c], covariance[c]))
     comparison = Comparison(cameras, noise, points, ground, settings)
     comparison.fit_noise()

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from data_contracts.camera_consistency import FaultKind
 from worldpose.camera_consistency.comparison import (
     Comparison,
@@ -29,18 +28,6 @@ from worldpose.camera_consistency.hypotheses import (
 from worldpose.compiled import map_in_threads
 from worldpose.geometry.cameras import Camera
 
-PARTNERS: Final = 4
-"""Number of partners for the closer comparison of a camera that agrees with others."""
-PARTNERS_OF_GROSS: Final = 6
-"""The same for a camera that agrees with less than half: those with most agreement with others."""
-MIN_SHIFT: Final = 2
-"""Minimum clock offset that is a fault [frame]; triangulation estimates smaller ones."""
-CLEAR: Final = 0.5
-"""Share of a camera's detections that match another camera's, below which all faults are tried."""
-RATES: Final = (0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)
-"""Candidate ratios of the actual to the stated frame rate."""
-CLOCK_BAND_S: Final = 0.5
-"""Range of clock offsets for a camera in partial agreement [s]; else the whole chunk."""
 MIN_GAIN: Final[dict[FaultKind, float]] = {
     "flipped": 1.5,
     "mirrored": 1.5,
@@ -52,19 +39,8 @@ MIN_GAIN: Final[dict[FaultKind, float]] = {
     "frame_rate": 1.15,
 }
 """Minimum ratio of matches with and without the correction. Lens orders have no free parameter."""
-SIMPLER: Final[dict[FaultKind, float]] = {
-    "pose": 1.05,
-    "focal": 1.02,
-    "lens": 1.02,
-    "frame_rate": 1.05,
-}
-"""Ratio of matches at which an explanation is preferred to a simpler one."""
 FINE: Final = ("focal", "lens", "clock", "frame_rate")
 """Faults that may be small."""
-MIN_CERTAINTY: Final = 3.5
-"""Minimum certainty of a small fault, in standard errors."""
-CONTRADICTED: Final = 0.2
-"""Share of the people in its image below which a camera's detections are inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +90,7 @@ class Diagnosis:
     """Iterative diagnosis: removes the camera with the clearest fault until none is left."""
 
     def __init__(
-        self,
-        comparison: Comparison,
-        fps: float,
-        given: NDArray[np.bool_],
-        tilt: Floats,
-        focal_error: Floats,
+        self, comparison: Comparison, fps: float, given: Flags, tilt: Floats, focal_error: Floats
     ) -> None:
         self.comparison = comparison
         self.fps = fps
@@ -185,13 +156,13 @@ class Diagnosis:
 
         def examine(c: int) -> tuple[float, int, Trial] | None:
             partners = [p for p in core if p != c and p not in self.faulty]
-            gross = bool(share[c].max() < CLEAR)
+            gross = bool(share[c].max() < 0.5)
             if gross:  # partners that agree with it by chance would not test it
                 support = {p: sum(share[p, q] for q in partners) for p in partners}
                 partners.sort(key=lambda p: -support[p])
             else:
                 partners.sort(key=lambda p: -self.agreement[c, p])
-            most = PARTNERS_OF_GROSS if gross else PARTNERS
+            most = 6 if gross else 4
             trials = self.explain(c, partners[:most], gross)
             return trials and (trials[0].matches - trials[1].matches, c, trials[0])
 
@@ -207,35 +178,29 @@ class Diagnosis:
         """Record a fault shown by the cameras of `core`; by one camera alone, a contradiction."""
         others = [p for p in core if p != c]
         people = self.comparison.people(others) if len(others) > 1 else None
-        now = corrected = 0.0
-        if people is not None:
-            now = self.comparison.shares(c, STATED, people)[0]
-            corrected = self.comparison.shares(c, trial.hypothesis, people)[0]
         hypothesis = trial.hypothesis
-        if len(others) == 1 and hypothesis.kind != "swapped":
-            self.faults.append(
-                Fault(
-                    c,
-                    "contradiction",
-                    hypothesis.detail,
-                    hypothesis.value,
-                    others[0],
-                    hypothesis.kind,
-                )
+        found = Fault(
+            c,
+            hypothesis.kind,
+            hypothesis.detail,
+            hypothesis.value,
+            hypothesis.source,
+            share_corrected=0.0,
+        )
+        if people is not None:
+            now, corrected = (
+                self.comparison.shares(c, each, people)[0] for each in (STATED, hypothesis)
             )
-        else:
-            self.faults.append(
-                Fault(
-                    c,
-                    hypothesis.kind,
-                    hypothesis.detail,
-                    hypothesis.value,
-                    hypothesis.source,
-                    None,
-                    now,
-                    corrected,
-                )
+            found = replace(found, share_now=now, share_corrected=corrected)
+        elif len(others) == 1 and hypothesis.kind != "swapped":
+            found = replace(
+                found,
+                kind="contradiction",
+                other=others[0],
+                cause=hypothesis.kind,
+                share_corrected=None,
             )
+        self.faults.append(found)
 
     # -- faults of cameras that agree with no others -----------------------------------------
 
@@ -309,7 +274,7 @@ class Diagnosis:
         share, found, expected = self.comparison.shares(c, STATED, people)
         seen = np.isfinite(self.comparison.views[c].rays[..., 0]).any(axis=-1).sum()
         enough = len(self.comparison.sample)
-        if min(expected, seen) >= enough and found < CONTRADICTED:
+        if min(expected, seen) >= enough and found < 0.2:
             self.faults.append(Fault(c, "pose", share_now=share))
 
     # -- one camera --------------------------------------------------------------------------
@@ -352,9 +317,10 @@ class Diagnosis:
 
         Consistent gains over frames prove a small change; several partners prove a large one.
         """
-        if trial.hypothesis.kind in FINE and trial.certainty(now) > MIN_CERTAINTY:
+        min_certainty = 3.5  # [standard errors]
+        if trial.hypothesis.kind in FINE and trial.certainty(now) > min_certainty:
             return True
-        if trial.partners > now.partners and trial.certainty(now) > MIN_CERTAINTY:
+        if trial.partners > now.partners and trial.certainty(now) > min_certainty:
             return True
         gain = trial.matches - now.matches
         return trial.partners >= now.partners + 2 and gain > 4.0 * chance_noise(trial.chance)
@@ -362,7 +328,14 @@ class Diagnosis:
     @staticmethod
     def rank(trial: Trial) -> float:
         """Return the rank of an explanation: matches, reduced for kinds with more freedom."""
-        return trial.matches / SIMPLER.get(trial.hypothesis.kind, 1.0)
+        # Kinds with more freedom count less.
+        simpler = {
+            "pose": 1.05,
+            "focal": 1.02,
+            "lens": 1.02,
+            "frame_rate": 1.05,
+        }
+        return trial.matches / simpler.get(trial.hypothesis.kind, 1.0)
 
     def polish(self, c: int, hypothesis: Hypothesis, partners: Sequence[int]) -> Hypothesis:
         """Return the hypothesis with the camera rotated, within its uncertainty, for the best fit.
@@ -419,7 +392,7 @@ class Diagnosis:
         comparison, search = self.comparison, self.comparison.search
         view = comparison.view(c, STATED, np.arange(comparison.frames))
         longest = comparison.frames - 1
-        band = longest if gross else min(longest, round(CLOCK_BAND_S * self.fps))
+        band = longest if gross else min(longest, round(0.5 * self.fps))
         shifts = np.arange(-band, band + 1)
         table = np.zeros((len(shifts), len(search)))
         for k, n in enumerate(search):
@@ -429,7 +402,7 @@ class Diagnosis:
                 there = np.full(len(shifts), n)
                 table[:, k] += comparison.scores(view, comparison.views[p], at, there)
         moments = comparison.sample[search]
-        rates = np.array((1.0, *RATES))
+        rates = np.array((1.0, *(0.5, 2.0, 24 / 25, 25 / 24, 25 / 30, 30 / 25, 24 / 30, 30 / 24)))
         # Matches along lines of the table, for every rate and start.
         rows = shifts[:, None] + np.round((rates[:, None, None] - 1.0) * moments) + band
         rows = rows.astype(np.int64)
@@ -437,7 +410,8 @@ class Diagnosis:
         along = table[rows.clip(0, len(shifts) - 1), np.arange(len(moments))]
         along = np.where(inside, along, 0.0).mean(axis=-1)
         shift = int(shifts[int(along[0].argmax())])
-        if abs(shift) >= MIN_SHIFT:
+        # Triangulation estimates smaller offsets.
+        if abs(shift) >= 2:
             yield float(along[0].max()), self.change_clock("clock", float(shift), shift, 1.0)
         row, column = np.unravel_index(int(along[1:].argmax()), along[1:].shape)
         rate = float(rates[1:][row])

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.camera_consistency import FaultKind
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
@@ -69,9 +69,9 @@ class Hypothesis:
     upside_down: bool = False
     value: float | None = None
     source: int | None = None
-    time: NDArray[np.int64] | None = None
+    time: Integers | None = None
 
-    def correct(self, stated: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.float64]:
+    def correct(self, stated: Floats, size: Integers) -> Floats:
         """Return detections (..., 17, 2) [px] as a correct video would show them."""
         if self.mirrored:
             image = stated[..., LEFT_RIGHT, :].copy()
@@ -86,9 +86,7 @@ STATED: Final = Hypothesis("pose", "")
 """A camera as stated."""
 
 
-def replace_pose(
-    camera: Camera, rotation: NDArray[np.float64], translation: NDArray[np.float64]
-) -> Camera:
+def replace_pose(camera: Camera, rotation: Floats, translation: Floats) -> Camera:
     """Return the camera with another pose."""
     return replace(camera, cam_from_world=Rigid(rotation, translation))
 
@@ -98,7 +96,7 @@ def scale_focal_length(camera: Camera, ratio: float) -> Camera:
     return replace(camera, focal=camera.focal * ratio)
 
 
-def rotate_camera(camera: Camera, rotvec: NDArray[np.float64]) -> Camera:
+def rotate_camera(camera: Camera, rotvec: Floats) -> Camera:
     """Return the camera rotated about its own centre by a rotation vector [rad] of its axes."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix() @ camera.cam_from_world.rotation
     return replace_pose(camera, rotation, -rotation @ camera.center)
@@ -179,7 +177,7 @@ def lens_hypotheses(camera: Camera) -> Iterator[Hypothesis]:
             yield Hypothesis("lens", detail, replace(camera, distortion=values))
 
 
-def tangential_shift(camera: Camera, distortion: NDArray[np.float64]) -> float:
+def tangential_shift(camera: Camera, distortion: Floats) -> float:
     """Return the largest shift of an image corner by p1 and p2, relative to the width [1]."""
     p1, p2 = distortion[2:4]
     width, height = camera.image_size - 1.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from data_contracts.cameras import CameraCalibration, Vector3
+from data_contracts.arrays import Floats, Image, Integers
+from data_contracts.cameras import CameraCalibration, LensCalibration, Vector3
 from worldpose.errors import InputError
 from worldpose.geometry import projection
 from worldpose.geometry.projection import fold_radius
@@ -33,18 +34,18 @@ class Projection:
     All arrays are NaN where `status` is not OK.
     """
 
-    points_image: NDArray[np.float64]
+    points_image: Floats
     """(..., n, 2) [px]."""
-    d_points: NDArray[np.float64]
+    d_points: Floats
     """(..., n, 2, 3) [px/m], by the world point."""
-    d_pose: NDArray[np.float64]
+    d_pose: Floats
     """(..., n, 2, 6) [px/rad, px/m], by the delta of `cam_from_world.retract(delta)`: rotation
     vector, then translation, both acting in the camera frame."""
-    d_intrinsics: NDArray[np.float64]
+    d_intrinsics: Floats
     """(..., n, 2, 4), by fx fy cx cy."""
-    d_distortion: NDArray[np.float64]
+    d_distortion: Floats
     """(..., n, 2, 5) [px], by k1 k2 p1 p2 k3."""
-    status: NDArray[np.uint8]
+    status: Image
     """(..., n) RayStatus."""
 
 
@@ -62,15 +63,15 @@ class Camera:
         C3, C5.
     """
 
-    focal: NDArray[np.float64]
+    focal: Floats
     """(..., 2) fx, fy [px]."""
-    principal_point: NDArray[np.float64]
+    principal_point: Floats
     """(..., 2) cx, cy [px]; (0, 0) is the centre of the top-left pixel."""
-    distortion: NDArray[np.float64]
+    distortion: Floats
     """(..., 5) k1 k2 p1 p2 k3."""
     cam_from_world: Rigid
     """(...) pose."""
-    image_size: NDArray[np.int64]
+    image_size: Integers
     """(..., 2) width, height [px]."""
 
     def __post_init__(self) -> None:
@@ -183,6 +184,17 @@ class Camera:
             image_size=np.array(calibration.image_size, dtype=np.int64),
         )
 
+    @classmethod
+    def from_lens(cls, lens: LensCalibration, image_size: ArrayLike | None = None) -> Camera:
+        """Return a camera with a lens, at the origin; the image size is the lens's if None."""
+        return cls(
+            focal=np.array([lens.focal_px, lens.focal_px]),
+            principal_point=np.array(lens.principal_point_px),
+            distortion=np.array(lens.distortion),
+            cam_from_world=Rigid.identity(),
+            image_size=np.array(lens.image_size if image_size is None else image_size),
+        )
+
     def to_calibration(self, camera_id: str) -> CameraCalibration:
         """Return the record of a single camera.
 
@@ -217,12 +229,12 @@ class Camera:
         return self.focal.shape[:-1]
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def center(self) -> Floats:
         """Camera centres (..., 3) [m], world."""
         return self.cam_from_world.inverse().translation
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
+    def numbers(self) -> Floats:
         """Rows (..., 22) as the compiled kernels of `worldpose.geometry.projection` take them."""
         return np.concatenate(
             [
@@ -242,7 +254,7 @@ class Camera:
             cam_from_world=self.cam_from_world[index],
         )
 
-    def project(self, points_world: ArrayLike) -> NDArray[np.float64]:
+    def project(self, points_world: ArrayLike) -> Floats:
         """Return the pixels of world points.
 
         Args:
@@ -289,13 +301,10 @@ class Camera:
         )
 
     def unproject(self, points_image: ArrayLike) -> Rays:
-        """Return the rays of image points.
+        """Return the rays (..., n) of image points (..., n, 2) [px].
 
-        Args:
-            points_image: (..., n, 2) [px]; the cameras broadcast against the dimensions before n.
-
-        Returns:
-            (..., n) rays, NaN with a status where the lens model has no inverse.
+        Points broadcast as in `project`; rays without an inverse of the lens model are NaN, with
+        a status.
 
         Raises:
             InputError: the shapes do not agree.
@@ -310,14 +319,10 @@ class Camera:
             status=status.reshape((*batch, *status.shape[1:])),
         )
 
-    def normalize(self, points_image: ArrayLike) -> NDArray[np.float64]:
-        """Return the undistorted coordinates of image points on the plane z = 1.
+    def normalize(self, points_image: ArrayLike) -> Floats:
+        """Return the undistorted coordinates (..., n, 2) of image points [px] on the plane z = 1.
 
-        Args:
-            points_image: (..., n, 2) [px], as in `unproject`.
-
-        Returns:
-            (..., n, 2), NaN where the lens model has no inverse.
+        They are NaN where the lens model has no inverse; shapes are as in `unproject`.
 
         Raises:
             InputError: the shapes do not agree.
@@ -328,7 +333,7 @@ class Camera:
 
     def _flat(
         self, where: str, points: ArrayLike, width: int
-    ) -> tuple[tuple[int, ...], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[tuple[int, ...], Floats, Floats]:
         """Return the common batch shape, cameras (batch, 22) and points (batch, n, width)."""
         values = check_shape(where, points, (-1, width))
         batch = common_batch(where, self.batch_shape, values.shape[:-2])
@@ -338,9 +343,7 @@ class Camera:
         return batch, cameras, np.broadcast_to(values, (*batch, *shape)).reshape((size, *shape))
 
 
-def _normalize(
-    cameras: NDArray[np.float64], points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _normalize(cameras: Floats, points: Floats) -> tuple[Floats, Image]:
     """Return undistorted coordinates (batch, n, 2) and their status (batch, n)."""
     plane = np.empty(points.shape)
     status = np.empty(points.shape[:-1], dtype=np.uint8)
@@ -348,34 +351,20 @@ def _normalize(
     return plane, status
 
 
-def _vector3(values: NDArray[np.float64]) -> Vector3:
+def _vector3(values: Floats) -> Vector3:
     x, y, z = values.tolist()
     return x, y, z
 
 
-_STORED: Final = ("focal", "principal_point", "distortion", "rotation", "translation", "image_size")
-"""Arrays of `data_contracts.cameras`."""
-
-
 def camera_arrays(camera: Camera) -> dict[str, NDArray[Any]]:
     """Return the stored arrays of a single camera, by name."""
-    return {
-        "focal": camera.focal,
-        "principal_point": camera.principal_point,
-        "distortion": camera.distortion,
-        "rotation": camera.cam_from_world.rotation,
-        "translation": camera.cam_from_world.translation,
-        "image_size": camera.image_size,
-    }
+    pose = camera.cam_from_world
+    parts = {name: getattr(camera, name) for name in _PARTS}
+    return {**parts, "rotation": pose.rotation, "translation": pose.translation}
 
 
 def camera_from_arrays(arrays: Mapping[Any, ArrayLike]) -> Camera:
     """Return the camera of stored arrays, bit for bit the one that was stored."""
-    stored = {name: np.asarray(arrays[name]) for name in _STORED}
-    return Camera(
-        focal=stored["focal"],
-        principal_point=stored["principal_point"],
-        distortion=stored["distortion"],
-        cam_from_world=Rigid(stored["rotation"], stored["translation"]),
-        image_size=stored["image_size"],
-    )
+    parts: dict[str, Any] = {name: np.asarray(arrays[name]) for name in _PARTS}
+    rotation, translation = (np.asarray(arrays[name]) for name in ("rotation", "translation"))
+    return Camera(**parts, cam_from_world=Rigid(rotation, translation))

@@ -11,9 +11,9 @@ formula has no meaning.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Floats, Image
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.rays import RayStatus
 from worldpose.geometry.rigid import check_shape
@@ -22,7 +22,7 @@ from worldpose.geometry.rigid import check_shape
 _MAX_RADIUS = 1e6
 
 
-def fold_radius(distortion: ArrayLike) -> NDArray[np.float64]:
+def fold_radius(distortion: ArrayLike) -> Floats:
     """Return the undistorted radius on the plane z = 1 where the radial model folds.
 
     Args:
@@ -58,7 +58,7 @@ def distort(
 
 
 @compile_kernel
-def _fold_squared(coefficients: NDArray[np.float64], squared: NDArray[np.float64]) -> None:
+def _fold_squared(coefficients: Floats, squared: Floats) -> None:
     """Write the squared radii of the folds of lenses (batch, 5); see `fold_squared`."""
     for row in range(len(coefficients)):
         k = coefficients[row]
@@ -109,7 +109,7 @@ def _turning_points(a: float, b: float, c: float) -> tuple[float, float]:
     return min(first, second), max(first, second)
 
 
-Bytes = NDArray[np.uint8]
+Bytes = Image
 
 _OK = int(RayStatus.OK)
 _MISSING = int(RayStatus.MISSING)
@@ -122,7 +122,6 @@ _MAX_ITERATIONS = 100
 # in practice, 7100 px.
 _MISFIT = 1e-13
 # Relative residual that rounding of the polynomial alone can leave: two units.
-_ROUNDING = 4.5e-16
 
 
 @compile_kernel
@@ -302,7 +301,8 @@ def _undistort_radius(c: Floats, radius_d: float) -> tuple[float, int]:
     for _ in range(_MAX_ITERATIONS):
         s = radius * radius
         misfit = radius * (1.0 + s * (k1 + s * (k2 + s * k3))) - radius_d
-        if abs(misfit) <= _ROUNDING * radius_d:
+        # Rounding of the polynomial alone leaves two units.
+        if abs(misfit) <= 4.5e-16 * radius_d:
             return radius, _OK
         if misfit > 0.0:
             high = radius

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Singles
+from data_contracts.arrays import Flags, Floats, Image, Integers, Singles
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.projection import project_point
@@ -81,7 +81,7 @@ class Surface(NamedTuple):
     """
 
     faces: NDArray[np.int32]
-    backs: NDArray[np.bool_]
+    backs: Flags
     texels: Singles
     textures: Image
     opened: Singles
@@ -185,11 +185,7 @@ def cover_triangles(pixels: Singles, faces: NDArray[np.int32], bit: int, mask: I
 
 @compile_kernel
 def resolve(
-    who: NDArray[np.int16],
-    color: Image,
-    picture: Image,
-    persons: NDArray[np.int16],
-    seen: NDArray[np.int64],
+    who: NDArray[np.int16], color: Image, picture: Image, persons: NDArray[np.int16], seen: Integers
 ) -> None:
     """Blend samples into a part of an image, and write the person in at least half of each pixel.
 

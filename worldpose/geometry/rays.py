@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from data_contracts.arrays import Flags, Floats, Image
 from worldpose.errors import InputError
 from worldpose.geometry.rigid import Index, check_shape, common_batch, index_leading
 
@@ -34,11 +35,11 @@ class Rays:
         InputError: the shapes do not agree.
     """
 
-    origins: NDArray[np.float64]
+    origins: Floats
     """(..., 3) camera centres [m], world."""
-    directions: NDArray[np.float64]
+    directions: Floats
     """(..., 3) unit vectors, world; NaN where `status` is not OK."""
-    status: NDArray[np.uint8]
+    status: Image
     """(...) RayStatus."""
 
     def __post_init__(self) -> None:
@@ -51,7 +52,7 @@ class Rays:
         object.__setattr__(self, "status", np.broadcast_to(status, batch))
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Flags:
         """(...) whether the ray exists."""
         return np.asarray(self.status == RayStatus.OK)
 
@@ -63,9 +64,7 @@ class Rays:
         )
 
 
-def intersect_rays(
-    rays: Rays, weights: ArrayLike | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def intersect_rays(rays: Rays, weights: ArrayLike | None = None) -> tuple[Floats, Floats]:
     """Return the points nearest to each bundle of rays in the weighted least-squares sense.
 
     The point p minimises the sum of weight * squared distance to the lines of the rays.

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.errors import InputError
 
 Index: TypeAlias = (
@@ -17,15 +18,13 @@ Index: TypeAlias = (
     | slice
     | EllipsisType
     | NDArray[np.integer]
-    | NDArray[np.bool_]
-    | tuple[int | slice | EllipsisType | NDArray[np.integer] | NDArray[np.bool_] | None, ...]
+    | Flags
+    | tuple[int | slice | EllipsisType | NDArray[np.integer] | Flags | None, ...]
 )
 """Index types of numpy; an index addresses the batch dimensions only."""
 
 # Six decimals, truncated rather than rounded, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
-_ORTHONORMAL = 4e-6
 # Rotations with all digits of float64 read back within this error and need no correction.
-_EXACT = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +38,9 @@ class Rigid:
         InputError: an array has the wrong trailing shape or the batches do not broadcast.
     """
 
-    rotation: NDArray[np.float64]
+    rotation: Floats
     """(..., 3, 3), orthonormal with determinant 1."""
-    translation: NDArray[np.float64]
+    translation: Floats
     """(..., 3) [m]."""
 
     def __post_init__(self) -> None:
@@ -83,7 +82,7 @@ class Rigid:
         return self.translation.shape[:-1]
 
     @property
-    def rotvec(self) -> NDArray[np.float64]:
+    def rotvec(self) -> Floats:
         """Axis-angle vectors of the rotation (..., 3) [rad] with angles in [0, pi]."""
         r = self.rotation
         diagonal = np.diagonal(r, axis1=-2, axis2=-1)
@@ -103,7 +102,7 @@ class Rigid:
         sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             factor = np.where(sine == 0.0, 2.0, 2.0 * np.arctan2(sine, quaternion[..., :1]) / sine)
-        scaled: NDArray[np.float64] = factor * quaternion[..., 1:]
+        scaled: Floats = factor * quaternion[..., 1:]
         return scaled
 
     def inverse(self) -> Rigid:
@@ -117,7 +116,7 @@ class Rigid:
             np.einsum("...ij,...j->...i", self.rotation, other.translation) + self.translation,
         )
 
-    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
+    def apply(self, points: ArrayLike) -> Floats:
         """Return points in frame b.
 
         Args:
@@ -128,7 +127,7 @@ class Rigid:
             InputError: the last dimension is not 3 or there is no n.
         """
         points_a = check_shape("Rigid.apply: points", points, (-1, 3))
-        moved: NDArray[np.float64] = (
+        moved: Floats = (
             points_a @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
         )
         return moved
@@ -154,7 +153,7 @@ class Rigid:
         )
 
 
-def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
+def nearest_rotation(where: str, matrix: ArrayLike) -> Floats:
     """Return the exact rotation nearest to a matrix given with at least six decimals.
 
     Args:
@@ -167,17 +166,19 @@ def nearest_rotation(where: str, matrix: ArrayLike) -> NDArray[np.float64]:
     rotation = check_shape(where, matrix, (3, 3))
     excess = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     determinant = float(np.dot(rotation[0], np.cross(rotation[1], rotation[2])))
-    if not excess <= _ORTHONORMAL or determinant < 0.0:
+    # Six decimals, truncated, put at most 2 sqrt(3) 1e-6 into rotation^T rotation.
+    if not excess <= 4e-6 or determinant < 0.0:
         raise InputError(
             where,
             expected="an orthonormal matrix with determinant 1",
             found=f"determinant {determinant:.6g}, largest entry {excess:.3g} of R^T R - identity",
             todo="Give R of x_b = R x_a + t with at least six decimals, without mirrored axes.",
         )
-    if excess <= _EXACT:
+    # Rotations with all digits of float64 read back within this error.
+    if excess <= 1e-14:
         return rotation
     u, _, v = np.linalg.svd(rotation)
-    nearest: NDArray[np.float64] = u @ v
+    nearest: Floats = u @ v
     return nearest
 
 
@@ -186,7 +187,7 @@ def index_leading(index: Index, trailing: int) -> tuple[Any, ...]:
     return (*(index if isinstance(index, tuple) else (index,)), *(slice(None),) * trailing)
 
 
-def check_shape(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float64]:
+def check_shape(where: str, array: ArrayLike, trailing: tuple[int, ...]) -> Floats:
     """Return `array` as float64 after a check of its last dimensions; -1 stands for any length.
 
     Raises:
@@ -222,7 +223,7 @@ def common_batch(where: str, *batches: tuple[int, ...]) -> tuple[int, ...]:
         ) from None
 
 
-def _cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross_matrix(vector: Floats) -> Floats:
     """Return (..., 3, 3) matrices M with M x = vector cross x."""
     matrix = np.zeros((*vector.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -235,14 +236,14 @@ def _cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 class Similarity:
     """Similarity transform `x_b = scale R x_a + t`, single or a batch."""
 
-    scale: NDArray[np.float64]
+    scale: Floats
     """(...)"""
-    rotation: NDArray[np.float64]
+    rotation: Floats
     """(..., 3, 3)"""
-    translation: NDArray[np.float64]
+    translation: Floats
     """(..., 3) [m]"""
 
-    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
+    def apply(self, points: ArrayLike) -> Floats:
         """Return points in frame b.
 
         Args:
@@ -251,7 +252,7 @@ class Similarity:
         """
         source = check_shape("Similarity.apply: points", points, (-1, 3))
         scaled = self.scale[..., None, None] * np.swapaxes(self.rotation, -1, -2)
-        moved: NDArray[np.float64] = source @ scaled + self.translation[..., None, :]
+        moved: Floats = source @ scaled + self.translation[..., None, :]
         return moved
 
 
@@ -297,9 +298,7 @@ def align(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Similari
     return Similarity(scale=scale, rotation=rotation, translation=b_mean - moved)
 
 
-def _center(
-    points: NDArray[np.float64], common: NDArray[np.bool_], count: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _center(points: Floats, common: Flags, count: Integers) -> tuple[Floats, Floats]:
     """Return the mean of the common points and their offsets from it; 0 for other points."""
     known = np.where(common[..., None], points, 0.0)
     mean = known.sum(-2) / np.maximum(count, 1)[..., None]

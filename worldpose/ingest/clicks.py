@@ -24,7 +24,8 @@ from worldpose.formats.files import whole_file
 from worldpose.ingest.annotations import clicked_file, key_frames_file
 from worldpose.ingest.match_folder import read_spec
 from worldpose.ingest.pitch_file import read_pitch, refuse_unread_pitch
-from worldpose.pitch.template import PitchTemplate, law_points
+from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import PitchTemplate
 
 COORDINATES: Final = re.compile(r"\(?\s*(-?\d+(?:\.\d+)?)\s*[,;_ ]\s*(-?\d+(?:\.\d+)?)\s*\)?")
 """A label that is a place, such as `(16.5, 13.84)` [m]."""

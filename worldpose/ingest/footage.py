@@ -20,7 +20,7 @@ from worldpose.formats.keypoint_files import read_observations
 from worldpose.ingest.match_folder import MatchFolder
 
 if TYPE_CHECKING:
-    from worldpose.video.files import FrameIndex
+    from worldpose.video.pictures import FrameIndex
 
 
 @dataclass(frozen=True)

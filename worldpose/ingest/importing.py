@@ -30,8 +30,9 @@ from worldpose.formats.lens_files import read_lens_toml, read_lenses, write_lens
 from worldpose.ingest.match_folder import LENS_FILE, image_sizes, read_spec
 from worldpose.ingest.validation import validate_record
 from worldpose.ingest.writing import copy_boxes, write_match
-from worldpose.video.files import FrameIndex, VideoReader, index_frames
+from worldpose.video.files import VideoReader, index_frames
 from worldpose.video.names import VIDEO_SUFFIXES, is_video
+from worldpose.video.pictures import FrameIndex
 
 SAME_SHAPE: Final = 0.002
 """Largest relative difference of two shapes of one picture [1]: sides are whole pixels."""

@@ -11,7 +11,7 @@ from data_contracts.pitch import PitchSpec
 from worldpose.errors import InputError
 from worldpose.formats.files import read_json, read_yaml
 from worldpose.ingest.validation import existing_file, validate_record
-from worldpose.pitch.template import law_points
+from worldpose.pitch.laws import law_points
 
 SIZES: Final = {"length": (80.0, 130.0), "width": (40.0, 100.0)}
 """Allowed sizes of a football pitch [m]: the Laws allow 90 to 120 by 45 to 90."""

@@ -30,8 +30,8 @@ from worldpose.ingest.footage import write_still
 from worldpose.ingest.match_folder import read_match
 from worldpose.ingest.pitch_file import NO_PITCH
 from worldpose.ingest.validation import require_local, validate_record
-from worldpose.video.files import FrameIndex
 from worldpose.video.folder import index_video
+from worldpose.video.pictures import FrameIndex
 
 
 @dataclass(frozen=True)

@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from data_contracts.arrays import Floats
 from data_contracts.pitch import PitchSpec
 from data_contracts.records import Record
 from worldpose.errors import InputError
-from worldpose.pitch.template import law_lines, law_points
-
-SURVEY_BYTES: Final = 1 << 20
-"""Largest size of a survey [byte]; all named points take 3 kB."""
+from worldpose.pitch.laws import law_lines, law_points
 
 COLUMNS: Final[Mapping[str, str]] = {
     "x": "x",
@@ -50,7 +47,7 @@ class Survey:
 
     where: str
     names: tuple[str, ...]
-    places: NDArray[np.float64]
+    places: Floats
 
 
 def read_survey(path: Path) -> Survey:
@@ -69,7 +66,11 @@ def read_survey(path: Path) -> Survey:
         raise _wrong(str(path), "a header and one row for each point", "nothing")
     header = [title.strip().lower() for title in rows[0]]
     axes = [COLUMNS.get(title) for title in header if title != "name"]
-    if header.count("name") != 1 or None in axes or sorted(map(str, axes)) not in _AXES:
+    if (
+        header.count("name") != 1
+        or None in axes
+        or sorted(map(str, axes)) not in (["x", "y"], ["x", "y", "z"])
+    ):
         raise _wrong(
             f"{path}: row 1",
             "the columns name, x, y and, where there are heights, z (or easting, northing, height)",
@@ -103,15 +104,13 @@ def line_ends() -> dict[str, str]:
     return starts | {f"{name}.end": line.end for name, line in lines.items()}
 
 
-_AXES: Final[Sequence[list[str]]] = (["x", "y"], ["x", "y", "z"])
-
-
 def _rows(path: Path) -> list[list[str]]:
+    most = 1 << 20  # all named points take 3 kB
     try:
         if not path.is_file():
             raise _wrong(str(path), "a CSV file", "nothing", "Check the path.")
-        if path.stat().st_size > SURVEY_BYTES:
-            raise _wrong(str(path), f"at most {SURVEY_BYTES} bytes", f"{path.stat().st_size}")
+        if path.stat().st_size > most:
+            raise _wrong(str(path), f"at most {most} bytes", f"{path.stat().st_size}")
         text = path.read_text(encoding="utf-8-sig")
         first = text.partition("\n")[0]
         separator = max(",;\t", key=first.count)
@@ -121,11 +120,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _number(where: str, title: str, values: Mapping[str, str]) -> float:
-    """Return the number in a column of one row; NaN for an empty height.
-
-    Raises:
-        InputError: the text is no finite number.
-    """
+    """Return the finite number in a column of one row; NaN for an empty height."""
     text = values[title]
     if COLUMNS[title] == "z" and not text:
         return math.nan
@@ -172,12 +167,11 @@ _STANDARD_SIZE: Final = (105.0, 68.0)
 """Initial length and width of a pitch [m]."""
 
 
-def _law_places(survey: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the positions of the survey's points in the Laws of the Game.
+def _law_places(survey: Survey) -> tuple[Floats, Floats]:
+    """Return the survey's points in the Laws: positions (n, 3) [m] and their change (n, 2) [1].
 
-    Returns:
-        Positions (n, 3) [m] on a pitch of no length and width, z above the surface, and the change
-        of x by length and of y by width (n, 2) [1].
+    On a pitch of no length and width, z above the surface; the change is of x by the length, and of
+    y by the width.
     """
     base, larger = law_points(0.0, 0.0), law_points(1.0, 1.0)
     at = np.array([base[name] for name in survey.names]).reshape(-1, 3)
@@ -185,32 +179,26 @@ def _law_places(survey: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64
     return at, change[:, :2]
 
 
-def _nominal_places(survey: Survey) -> NDArray[np.float64]:
+def _nominal_places(survey: Survey) -> Floats:
     """Return the points' positions in plan (n, 2) [m] on a pitch of 105 x 68 m."""
     law, change = _law_places(survey)
     return np.asarray(law[:, :2] + change * _STANDARD_SIZE)
 
 
-def _best_rotation(
-    centred: NDArray[np.float64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _best_rotation(centred: Floats, places: Floats) -> Floats:
     """Return the rotation (2, 2) that brings centred points nearest to others."""
     (a, b), (c, d) = centred.T @ (places - places.mean(axis=0))
     return _plane_rotation(float(np.arctan2(b - c, a + d)))
 
 
-def _plane_rotation(angle: float) -> NDArray[np.float64]:
+def _plane_rotation(angle: float) -> Floats:
     """Return the rotation (2, 2) by an angle [rad], from x towards y."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
 def _require_spread(survey: Survey) -> None:
-    """Reject fewer than four points, or points near one line.
-
-    Raises:
-        InputError: the survey is rejected; the error names the points.
-    """
+    """Reject fewer than four points, or points near one line."""
     enough = len(survey.names) >= 4
     for places in (survey.places[:, :2], _nominal_places(survey)) if enough else ():
         extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
@@ -224,19 +212,8 @@ def _require_spread(survey: Survey) -> None:
         )
 
 
-def _require_orientation(
-    survey: Survey, places: NDArray[np.float64], settings: SurveySettings
-) -> None:
-    """Reject a survey whose mirror image fits far better than the survey.
-
-    Args:
-        survey: survey, which the messages name.
-        places: (n, 2) [m], in a right-handed frame if the settings are correct.
-        settings: stated handedness of the frame.
-
-    Raises:
-        InputError: the survey is rejected; the error names possible causes.
-    """
+def _require_orientation(survey: Survey, places: Floats, settings: SurveySettings) -> None:
+    """Reject a survey whose mirror image fits far better than the survey."""
     nominal = _nominal_places(survey)
     target = nominal - nominal.mean(axis=0)
     errors = []
@@ -256,17 +233,8 @@ def _require_orientation(
         )
 
 
-def _require_names(survey: Survey, offsets: NDArray[np.float64], settings: SurveySettings) -> None:
-    """Reject points that are far from the positions of their names.
-
-    Args:
-        survey: survey, which the messages name.
-        offsets: (n, 2) offsets of the aligned survey from the Laws [m].
-        settings: largest plausible error of the markings.
-
-    Raises:
-        InputError: the survey is rejected; the error names the points.
-    """
+def _require_names(survey: Survey, offsets: Floats, settings: SurveySettings) -> None:
+    """Reject points that are far from the positions of their names."""
     offset = np.linalg.norm(offsets, axis=-1)
     far = [
         f"{survey.names[n]} ({offset[n]:.2f} m)"
@@ -298,15 +266,15 @@ class SurveyFit:
 
     pitch: PitchSpec
     names: tuple[str, ...]
-    offset_plan: NDArray[np.float64]
-    offset_height: NDArray[np.float64]
+    offset_plan: Floats
+    offset_height: Floats
     scale: float
     slope: tuple[float, float]
     measured: tuple[str, ...]
 
 
 def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> SurveyFit:
-    """Fit the pitch to a survey in any frame with heights upwards, and move it to the world frame.
+    """Fit the pitch to a survey in any frame with heights upwards, and move it to the world (C1).
 
     The names determine the orientation: left and right, near and far are those of a person at the
     main camera, which stands at negative y. The frame is rotated, shifted and levelled, and scaled
@@ -320,9 +288,6 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
     Raises:
         InputError: fewer than four points, or all near one line; another unit than metres; a
             mirror image; points far from the positions of their names.
-
-    Note:
-        C1.
     """
     settings = settings or SurveySettings()
     _require_spread(survey)
@@ -360,43 +325,35 @@ def fit_survey(survey: Survey, settings: SurveySettings | None = None) -> Survey
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
+class _Plan(NamedTuple):
     """The survey in plan, in the world: survey and law (n, 2) [m], and the rotation."""
 
-    places: NDArray[np.float64]
-    law: NDArray[np.float64]
-    turn: NDArray[np.float64]
+    places: Floats
+    law: Floats
+    turn: Floats
     length: float
     width: float
     measured: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Heights:
+class _Heights(NamedTuple):
     """Heights in the world and over the crowned surface (n,) [m]."""
 
-    places: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    places: Floats
+    offset: Floats
     crown: float
-    slope: NDArray[np.float64]
+    slope: Floats
     measured: bool
 
 
-_MAX_ITERATIONS: Final = 30
-"""Iterations of reweighted Gauss-Newton; the loss has its final width after ten."""
-
-
 def _fit_plan_and_heights(
-    survey: Survey, places: NDArray[np.float64], settings: SurveySettings
+    survey: Survey, places: Floats, settings: SurveySettings
 ) -> tuple[_Plan, _Heights]:
     plan = _fit_plan(survey, places[:, :2], settings)
     return plan, _fit_heights(survey, plan, places[:, 2], settings)
 
 
-def _rotate_to_level(
-    places: NDArray[np.float64], level: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _rotate_to_level(places: Floats, level: Floats) -> Floats:
     """Return points (n, 3) [m] after a rotation; a point without height lies on the plane."""
     taken = np.isfinite(places[:, 2])
     if not taken.any():
@@ -410,7 +367,7 @@ def _rotate_to_level(
 
 
 def _fit_plan(
-    survey: Survey, places: NDArray[np.float64], settings: SurveySettings, stretch: bool = False
+    survey: Survey, places: Floats, settings: SurveySettings, stretch: bool = False
 ) -> _Plan:
     """Fit rotation, shift, length and width by robust least squares, with `stretch` the scale."""
     law, change = _law_places(survey)
@@ -421,7 +378,8 @@ def _fit_plan(
     shift = (law[:, :2] + change * size).mean(axis=0)
     spreads = np.array([settings.length_std_m, settings.width_std_m])
     scale = 1.0
-    for iteration in range(_MAX_ITERATIONS):
+    # The loss has its final width after ten iterations.
+    for iteration in range(30):
         turned = centred @ turn.T
         residual = scale * turned + shift - law[:, :2] - change * size
         # Wide at first: the start may be metres off if the pitch is not 105 x 68 m.
@@ -454,7 +412,7 @@ def _fit_plan(
 
 
 def _fit_heights(
-    survey: Survey, plan: _Plan, heights: NDArray[np.float64], settings: SurveySettings
+    survey: Survey, plan: _Plan, heights: Floats, settings: SurveySettings
 ) -> _Heights:
     """Fit level, slope and crown by least squares to the points with a height."""
     above = _law_places(survey)[0][:, 2]
@@ -486,7 +444,7 @@ def _fit_heights(
     )
 
 
-def _leveling_rotation(slope: NDArray[np.float64]) -> NDArray[np.float64]:
+def _leveling_rotation(slope: Floats) -> Floats:
     """Return the rotation (3, 3) that makes a plane with this slope horizontal."""
     normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1.0 + slope @ slope)
     x, y, z = normal
@@ -499,12 +457,8 @@ def _leveling_rotation(slope: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _estimate_scale(survey: Survey, places: NDArray[np.float64], settings: SurveySettings) -> float:
-    """Return the ratio of lengths in the survey to true ones.
-
-    Raises:
-        InputError: the ratio differs from 1 by more than in any grid.
-    """
+def _estimate_scale(survey: Survey, places: Floats, settings: SurveySettings) -> float:
+    """Return the ratio of lengths in the survey to true ones; reject that of another unit."""
     nominal = _nominal_places(survey)
     extents = [np.linalg.norm(each - each.mean(axis=0)) for each in (places, nominal)]
     gross = float(extents[0] / extents[1])

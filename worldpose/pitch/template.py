@@ -8,132 +8,31 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from data_contracts.arrays import Floats, Integers
 from data_contracts.pitch import ArcSpec, LineSpec, PitchSpec
 from worldpose.errors import InputError
-
-PENALTY_AREA = (16.5, 40.32)
-"""Depth from the goal line, width along it [m]: 16.5 m to either side of the goal of 7.32 m."""
-GOAL_AREA = (5.5, 18.32)
-"""Depth from the goal line, width along it [m]: 5.5 m to either side of the goal."""
-GOAL = (2.44, 7.32)
-"""Height of the crossbar's lower edge, width between the posts [m]."""
-PENALTY_MARK_DISTANCE = 11.0
-"""Distance from the goal line [m]."""
-CIRCLE_RADIUS = 9.15
-"""Radius of the centre circle, and of the penalty arcs around the penalty marks [m]."""
-CORNER_RADIUS = 1.0
-"""Radius of the corner arcs [m]."""
-
-SIDES = {"left": -1.0, "right": 1.0}
-ENDS = {"near": -1.0, "far": 1.0}
-
-# Half the opening of a penalty arc, where the circle crosses the line of the penalty area.
-_ARC_HALF_ANGLE = math.acos((PENALTY_AREA[0] - PENALTY_MARK_DISTANCE) / CIRCLE_RADIUS)
-
-Place = tuple[float, float, float]
-
-
-def law_points(length: float, width: float) -> dict[str, Place]:
-    """Return the named points as (x, y, height above the surface) [m], world.
-
-    Args:
-        length: length of the pitch [m].
-        width: width of the pitch [m].
-    """
-    x_goal, y_touch = 0.5 * length, 0.5 * width
-    points: dict[str, Place] = {"center_mark": (0.0, 0.0, 0.0)}
-    for end, toward in ENDS.items():
-        points[f"halfway_{end}"] = (0.0, toward * y_touch, 0.0)
-        points[f"center_circle_{end}"] = (0.0, toward * CIRCLE_RADIUS, 0.0)
-    for side, out in SIDES.items():
-        points[f"penalty_mark_{side}"] = (out * (x_goal - PENALTY_MARK_DISTANCE), 0.0, 0.0)
-        for end, toward in ENDS.items():
-            points[f"corner_{side}_{end}"] = (out * x_goal, toward * y_touch, 0.0)
-            for area, (depth, across) in (("penalty", PENALTY_AREA), ("goal", GOAL_AREA)):
-                y = toward * 0.5 * across
-                points[f"{area}_area_{side}_{end}_back"] = (out * x_goal, y, 0.0)
-                points[f"{area}_area_{side}_{end}_front"] = (out * (x_goal - depth), y, 0.0)
-            points[f"penalty_arc_{side}_{end}"] = (
-                out * (x_goal - PENALTY_AREA[0]),
-                toward * CIRCLE_RADIUS * math.sin(_ARC_HALF_ANGLE),
-                0.0,
-            )
-            y = toward * 0.5 * GOAL[1]
-            points[f"goal_post_{side}_{end}_bottom"] = (out * x_goal, y, 0.0)
-            points[f"goal_post_{side}_{end}_top"] = (out * x_goal, y, GOAL[0])
-    return points
-
-
-def law_lines() -> dict[str, LineSpec]:
-    """Return the straight markings by name."""
-    lines = {"halfway_line": LineSpec(start="halfway_near", end="halfway_far")}
-    for end in ENDS:
-        lines[f"touch_line_{end}"] = LineSpec(start=f"corner_left_{end}", end=f"corner_right_{end}")
-    for side in SIDES:
-        lines[f"goal_line_{side}"] = LineSpec(start=f"corner_{side}_near", end=f"corner_{side}_far")
-        for area in ("penalty_area", "goal_area"):
-            corner = f"{area}_{side}"
-            lines[f"{corner}_front"] = LineSpec(
-                start=f"{corner}_near_front", end=f"{corner}_far_front"
-            )
-            for end in ENDS:
-                lines[f"{corner}_{end}"] = LineSpec(
-                    start=f"{corner}_{end}_back", end=f"{corner}_{end}_front"
-                )
-    return lines
-
-
-def law_goals() -> dict[str, LineSpec]:
-    """Return the goals' posts and crossbars by name: straight and white, but not painted."""
-    frames = {}
-    for side in SIDES:
-        for end in ENDS:
-            post = f"goal_post_{side}_{end}"
-            frames[post] = LineSpec(start=f"{post}_bottom", end=f"{post}_top")
-        frames[f"crossbar_{side}"] = LineSpec(
-            start=f"goal_post_{side}_near_top", end=f"goal_post_{side}_far_top"
-        )
-    return frames
-
-
-def law_arcs() -> dict[str, ArcSpec]:
-    """Return the curved markings by name."""
-    arcs = {
-        "center_circle": ArcSpec(
-            center="center_mark", radius=CIRCLE_RADIUS, start_angle=0.0, end_angle=2.0 * math.pi
-        )
-    }
-    # Each begins at the angle at which it enters the pitch, in the direction from x towards y.
-    quarters = (("left_near", 0), ("right_near", 1), ("right_far", 2), ("left_far", 3))
-    for corner, quarter in quarters:
-        arcs[f"corner_arc_{corner}"] = ArcSpec(
-            center=f"corner_{corner}",
-            radius=CORNER_RADIUS,
-            start_angle=quarter * 0.5 * math.pi,
-            end_angle=(quarter + 1) * 0.5 * math.pi,
-        )
-    for side, middle in (("left", 0.0), ("right", math.pi)):
-        arcs[f"penalty_arc_{side}"] = ArcSpec(
-            center=f"penalty_mark_{side}",
-            radius=CIRCLE_RADIUS,
-            start_angle=middle - _ARC_HALF_ANGLE,
-            end_angle=middle + _ARC_HALF_ANGLE,
-        )
-    return arcs
+from worldpose.pitch.laws import (
+    CIRCLE_RADIUS,
+    ENDS,
+    PENALTY_AREA,
+    PENALTY_MARK_DISTANCE,
+    SIDES,
+    law_arcs,
+    law_goals,
+    law_lines,
+    law_points,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class MarkingSamples:
-    """Points along the painted markings, each with the index of its marking."""
+    """Points (n, 3) along the painted markings [m], world, with their marking (n,) in `names`."""
 
-    points_world: NDArray[np.float64]
-    """(n, 3) [m], world."""
-    marking: NDArray[np.int64]
-    """(n,) indices into `names`."""
+    points_world: Floats
+    marking: Integers
     names: tuple[str, ...]
-    """Names of the markings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +53,7 @@ class PitchTemplate:
     """Height of the long axis above the touch lines [m]."""
     end_fall: float
     """Height of the halfway line above the goal lines [m]."""
-    points: dict[str, NDArray[np.float64]]
+    points: dict[str, Floats]
     """(3,) [m], world, by name. Law 1 gives, for side in left (negative x), right and end in near
     (negative y), far: `center_mark`, `halfway_{end}`, `center_circle_{end}` (its crossings with
     the halfway line), `corner_{side}_{end}`, `penalty_mark_{side}`, `penalty_arc_{side}_{end}`
@@ -218,21 +117,21 @@ class PitchTemplate:
         sizes = ("length", "width", "crown", "end_fall")
         assumed = [name for name in sizes if getattr(spec, name) == getattr(usual, name)]
         return cls(
-            spec.length,
-            spec.width,
-            spec.crown,
-            spec.end_fall,
-            points,
-            lines,
-            arcs,
-            law_goals(),
-            unpainted,
+            length=spec.length,
+            width=spec.width,
+            crown=spec.crown,
+            end_fall=spec.end_fall,
+            points=points,
+            lines=lines,
+            arcs=arcs,
+            goals=law_goals(),
+            unpainted=unpainted,
             surveyed=frozenset(spec.points),
             leveled=frozenset(name for name, place in spec.points.items() if len(place) == 3),
             assumed=frozenset(() if spec.points else assumed),
         )
 
-    def height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+    def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
         """Return the height of the surface [m], continued beyond the touch lines.
 
         Args:
@@ -246,16 +145,12 @@ class PitchTemplate:
         return np.asarray(shape @ (self.crown, self.end_fall))
 
     @property
-    def surface(self) -> NDArray[np.float64]:
+    def surface(self) -> Floats:
         """(2,) crown and end fall [m]."""
         return np.array([self.crown, self.end_fall])
 
     def with_surface(self, surface: ArrayLike) -> PitchTemplate:
-        """Return the pitch with another surface; points of surveyed height keep theirs.
-
-        Args:
-            surface: (2,) crown and end fall [m].
-        """
+        """Return the pitch with another crown and end fall (2,) [m]; surveyed heights stay."""
         crown, end_fall = np.asarray(surface, dtype=np.float64).tolist()
         change = (crown - self.crown, end_fall - self.end_fall)
         points = {}
@@ -265,15 +160,10 @@ class PitchTemplate:
                 rise = surface_shape(place[0], place[1], (self.length, self.width)) @ change
                 points[name][2] += float(rise)
             points[name].setflags(write=False)
-        return replace(
-            self,
-            points=points,
-            crown=crown,
-            end_fall=end_fall,
-            assumed=self.assumed - {"crown", "end_fall"},
-        )
+        assumed = self.assumed - {"crown", "end_fall"}
+        return replace(self, points=points, crown=crown, end_fall=end_fall, assumed=assumed)
 
-    def positions(self, names: Sequence[str]) -> NDArray[np.float64]:
+    def positions(self, names: Sequence[str]) -> Floats:
         """Return named points (n, 3) [m], world.
 
         Raises:
@@ -284,7 +174,7 @@ class PitchTemplate:
                 raise _unknown_point("PitchTemplate.positions", name, self.points)
         return np.array([self.points[name] for name in names], dtype=np.float64).reshape(-1, 3)
 
-    def by_surface(self, names: Sequence[str]) -> NDArray[np.float64]:
+    def by_surface(self, names: Sequence[str]) -> Floats:
         """Return derivatives (n, 2) of points' heights by crown and end fall [m/m].
 
         Raises:
@@ -295,17 +185,15 @@ class PitchTemplate:
         free = np.array([name not in self.leveled for name in names], dtype=np.bool_)
         return np.asarray(shape * free[:, None])
 
-    def marking_by_surface(self, name: str, spacing: float) -> NDArray[np.float64]:
+    def marking_by_surface(self, name: str, spacing: float) -> Floats:
         """Return derivatives (n, 2) of the heights of `marking_points`, as `by_surface`."""
         return self._difference(lambda pitch: pitch.marking_points(name, spacing))
 
-    def samples_by_surface(self, spacing: float) -> NDArray[np.float64]:
+    def samples_by_surface(self, spacing: float) -> Floats:
         """Return derivatives (n, 2) of the heights of `sample_lines`, as `by_surface`."""
         return self._difference(lambda pitch: pitch.sample_lines(spacing).points_world)
 
-    def _difference(
-        self, places: Callable[[PitchTemplate], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
+    def _difference(self, places: Callable[[PitchTemplate], Floats]) -> Floats:
         """Return derivatives (n, 2) of heights; they are linear in the surface."""
         here = places(self)[:, 2]
         others = [self.with_surface(self.surface + axis) for axis in np.eye(2)]
@@ -321,7 +209,7 @@ class PitchTemplate:
         """Names of what is white: painted lines, arcs, and the goals' posts and crossbars."""
         return (*self.lines, *self.arcs, *self.goals)
 
-    def marking_points(self, name: str, spacing: float) -> NDArray[np.float64]:
+    def marking_points(self, name: str, spacing: float) -> Floats:
         """Return points (n, 3) [m], world, along one marking, both ends included.
 
         Args:
@@ -345,11 +233,10 @@ class PitchTemplate:
                 found=repr(name),
                 todo=f"Use one of {', '.join(sorted(self.marking_names))}.",
             )
-        start, end = (self.points[getattr(self.goals[name], key)] for key in ("start", "end"))
-        steps = _steps(float(np.linalg.norm(end - start)), spacing)
-        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
-        bar: NDArray[np.float64] = (1.0 - share) * start + share * end
-        return bar
+        goal = self.goals[name]
+        start, end = self.points[goal.start], self.points[goal.end]
+        share = _shares(float(np.linalg.norm(end - start)), spacing)
+        return np.asarray((1.0 - share) * start + share * end)
 
     def sample_lines(self, spacing: float) -> MarkingSamples:
         """Return points along all markings, both ends included, evenly spaced in plan.
@@ -379,15 +266,14 @@ class PitchTemplate:
             names=(*self.lines, *self.arcs),
         )
 
-    def _line_points(self, line: LineSpec, spacing: float) -> NDArray[np.float64]:
+    def _line_points(self, line: LineSpec, spacing: float) -> Floats:
         start, end = self.points[line.start], self.points[line.end]
-        steps = _steps(float(np.linalg.norm(end[:2] - start[:2])), spacing)
-        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        share = _shares(float(np.linalg.norm(end[:2] - start[:2])), spacing)
         points = (1.0 - share) * self._above_surface(start) + share * self._above_surface(end)
         points[:, 2] += self.height(points[:, 0], points[:, 1])
         return points
 
-    def _arc_points(self, arc: ArcSpec, spacing: float) -> NDArray[np.float64]:
+    def _arc_points(self, arc: ArcSpec, spacing: float) -> Floats:
         span = arc.end_angle - arc.start_angle
         steps = _steps(span * arc.radius, spacing)
         angle = np.linspace(arc.start_angle, arc.end_angle, steps + 1)
@@ -399,13 +285,13 @@ class PitchTemplate:
         points[:, 2] += self.height(points[:, 0], points[:, 1])
         return points
 
-    def _above_surface(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _above_surface(self, point: Floats) -> Floats:
         """Return (3,) x, y and the height above the crowned surface [m]."""
         x, y, z = point
         return np.array([x, y, z - float(self.height(x, y))])
 
 
-def surface_shape(x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> NDArray[np.float64]:
+def surface_shape(x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> Floats:
     """Return the derivatives (..., 2) of the surface's height by crown and end fall [m/m].
 
     Args:
@@ -417,6 +303,11 @@ def surface_shape(x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> NDAr
     across = np.asarray(y, dtype=np.float64) / (0.5 * size[1])
     # 0 - keeps the long axis free of negative zero.
     return 0.0 - np.stack([across**2, along**2], axis=-1)
+
+
+def _shares(extent: float, spacing: float) -> Floats:
+    """Return evenly spaced shares (n, 1) of a straight marking [1], both ends included."""
+    return np.linspace(0.0, 1.0, _steps(extent, spacing) + 1)[:, None]
 
 
 def _steps(extent: float, spacing: float) -> int:
@@ -455,7 +346,7 @@ def _check_size(spec: PitchSpec) -> None:
 
 
 def _check_markings(
-    points: dict[str, NDArray[np.float64]], lines: dict[str, LineSpec], arcs: dict[str, ArcSpec]
+    points: dict[str, Floats], lines: dict[str, LineSpec], arcs: dict[str, ArcSpec]
 ) -> None:
     """Raise InputError unless markings name known points and arcs run once around at most."""
     for name, line in lines.items():
@@ -474,7 +365,7 @@ def _check_markings(
             )
 
 
-def _unknown_point(where: str, name: str, points: dict[str, NDArray[np.float64]]) -> InputError:
+def _unknown_point(where: str, name: str, points: dict[str, Floats]) -> InputError:
     return InputError(
         where,
         expected="the name of a point",
@@ -486,8 +377,6 @@ def _unknown_point(where: str, name: str, points: dict[str, NDArray[np.float64]]
 PRIOR_STD_M: Final = np.array([0.1, 0.25])
 """Standard deviations of the crown about that of pitch.json, as in surveys, and of the end fall
 [m]: 0.5 m are 1 % of half the length."""
-_LEVEL_STD_M: Final = 0.02
-"""Deviation of a surveyed height from the shape [m]: ground is uneven by 1 to 3 cm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,22 +394,23 @@ class Surface:
         covariance: (2, 2) [m^2].
     """
 
-    shape: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    shape: Floats
+    covariance: Floats
 
     @classmethod
     def of(cls, pitch: PitchTemplate) -> Surface:
         """Return what is known of a pitch before any image: its template, and surveyed heights."""
+        level_std_m = 0.02  # ground is uneven by 1 to 3 cm
         stated, information = pitch.surface, np.diag(PRIOR_STD_M**-2.0)
         laws = law_points(pitch.length, pitch.width)
         names = sorted(pitch.leveled & laws.keys())
         places = pitch.positions(names)
         rows = surface_shape(places[:, 0], places[:, 1], (pitch.length, pitch.width))
         above = places[:, 2] - [laws[name][2] for name in names] - rows @ stated
-        covariance = np.asarray(np.linalg.inv(information + rows.T @ rows / _LEVEL_STD_M**2))
-        return cls(stated + covariance @ rows.T @ above / _LEVEL_STD_M**2, covariance)
+        covariance = np.asarray(np.linalg.inv(information + rows.T @ rows / level_std_m**2))
+        return cls(stated + covariance @ rows.T @ above / level_std_m**2, covariance)
 
-    def whiten(self, shape: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def whiten(self, shape: Floats) -> tuple[Floats, Floats]:
         """Return whitened residuals (2,) of a shape (2,), and derivatives (2, 2) by it."""
-        rows: NDArray[np.float64] = np.linalg.inv(np.linalg.cholesky(self.covariance))
+        rows: Floats = np.linalg.inv(np.linalg.cholesky(self.covariance))
         return rows @ (shape - self.shape), rows

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.cameras import LensCalibration
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
@@ -26,10 +25,6 @@ from worldpose.static_calibration.settings import StaticCalibrationSettings
 
 _ITERATIONS: Final = 60
 """Enough from any start in the basin; most end after ten."""
-_MIN_DEPTH: Final = 1.0
-"""Depth [m] below which no point is clicked: the camera is far from the answer."""
-_MIN_HEIGHT: Final = 0.5
-"""Height [m] below which the prior pushes a camera up as strongly as at this height."""
 TOLERANCE: Final = 1e-10
 """Relative decrease of the cost below which the loop counts as converged."""
 
@@ -43,9 +38,9 @@ class Problem:
         image_size: width, height [px].
         prior: (21,), see `prior_residuals`.
         free: (12,) parameters to solve for.
-        click_noise: standard deviation of each click (n,), each axis [px].
-        drawn_noise: standard deviation of each drawn pixel (d,), across its marking [px]: larger
-            where other pixels are close, so that a marking counts by its length.
+        click_noise: (n,) standard deviation of each click, each axis [px].
+        drawn_noise: (d,) standard deviation of each drawn pixel, across its marking [px]: larger
+            where other pixels are close.
         drawn_loss: Cauchy scale of drawn points [standard deviations].
         where: file or camera, for messages.
         lens: the given lens that `prior` contains; None = none is known.
@@ -53,10 +48,10 @@ class Problem:
 
     evidence: Evidence
     image_size: tuple[int, int]
-    prior: NDArray[np.float64]
-    free: NDArray[np.bool_]
-    click_noise: NDArray[np.float64]
-    drawn_noise: NDArray[np.float64]
+    prior: Floats
+    free: Flags
+    click_noise: Floats
+    drawn_noise: Floats
     drawn_loss: float
     where: str = "clicked markings"
     lens: LensCalibration | None = None
@@ -66,7 +61,7 @@ class Problem:
         """Half the image diagonal [px]."""
         return 0.5 * float(np.hypot(*self.image_size))
 
-    def select(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Problem:
+    def select(self, points: Flags, markings: Flags) -> Problem:
         """Return the problem restricted to some clicked points (n,) and drawn markings (m,)."""
         return replace(
             self,
@@ -75,20 +70,15 @@ class Problem:
             drawn_noise=self.drawn_noise[markings[self.evidence.drawn_marking]],
         )
 
-    def with_survey_error(
-        self, row: NDArray[np.float64], settings: StaticCalibrationSettings
-    ) -> Problem:
-        """Return the problem with click noise that includes the projected survey error.
+    def with_survey_error(self, row: Floats, settings: StaticCalibrationSettings) -> Problem:
+        """Return the problem with click noise that includes the survey error before a camera (22,).
 
-        A survey error that is equal along all three axes is the same along both image axes: the
-        error in meters times focal length over depth.
-
-        Args:
-            row: (22,) camera near the answer.
-            settings: noise of clicks and survey.
+        A survey error that is equal along all axes of the world is so along both axes of the image:
+        the error in meters times focal length over depth.
         """
+        min_depth = 1.0  # [m]; a camera nearer to a clicked point is far from the answer
         depth = self.evidence.points_world @ row[15:18] + row[20]
-        meter = np.where(depth > _MIN_DEPTH, row[0] / np.maximum(depth, _MIN_DEPTH), 0.0)
+        meter = np.where(depth > min_depth, row[0] / np.maximum(depth, min_depth), 0.0)
         return replace(
             self, click_noise=np.hypot(settings.click_noise_px, settings.survey_error_m * meter)
         )
@@ -117,14 +107,10 @@ def build_problem(
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
 ) -> Problem:
-    """Return the fit problem of evidence and settings.
+    """Return the fit problem of evidence in an image of a width and height [px].
 
-    Args:
-        evidence: clicks and drawn markings.
-        image_size: width, height [px].
-        settings: noise, prior, free coefficients.
-        where: file or camera, for messages.
-        lens: replaces the prior of focal length, principal point and distortion.
+    A lens replaces the prior of focal length, principal point and distortion; `where` is for
+    messages.
     """
     width, height = image_size
     known = settings.prior
@@ -136,7 +122,7 @@ def build_problem(
     prior += [*middle, known.principal_point_std * width, 0.5 * np.hypot(width, height)]
     prior += [known.k1_std, known.k2_std, known.k3_std]
     prior += [np.log(known.height_m), known.log_height_std]
-    prior += [np.log(known.distance_m), known.log_distance_std, known.roll_std_rad, _MIN_HEIGHT]
+    prior += [np.log(known.distance_m), known.log_distance_std, known.roll_std_rad, 0.5]
     prior += [*known.lens_std, known.k1, 0.0, 0.0]
     if lens is not None:
         reach = (0.5 * np.hypot(width, height) / lens.focal_px) ** 2
@@ -160,19 +146,11 @@ def build_problem(
 
 
 def adjust(
-    problem: Problem,
-    rows: NDArray[np.float64],
-    *,
-    click_loss: float = np.inf,
-    iterations: int = _ITERATIONS,
+    problem: Problem, rows: Floats, *, click_loss: float = np.inf, iterations: int = _ITERATIONS
 ) -> Fits:
-    """Return cameras fitted from starts.
+    """Return cameras fitted from starts (b, 22) in so many iterations at most; 0 only evaluates.
 
-    Args:
-        problem: evidence, noise and prior.
-        rows: (b, 22) starts.
-        click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
-        iterations: at most; 0 only evaluates the starts.
+    The loss of clicks is a Cauchy scale [standard deviations]; infinite = least squares.
     """
     count, evidence = len(rows), problem.evidence
     starts = rows.copy()
@@ -241,7 +219,7 @@ def compute_residuals(problem: Problem, row: Floats) -> Residuals:
     )
 
 
-def camera_row(camera: Camera) -> NDArray[np.float64]:
+def camera_row(camera: Camera) -> Floats:
     """Return the (22,) row of a single camera; the solver checks lens folds itself."""
     pose = camera.cam_from_world
     return np.concatenate(
@@ -256,7 +234,7 @@ def camera_row(camera: Camera) -> NDArray[np.float64]:
     )
 
 
-def camera_from_row(row: NDArray[np.float64], image_size: tuple[int, int]) -> Camera:
+def camera_from_row(row: Floats, image_size: tuple[int, int]) -> Camera:
     """Return the camera of a row."""
     u, _, v = np.linalg.svd(row[9:18].reshape(3, 3))
     return Camera(
@@ -269,23 +247,7 @@ def camera_from_row(row: NDArray[np.float64], image_size: tuple[int, int]) -> Ca
 
 
 class Measurements(NamedTuple):
-    """Clicks, drawn markings and prior of a camera fit.
-
-    Attributes:
-        points_world: (n, 3) clicked points [m], world.
-        points_image: (n, 2) [px].
-        samples_world: (s, 3) [m], world, along the drawn markings one after another.
-        bounds: (m + 1,) first sample of each marking, and the end.
-        drawn_image: (d, 2) drawn pixels [px].
-        drawn_marking: (d,) index of the marking of each.
-        prior: (21,), see `prior_residuals`.
-        free: (12,) parameters to solve for.
-        click_noise: (n,) standard deviations, each axis [px].
-        drawn_noise: (d,) standard deviations across the marking [px].
-        half_diagonal: half of the diagonal of the image [px].
-        click_loss: Cauchy scale of clicks [standard deviations]; infinite = least squares.
-        drawn_loss: Cauchy scale of drawn pixels [standard deviations].
-    """
+    """Clicks, drawn markings and prior of a camera fit; see `Evidence` and `Problem`."""
 
     points_world: Floats
     points_image: Floats
@@ -294,7 +256,7 @@ class Measurements(NamedTuple):
     drawn_image: Floats
     drawn_marking: Integers
     prior: Floats
-    free: NDArray[np.bool_]
+    free: Flags
     click_noise: Floats
     drawn_noise: Floats
     half_diagonal: float
@@ -302,35 +264,15 @@ class Measurements(NamedTuple):
     drawn_loss: float
 
 
-class Linearization(NamedTuple):
-    """Normal equations linearized at one estimate, written by the kernels.
-
-    Attributes:
-        information: (12, 12) information of evidence and prior.
-        evidence_information: (12, 12) contribution of the evidence alone.
-        gradient: (12,) gradient of the cost.
-    """
-
-    information: Floats
-    evidence_information: Floats
-    gradient: Floats
-
-
 @compile_kernel
 def descend(given: Measurements, iterations: int, found: Fits) -> None:
-    """Minimize the cost from each row in place; see `adjust`.
-
-    Args:
-        given: evidence and prior.
-        iterations: at most, per start; 0 only evaluates the starts.
-        found: starts in its rows; written.
-    """
+    """Minimize the cost from each row of `found` in place; see `adjust`."""
     rows, cost, information = found.rows, found.cost, found.information
     free = given.free
     trial = np.empty(22)
     system = np.empty((SIZE, SIZE))
     gradient = np.empty(SIZE)
-    new = Linearization(np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE))
+    new, observed, slope = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE)
     step = np.empty(SIZE)
     for b in range(len(rows)):
         trial[:] = rows[b]
@@ -339,14 +281,14 @@ def descend(given: Measurements, iterations: int, found: Fits) -> None:
         stalled = 0
         iteration = 0
         while True:
-            reached = _linearize(trial, given, new)
+            reached = _linearize(trial, given, new, observed, slope)
             if reached < cost[b] or iteration == 0:
                 stalled = stalled + 1 if cost[b] - reached < TOLERANCE * cost[b] else 0
                 rows[b] = trial
                 cost[b] = reached
-                information[b] = new.information
-                found.evidence_information[b] = new.evidence_information
-                gradient[:] = new.gradient
+                information[b] = new
+                found.evidence_information[b] = observed
+                gradient[:] = slope
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping *= 8.0
@@ -362,10 +304,13 @@ def descend(given: Measurements, iterations: int, found: Fits) -> None:
 
 
 @compile_kernel
-def _linearize(c: Floats, given: Measurements, written: Linearization) -> float:
-    """Return the cost at a camera; write information and gradient, zero for fixed parameters."""
-    information, observed = written.information, written.evidence_information
-    gradient = written.gradient
+def _linearize(
+    c: Floats, given: Measurements, information: Floats, observed: Floats, gradient: Floats
+) -> float:
+    """Return the cost at a camera; write the information with and without priors, and the gradient.
+
+    They are zero for fixed parameters.
+    """
     free, spread, drawn_spread = given.free, given.click_noise, given.drawn_noise
     n, d = len(given.points_world), len(given.drawn_image)
     click = np.empty((n, 2))

@@ -14,24 +14,6 @@ from worldpose.errors import InputError
 
 MIN_VIEWS: Final = 4
 """Minimum images with a board [1]: leaving out one must leave three, which determine a lens."""
-MAX_VIEWS: Final = 40
-"""Maximum views of a video [1]."""
-MIN_CORNERS: Final = 8
-"""Minimum corners of a board in an image [1]."""
-MAX_PLANE_ERROR: Final = 0.25
-"""Maximum mean residual of a plane's image, in squares [1]: a lens bends a board less, and corners
-that were counted wrongly have errors of whole squares."""
-OUTLIER_RATIO: Final = 2.0
-"""The worst image is left out if the residual is larger with it by this factor [1]."""
-MIN_RESIDUAL_PX: Final = 0.3
-"""Residual up to which no image is left out [px]."""
-SAME_VIEW: Final = 0.02
-"""Views of a video whose corners moved by less than this share of the image width are one [1]."""
-SUBPIXEL_WINDOW: Final = 5
-"""Half the side of the window in which a corner of a ChArUco board is refined [px]."""
-MAX_FOCAL_STD: Final = 0.05
-"""Maximum relative deviation of the focal length [1]; boards that all face the camera do not
-determine it."""
 
 
 @dataclass(frozen=True)
@@ -74,21 +56,17 @@ class Board:
 
         board = self._charuco()
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-        if ids is None or len(ids) < MIN_CORNERS:
+        if ids is None or len(ids) < 8:
             return None
         # The detector interpolates corners between markers.
-        window = (SUBPIXEL_WINDOW, SUBPIXEL_WINDOW)
+        window = (5, 5)  # half the sides
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
         corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
         places = np.asarray(board.getChessboardCorners())[ids.ravel(), :2]
         return BoardView(places.astype(np.float64), corners.reshape(-1, 2).astype(np.float64))
 
     def _charuco(self) -> Any:  # noqa: ANN401
-        """Return OpenCV's board.
-
-        Raises:
-            InputError: OpenCV has no such dictionary or refuses the sizes.
-        """
+        """Return OpenCV's board."""
         import cv2
 
         known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
@@ -184,9 +162,12 @@ def calibrate_lens(
     Raises:
         InputError: too few images with a board, or the boards do not determine the focal length.
     """
+    min_std_px = 0.1  # of focal length and principal point
+    max_focal_std = 0.05  # relative; boards that all face the camera do not determine it
     reasons = ["" if view is not None else "no whole board found" for view in views]
     for n, view in enumerate(views):
-        if view is not None and view.bend > MAX_PLANE_ERROR:
+        # In squares: a lens bends a board less; corners that were counted wrongly have errors of 1.
+        if view is not None and view.bend > 0.25:
             reasons[n] = "its corners are not those of a flat board"
     while True:
         chosen = [n for n, reason in enumerate(reasons) if not reason]
@@ -202,20 +183,21 @@ def calibrate_lens(
         numbers, residuals = _solve(kept, size)
         error = np.array([_rms(each) for each in residuals])
         worst = int(error.argmax())
-        if error[worst] <= MIN_RESIDUAL_PX or len(kept) == MIN_VIEWS:
+        if error[worst] <= 0.3 or len(kept) == MIN_VIEWS:
             break
         others = _solve(kept[:worst] + kept[worst + 1 :], size)[1]
-        if _rms(np.concatenate(residuals)) <= OUTLIER_RATIO * _rms(np.concatenate(others)):
+        # The worst image is left out if it doubles the residual.
+        if _rms(np.concatenate(residuals)) <= 2.0 * _rms(np.concatenate(others)):
             break
         reasons[chosen[worst]] = f"it contradicts the others, by {error[worst]:.1f} px"
     left_out = np.array([_solve(kept[:n] + kept[n + 1 :], size)[0] for n in range(len(kept))])
     count = len(kept)
     spread = (count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
     std = np.sqrt(spread)
-    if std[0] > MAX_FOCAL_STD * numbers[0]:
+    if std[0] > max_focal_std * numbers[0]:
         raise InputError(
             f"{camera}: board images",
-            expected=f"boards that determine the focal length within {100 * MAX_FOCAL_STD:g} %",
+            expected=f"boards that determine the focal length within {100 * max_focal_std:g} %",
             found=f"{numbers[0]:.0f} px with a standard deviation of {std[0]:.0f} px",
             todo="Add images in which the board is tilted by 30 to 45 degrees about both axes.",
         )
@@ -228,12 +210,11 @@ def calibrate_lens(
         focal_px=float(numbers[0]),
         principal_point_px=(float(numbers[1]), float(numbers[2])),
         distortion=(*(float(one) for one in numbers[3:7]), 0.0),
-        focal_std_px=float(max(std[0], MIN_STD_PX)),
-        principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), MIN_STD_PX)),
-        distortion_std=float(max(corner_std, MIN_DISTORTION_STD)),
+        focal_std_px=float(max(std[0], min_std_px)),
+        principal_point_std_px=float(max(np.sqrt(0.5 * (spread[1] + spread[2])), min_std_px)),
+        distortion_std=float(max(corner_std, 1e-4)),
     )
     pixels = np.concatenate([view.pixels for view in kept])
-    fields = np.clip((8 * pixels / np.array(size)).astype(int), 0, 7)
     return LensFit(
         lens=lens,
         used=np.array([not reason for reason in reasons]),
@@ -241,14 +222,8 @@ def calibrate_lens(
         pixels=pixels,
         residuals=np.concatenate(residuals),
         image=np.repeat(chosen, [len(each) for each in residuals]),
-        coverage=len(np.unique(fields, axis=0)) / 64.0,
+        coverage=image_coverage(pixels, size),
     )
-
-
-MIN_STD_PX: Final = 0.1
-"""Minimum stated deviation of focal length and principal point [px]."""
-MIN_DISTORTION_STD: Final = 1e-4
-"""The same of the corner's displacement [1]."""
 
 
 def _rms(residuals: Floats) -> float:
@@ -288,12 +263,7 @@ def _corner_factor(numbers: Floats, size: tuple[int, int]) -> float:
 def choose_views(
     frames: Iterable[Image], board: Board
 ) -> tuple[list[BoardView | None], tuple[int, int]]:
-    """Return different views of a board in the frames of a video, and the frames' size.
-
-    Args:
-        frames: (height, width, 3) each.
-        board: the board.
-    """
+    """Return different views of a board in frames (height, width, 3), and the frames' size."""
     views: list[BoardView | None] = []
     size = (0, 0)
     for frame in frames:
@@ -302,13 +272,19 @@ def choose_views(
         if view is None or any(_is_same(view, other, size[0]) for other in views if other):
             continue
         views.append(view)
-        if len(views) == MAX_VIEWS:
+        if len(views) == 40:
             break
     return views, size
+
+
+def image_coverage(pixels: Floats, size: Sequence[int] | Integers) -> float:
+    """Return the share of a grid of 8 x 8 fields of an image that pixels (n, 2) [px] reach [1]."""
+    fields = np.clip((8 * pixels / np.array(size)).astype(int), 0, 7)
+    return len(np.unique(fields, axis=0)) / 64.0
 
 
 def _is_same(one: BoardView, other: BoardView, width: int) -> bool:
     """Return whether two views show a board at the same place."""
     if one.places.shape != other.places.shape or not np.array_equal(one.places, other.places):
         return False
-    return bool(np.abs(one.pixels - other.pixels).mean() < SAME_VIEW * width)
+    return bool(np.abs(one.pixels - other.pixels).mean() < 0.02 * width)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats, Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
-from worldpose.pitch.template import PitchTemplate, law_points
+from worldpose.pitch.laws import law_points
+from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.adjustment import (
     Problem,
     adjust,
@@ -48,43 +49,10 @@ from worldpose.static_calibration.parameters import PARAMETERS
 from worldpose.static_calibration.report import StaticCalibration, build_report
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_CROP_SPREAD: Final = 0.15
-"""Spread of a cropped image's principal point, in widths [1]: covers crops of half the size."""
-_MAX_CROP: Final = 0.5
-"""Largest offset of a cropped image's principal point from its center, in widths and in heights
-[1]: a corner of an image of twice its size."""
-_MIN_FOR_CROP: Final = 7
-"""Minimum clicked points, or markings, that distinguish a crop from wrong names [1]."""
-_MAX_LEFT_OUT: Final = 16
-"""Maximum clicks for leave-one-out starts [1]."""
-_OTHER_STARTS: Final = 2
-"""Leave-one-out starts to refine, the best first [1]."""
-_MIN_FOR_K3: Final = 24
-"""Minimum residuals to try k3 [1]: twice the parameters."""
-_POSE_SPREAD: Final = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
-"""Spread of pose and focal length without information [rad, m, 1]: the clicks do not determine
-directions with a larger standard deviation."""
-_MIN_UNKNOWN: Final = 2
-"""Undetermined directions of pose and focal length from which the check fails [1]."""
-_MIRRORED_GAIN: Final = 0.25
-"""Names count as mirrored if mirroring leaves less than this share of the cost [1]."""
-_SUSPICIOUS_SHARE: Final = 0.2
-"""Share of outliers above which the check tries mirrored names [1]."""
-_SUSPICIOUS_MISFIT: Final = 4.0
-"""Mean loss per observation in the stated noise [1] from which to try other explanations."""
 _COMPARISON_LOSS: Final = 9.0
 """Cauchy scale of clicks [standard deviations] while mirrored names compete."""
 _MAX_OUTLIER_SHARE: Final = 0.1
 """Maximum share of outliers of a camera that rests on an assumption [1]."""
-_MAX_MISFIT: Final = 4.0
-"""Maximum mean loss per observation of such a camera [1]: twice the stated noise."""
-_SAME_SIZE: Final = 0.5
-"""Difference in length or width that clicks cannot resolve [m]."""
-_UNIT_GAIN: Final = 14.0
-"""Twice the logarithm of the minimum probability ratio in favor of a pitch in yards [1]: a
-thousand, since the fault is rare."""
-_YARD_M: Final = 0.9144
-"""[m]"""
 
 
 def calibrate_camera(
@@ -92,7 +60,7 @@ def calibrate_camera(
     clicked: ClickedMarkings,
     image_size: tuple[int, int],
     *,
-    picture: NDArray[np.uint8] | None = None,
+    picture: Image | None = None,
     settings: StaticCalibrationSettings | None = None,
     where: str = "clicked markings",
     lens: LensCalibration | None = None,
@@ -155,18 +123,10 @@ def _find_explanation(
     """Return the most probable explanation of consistent clicks.
 
     Before many clicks count as outliers, or as far noisier than stated, the search tries other
-    explanations: drawn markings are wrong, or the image is a crop, so that the principal point
-    lies elsewhere.
-
-    Args:
-        found: the clicks at their most probable noise.
-        pitch: the template.
-        stated: settings as given.
-
-    Raises:
-        InputError: the names are mirrored, the pitch has another size or unit, or no camera
-            explains most of the clicks.
+    explanations: drawn markings are wrong, or the image is a crop, so that the principal point lies
+    elsewhere.
     """
+    max_crop = 0.5  # in widths and heights: a corner of an image of twice its size
     fit, factor = found.fit, found.noise_factor(stated)
     as_stated = scale_noise(found.problem, 1.0 / factor, found.settings)[0]
     if not is_suspicious(fit, factor):
@@ -191,7 +151,7 @@ def _find_explanation(
         except InputError:
             continue
         shift = np.abs(other.fit.row[2:4] - problem.prior[2:4])
-        if np.any(shift > _MAX_CROP * np.array(problem.image_size)):
+        if np.any(shift > max_crop * np.array(problem.image_size)):
             continue
         factor = other.noise_factor(stated)
         own = negative_log_posterior(other, factor=factor, with_prior=True)
@@ -203,15 +163,13 @@ def _find_explanation(
     return best
 
 
-def _other_starts(
-    problem: Problem, settings: StaticCalibrationSettings
-) -> list[NDArray[np.float64]]:
+def _other_starts(problem: Problem, settings: StaticCalibrationSettings) -> list[Floats]:
     """Return starts (22,) that leave out one click each.
 
     A single click under a wrong name may hold the robust fit in another minimum.
     """
     count = len(problem.evidence.points)
-    if count > _MAX_LEFT_OUT:
+    if count > 16:
         return []
     every = np.ones(len(problem.evidence.markings), dtype=np.bool_)
     found = []
@@ -220,20 +178,13 @@ def _other_starts(
         rows = cameras_from_homographies(fewer, settings.prior, leave_out=False)
         if len(rows):
             found.append(fit_from_starts(fewer, rows, settings.wrong_click))
-    return [row for row, _ in sorted(found, key=lambda one: one[1])[:_OTHER_STARTS]]
+    return [row for row, _ in sorted(found, key=lambda one: one[1])[:2]]
 
 
 def _extend_to_all(
     problem: Problem, assumed: Problem, found: Explanation, factor: float
 ) -> Explanation:
-    """Return an explanation applied to the whole problem: markings that it lacks are outliers.
-
-    Args:
-        problem: all clicks and markings, at the stated noise.
-        assumed: the problem under the assumption, perhaps without markings.
-        found: explanation of the assumed problem.
-        factor: its noise over the stated noise.
-    """
+    """Return an explanation applied to the whole problem: markings that it lacks are outliers."""
     if len(assumed.evidence.drawn_image) == len(problem.evidence.drawn_image):
         return found
     none = np.zeros(len(problem.evidence.markings), dtype=np.bool_)
@@ -245,7 +196,8 @@ def _extend_to_all(
 def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierFit], str]]]:
     """Yield alternative problems, each with a function that describes its assumption."""
     evidence, prior = problem.evidence, problem.prior.copy()
-    prior[4] = _CROP_SPREAD * problem.image_size[0]
+    # In widths: covers crops of half the size.
+    prior[4] = 0.15 * problem.image_size[0]
     middle = problem.prior[2:4]
 
     def shift(fit: InlierFit) -> str:
@@ -260,20 +212,22 @@ def _alternatives(problem: Problem) -> Iterator[tuple[Problem, Callable[[InlierF
         points = np.ones(len(evidence.points), dtype=np.bool_)
         alone = problem.select(points, np.zeros(len(evidence.markings), dtype=np.bool_))
         yield alone, lambda fit: f"{names} left out: drawn elsewhere than the points say"
-    if max(len(evidence.points), len(evidence.markings)) >= _MIN_FOR_CROP:
+    # Fewer points or markings do not distinguish a crop from wrong names.
+    if max(len(evidence.points), len(evidence.markings)) >= 7:
         yield replace(problem, prior=prior), shift
 
 
 def _try_k3(found: Explanation) -> Explanation:
     """Return the explanation with k3 if it lowers the held-out error, and the decisions (C5)."""
+    min_residuals = 24  # twice the parameters
     problem, fit, settings = found.problem, found.fit, found.settings
     before = held_out_error(problem, fit)
     decisions = (*found.assumptions, f"held-out error {before:.2f} px with {settings.distortion}")
     count = 2 * int(fit.inliers.sum()) + len(problem.evidence.drawn_image)
     if settings.distortion != "k1_k2":
         return replace(found, assumptions=decisions)
-    if count < _MIN_FOR_K3:
-        decision = f"k3 kept 0: {count} residuals, tried from {_MIN_FOR_K3}"
+    if count < min_residuals:
+        decision = f"k3 kept 0: {count} residuals, tried from {min_residuals}"
         return replace(found, assumptions=(*decisions, decision))
     wider = replace(problem, free=np.arange(len(PARAMETERS)) < len(PARAMETERS))
     more = fit_inliers(wider, fit.row, settings)
@@ -287,18 +241,8 @@ def _try_k3(found: Explanation) -> Explanation:
 
 
 def is_suspicious(fit: InlierFit, factor: float) -> bool:
-    """Return whether outliers or residuals suggest wrong names or a cropped image.
-
-    Args:
-        fit: fit to the clicks.
-        factor: its noise over the stated noise.
-    """
-    return _outlier_share(fit) > _SUSPICIOUS_SHARE or fit.misfit * factor**2 >= _SUSPICIOUS_MISFIT
-
-
-def _explains(fit: InlierFit) -> bool:
-    """Return whether a fit has few outliers and small residuals."""
-    return _outlier_share(fit) <= _MAX_OUTLIER_SHARE and bool(fit.misfit < _MAX_MISFIT)
+    """Return whether outliers or residuals suggest wrong names or a cropped image."""
+    return _outlier_share(fit) > 0.2 or fit.misfit * factor**2 >= 4.0
 
 
 def check_mirrored(found: Explanation) -> None:
@@ -317,13 +261,7 @@ def check_mirrored(found: Explanation) -> None:
 def check_agreement(
     found: Explanation, pitch: PitchTemplate, stated: StaticCalibrationSettings
 ) -> None:
-    """Raise InputError if no camera explains most clicks, or a pitch of another size does.
-
-    Args:
-        found: the clicks, at the most probable noise.
-        pitch: the template.
-        stated: settings as given.
-    """
+    """Raise InputError if no camera explains most clicks, or a pitch of another size does."""
     problem, fit, settings = found.problem, found.fit, found.settings
     evidence, wrong = problem.evidence, _outlier_share(fit)
     factor = found.noise_factor(stated)
@@ -342,15 +280,8 @@ def check_agreement(
         )
 
 
-@dataclass(frozen=True)
-class _PitchSize:
-    """A size that the clicks may have been made on.
-
-    Attributes:
-        length: [m].
-        width: [m].
-        mistake: the likely mistake in pitch.json, in words.
-    """
+class _PitchSize(NamedTuple):
+    """Length and width [m] that the clicks may have been made on, and the likely mistake."""
 
     length: float
     width: float
@@ -358,7 +289,8 @@ class _PitchSize:
 
 
 def _size_in_yards(pitch: PitchTemplate) -> _PitchSize:
-    return _PitchSize(_YARD_M * pitch.length, _YARD_M * pitch.width, "it seems to be in yards")
+    yard_m = 0.9144
+    return _PitchSize(yard_m * pitch.length, yard_m * pitch.width, "it seems to be in yards")
 
 
 def check_unit(
@@ -370,12 +302,6 @@ def check_unit(
     """Raise InputError when a pitch whose size is in yards explains the clicks far better.
 
     With lens distortion and one or two outliers, the clicks also fit a pitch that is 9 % too large.
-
-    Args:
-        problem: the clicks, at the stated noise.
-        best: its best explanation in metres, which may assume a cropped image.
-        pitch: the template.
-        settings: settings as given.
     """
     size = _size_in_yards(pitch)
     other = _start_on_pitch(problem, size, settings)
@@ -391,7 +317,8 @@ def check_unit(
         negative_log_posterior(each, factor=each.noise_factor(settings), with_prior=True)
         for each in (found, best)
     )
-    if in_yards < given - _UNIT_GAIN and _outlier_share(found.fit) <= _MAX_OUTLIER_SHARE:
+    # Twice the logarithm of a probability ratio of a thousand, since the fault is rare.
+    if in_yards < given - 14.0 and _outlier_share(found.fit) <= _MAX_OUTLIER_SHARE:
         raise _size_error(problem, pitch, size)
 
 
@@ -416,7 +343,8 @@ def _find_size(
     sizes = (_size_in_yards(pitch), _PitchSize(105.0, 68.0, "it seems to be another pitch's"))
     for size in sizes:
         other = abs(size.length - pitch.length), abs(size.width - pitch.width)
-        if max(other) < _SAME_SIZE:
+        # Clicks do not resolve half a metre.
+        if max(other) < 0.5:
             continue
         found = _start_on_pitch(problem, size, settings)
         if found is None:
@@ -426,20 +354,16 @@ def _find_size(
             fit = fit_inliers(points, row, settings)
         except InputError:
             continue
-        if _explains(fit):
+        # Few outliers, and twice the stated noise at most.
+        if _outlier_share(fit) <= _MAX_OUTLIER_SHARE and fit.misfit < 4.0:
             return size
     return None
 
 
 def _start_on_pitch(
     problem: Problem, size: _PitchSize, settings: StaticCalibrationSettings
-) -> tuple[Problem, NDArray[np.float64]] | None:
+) -> tuple[Problem, Floats] | None:
     """Return the clicked points on a pitch of another size, and a camera (22,) near the answer.
-
-    Args:
-        problem: clicks, noise and prior.
-        size: size of the other pitch.
-        settings: settings with the prior of cameras.
 
     Returns:
         None if a point is not in the Laws, or the points determine no camera.
@@ -449,7 +373,8 @@ def _start_on_pitch(
         return None
     world = np.array([laws[name] for name in evidence.points])
     world[:, 2] = evidence.points_world[:, 2]
-    points = _select_points(problem)
+    none = np.zeros(len(evidence.markings), dtype=np.bool_)
+    points = problem.select(np.ones(len(evidence.points), dtype=np.bool_), none)
     other = replace(points, evidence=replace(points.evidence, points_world=world))
     rows = cameras_from_homographies(other, settings.prior, leave_out=False)
     if not len(rows):
@@ -458,18 +383,13 @@ def _start_on_pitch(
     return other, start.rows[np.argmin(start.cost)]
 
 
-def _select_points(problem: Problem) -> Problem:
-    """Return the problem without its drawn markings."""
-    evidence = problem.evidence
-    none = np.zeros(len(evidence.markings), dtype=np.bool_)
-    return problem.select(np.ones(len(evidence.points), dtype=np.bool_), none)
-
-
 def check_determined(found: Explanation, pitch: PitchTemplate) -> None:
     """Raise InputError when the prior alone determines several directions of the camera."""
-    block = found.fit.evidence_information[:7, :7] * np.outer(_POSE_SPREAD, _POSE_SPREAD)
+    # Without information [rad, m, 1]: clicks do not determine directions of a larger deviation.
+    spread = np.array([1.0, 1.0, 1.0, 30.0, 30.0, 30.0, 0.7])
+    block = found.fit.evidence_information[:7, :7] * np.outer(spread, spread)
     unknown = int((np.linalg.eigvalsh(block) < 1.0).sum())
-    if unknown < _MIN_UNKNOWN:
+    if unknown < 2:
         return
     evidence = found.problem.evidence
     clicked = (*evidence.points, *evidence.markings)
@@ -503,4 +423,4 @@ def _is_mirrored(found: Explanation) -> bool:
         rows = rows[np.argsort(weighed.cost, kind="stable")[: settings.search_cameras]]
     best = adjust(mirrored, rows, click_loss=_COMPARISON_LOSS).cost.min()
     given = adjust(problem, found.fit.row[None], click_loss=_COMPARISON_LOSS).cost[0]
-    return bool(best < _MIRRORED_GAIN * given)
+    return bool(best < 0.25 * given)

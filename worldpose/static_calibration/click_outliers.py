@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.errors import InputError
 from worldpose.static_calibration.adjustment import (
     Fits,
@@ -28,35 +28,9 @@ from worldpose.static_calibration.parameters import (
 )
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
-_ROBUST_LOSS: Final = 3.0
-"""Cauchy scale of clicks [standard deviations] of the fit that starts the outlier search."""
-_MIN_EIGENVALUE: Final = 1e-14
-"""Minimum eigenvalue of the scaled information [1]: below it a point lies in the camera's center,
-and rounding decides."""
-_SIGNIFICANCE: Final = 0.002
-"""Significance level of the test that residuals contradict the stated noise [1]."""
-_STATED_FREEDOM: Final = 4.0
-"""Degrees of freedom of the stated noise as a prior where residuals contradict it [1]: it is
-correct within a factor of 1.4."""
-_MAX_SCALE: Final = 5.0
-"""Maximum factor on the stated noise [1]; beyond, names are wrong."""
-_NOISE_FACTORS: Final = (1.5, 2.0, 3.0, 4.0)
-"""Factors on the stated noise to try where it does not explain the clicks [1]; the last is the
-largest plausible one."""
 CLEAR_GAIN: Final = 6.0
 """Twice the logarithm of the minimum probability ratio in favor of a noise other than the stated
 one [1]: twenty."""
-_NOISE_SPREAD: Final = 0.5
-"""Spread of this factor's logarithm [1]: true noise is half to twice the stated noise."""
-_LOG_TWO_PI: Final = float(np.log(2.0 * np.pi))
-_POINT_CONSTRAINTS: Final = 2
-_LINE_CONSTRAINTS: Final = 2
-_ARC_CONSTRAINTS: Final = 4
-"""Constraints of a click, a straight marking and an arc, whatever their drawn length [1]."""
-_MIN_REDUNDANCY: Final = 1e-9
-"""One minus leverage [1] below which a click or marking alone observes a parameter."""
-_MIN_CONSTRAINTS: Final = 8
-"""Minimum constraints that must remain to reject a marking [1]: four clicks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +53,13 @@ class InlierFit:
         misfit: mean loss per observation in the stated noise [1]; about 1 without gross errors.
     """
 
-    row: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    tangent_covariance: NDArray[np.float64]
-    evidence_information: NDArray[np.float64]
-    inliers: NDArray[np.bool_]
-    markings: NDArray[np.bool_]
-    mahalanobis: NDArray[np.float64]
+    row: Floats
+    covariance: Floats
+    tangent_covariance: Floats
+    evidence_information: Floats
+    inliers: Flags
+    markings: Flags
+    mahalanobis: Floats
     noise_scale: float
     click_noise: float
     click_freedom: float
@@ -122,29 +96,23 @@ class Explanation:
         return self.settings.click_noise_px / stated.click_noise_px
 
 
-def fit_inliers(
-    problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
-) -> InlierFit:
-    """Return the fit to the inliers among clicks and markings.
+def fit_inliers(problem: Problem, start: Floats, settings: StaticCalibrationSettings) -> InlierFit:
+    """Return the fit to the inliers among clicks and markings, from a camera (22,) near the answer.
 
     From the inliers of a robust fit, the search removes or restores one click at a time: the inlier
-    with the largest leave-one-out residual above `limit`, else an outlier that the inliers predict.
-    In the linear regime this is leave-one-out for every click at the cost of one fit. The noise for
-    the test of a click comes from the other clicks: the stated noise, unless their residuals
-    clearly contradict it. A click on a point that the camera cannot image is always an outlier. A
-    drawn marking is an outlier if half of it has a large residual: it has the wrong name.
-
-    Args:
-        problem: clicks, noise and prior.
-        start: (22,) camera near the answer.
-        settings: thresholds of outliers.
+    with the largest leave-one-out residual above the limit, else an outlier that the inliers
+    predict. In the linear regime this is leave-one-out for every click at the cost of one fit. The
+    noise for the test of a click comes from the other clicks: the stated noise, unless their
+    residuals clearly contradict it. A click on a point that the camera cannot image is always an
+    outlier. A drawn marking is an outlier if half of it has a large residual: it has the wrong
+    name.
 
     Raises:
         InputError: only an impossible camera explains the clicks.
     """
     limit = settings.wrong_click
     count = len(problem.evidence.points)
-    robust = adjust(problem, start[None], click_loss=_ROBUST_LOSS)
+    robust = adjust(problem, start[None], click_loss=3.0)
     row = robust.rows[0]
     problem = problem.with_survey_error(row, settings)
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1) / problem.click_noise
@@ -175,19 +143,14 @@ def fit_inliers(
 
 
 def fit_inliers_at_best_noise(
-    problem: Problem, start: NDArray[np.float64], settings: StaticCalibrationSettings
+    problem: Problem, start: Floats, settings: StaticCalibrationSettings
 ) -> Explanation:
-    """Return the explanation of the clicks at their most probable noise.
+    """Return the explanation of the clicks at their most probable noise, from a camera (22,).
 
     A few clicks with large residuals are outliers at the stated noise, or inliers at a larger
     noise. The larger posterior probability decides: inliers are Gaussian, outliers are uniform in
     the image, and the prior of the noise is centered on the stated noise, which stands unless
     another noise is clearly more probable.
-
-    Args:
-        problem: clicks, noise and prior.
-        start: (22,) camera near the answer.
-        settings: the stated noise, and thresholds of outliers.
 
     Raises:
         InputError: only an impossible camera explains the clicks.
@@ -197,7 +160,8 @@ def fit_inliers_at_best_noise(
     if fit.inliers.all() and fit.noise_scale <= 1.0:
         return best
     lowest = negative_log_posterior(best, factor=1.0, with_prior=False)
-    for factor in _NOISE_FACTORS:
+    # The last one is the largest plausible one.
+    for factor in (1.5, 2.0, 3.0, 4.0):
         other, rough = scale_noise(problem, factor, settings)
         try:
             tried = fit_inliers(other, fit.row, rough)
@@ -230,22 +194,19 @@ def scale_noise(
 def negative_log_posterior(found: Explanation, *, factor: float, with_prior: bool) -> float:
     """Return minus twice the log posterior of an explanation, up to a constant.
 
-    Args:
-        found: the explanation.
-        factor: its noise over the stated noise.
-        with_prior: include the camera prior: for comparisons of assumptions about the camera. For
-            comparisons of noise it would count a lens that is rare under the prior as noise.
+    Comparisons of assumptions about the camera include the camera prior; in comparisons of noise it
+    would count a lens that is rare under the prior as noise. The factor is the noise over the
+    stated one.
     """
+    log_two_pi = float(np.log(2.0 * np.pi))
     problem, fit, settings = found.problem, found.fit, found.settings
     kept = problem.select(fit.inliers, fit.markings)
     rows = compute_residuals(kept, fit.row)
     scale = fit.noise_scale
     squared = (_click_loss(kept, rows) + _drawn_loss(kept, rows)) / scale**2
     volume = 2.0 * float(np.log(scale)) * (2 * len(kept.click_noise) + len(kept.drawn_noise))
-    volume += (
-        4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * _LOG_TWO_PI
-    )
-    volume += 2.0 * float(np.log(kept.drawn_noise).sum()) + len(kept.drawn_noise) * _LOG_TWO_PI
+    volume += 4.0 * float(np.log(kept.click_noise).sum()) + 2.0 * len(kept.click_noise) * log_two_pi
+    volume += 2.0 * float(np.log(kept.drawn_noise).sum()) + len(kept.drawn_noise) * log_two_pi
     image_volume = 2.0 * np.log(float(np.prod(problem.image_size)))
     inlier_odds = 2.0 * np.log((1.0 - settings.wrong_rate) / settings.wrong_rate)
     outliers = float((~fit.inliers).sum()) * (image_volume + inlier_odds)
@@ -258,24 +219,13 @@ def negative_log_posterior(found: Explanation, *, factor: float, with_prior: boo
         known = np.empty(PRIORS)
         prior_residuals(fit.row, problem.prior, known, np.empty((PRIORS, SIZE)))
         squared += float((known**2).sum())
-    noise_deviation = float(np.log(scale * factor)) / _NOISE_SPREAD
+    # True noise is half to twice the stated noise.
+    noise_deviation = float(np.log(scale * factor)) / 0.5
     return float(squared + volume + outliers + posterior_volume + noise_deviation**2)
 
 
-def fit_given_inliers(
-    problem: Problem,
-    row: NDArray[np.float64],
-    inliers: NDArray[np.bool_],
-    markings: NDArray[np.bool_],
-) -> InlierFit:
-    """Return the fit to given inliers.
-
-    Args:
-        problem: clicks, noise and prior.
-        row: (22,) camera near the answer.
-        inliers: (n,) clicks to fit to.
-        markings: (m,) drawn markings to fit to.
-    """
+def fit_given_inliers(problem: Problem, row: Floats, inliers: Flags, markings: Flags) -> InlierFit:
+    """Return the fit to given clicks (n,) and markings (m,), from a camera (22,) near it."""
     kept = problem.select(inliers, markings)
     fit = adjust(kept, row[None])
     row = fit.rows[0]
@@ -301,24 +251,14 @@ def fit_given_inliers(
     )
 
 
-def noise_ratio(problem: Problem, row: NDArray[np.float64]) -> float:
-    """Return the ratio of the median click residual to its value at the stated noise.
-
-    Args:
-        problem: clicks, noise and prior.
-        row: (22,) camera.
-    """
+def noise_ratio(problem: Problem, row: Floats) -> float:
+    """Return the median click residual at a camera (22,), over its stated value."""
     length = np.linalg.norm(compute_residuals(problem, row).click, axis=1)
     return _median_spread(length / problem.click_noise)
 
 
-def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray[np.float64]:
-    """Return each click's Mahalanobis distance (n,) from the camera's prediction of it.
-
-    Args:
-        problem: clicks, noise and prior.
-        estimate: camera that is independent of these clicks.
-    """
+def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> Floats:
+    """Return each click's distance (n,) from its prediction by an independent camera."""
     rows = compute_residuals(problem, camera_row(estimate.camera))
     no_inliers = np.zeros(len(rows.click), dtype=np.bool_)
     return _leave_one_out_distances(rows, estimate.covariance, problem.click_noise, no_inliers)
@@ -327,9 +267,8 @@ def mahalanobis_distances(problem: Problem, estimate: CameraEstimate) -> NDArray
 def held_out_error(problem: Problem, fit: InlierFit) -> float:
     """Return the root mean square leave-one-out error of clicks and markings [px].
 
-    The function leaves out one click, or all pixels of one marking, at a time. The
-    residual of the left-out part follows from the complete fit, without a new fit (the block form
-    of the PRESS statistic).
+    One click, or all pixels of one marking, are left out at a time; their residual follows from the
+    complete fit (the block form of the PRESS statistic).
     """
     evidence = problem.evidence
     rows = compute_residuals(problem, fit.row)
@@ -350,7 +289,7 @@ def held_out_error(problem: Problem, fit: InlierFit) -> float:
         sigma = np.broadcast_to(noise * fit.noise_scale, len(residual))
         shared = by_step @ root / sigma[:, None]
         leverage, along = np.linalg.eigh(shared.T @ shared)
-        is_predicted = np.abs(1.0 - leverage) > _MIN_REDUNDANCY
+        is_predicted = np.abs(1.0 - leverage) > 1e-9
         # The rest does not predict directions that only this unit observes: no error counts there.
         gain = np.where(is_predicted, 1.0, -1.0) / np.where(is_predicted, 1.0 - leverage, leverage)
         whitened = residual / sigma
@@ -361,11 +300,8 @@ def held_out_error(problem: Problem, fit: InlierFit) -> float:
 
 
 def _select_markings(
-    problem: Problem,
-    row: NDArray[np.float64],
-    inliers: NDArray[np.bool_],
-    settings: StaticCalibrationSettings,
-) -> NDArray[np.bool_]:
+    problem: Problem, row: Floats, inliers: Flags, settings: StaticCalibrationSettings
+) -> Flags:
     """Return a mask of drawn markings (m,) near their projections; all where too few remain.
 
     The mask rejects markings only if the remaining clicks and markings hold most of all
@@ -378,22 +314,22 @@ def _select_markings(
         [np.median(away[marking == index]) for index in range(len(evidence.markings))]
     )
     accepted = np.asarray(medians < settings.wrong_marking * settings.drawn_noise_px)
-    constraints = np.where(evidence.straight, _LINE_CONSTRAINTS, _ARC_CONSTRAINTS)
-    all_constraints = _POINT_CONSTRAINTS * len(inliers) + int(constraints.sum())
-    remaining = _POINT_CONSTRAINTS * int(inliers.sum()) + int(constraints[accepted].sum())
+    constraints = np.where(evidence.straight, 2, 4)
+    all_constraints = 2 * len(inliers) + int(constraints.sum())
+    remaining = 2 * int(inliers.sum()) + int(constraints[accepted].sum())
     share = 1.0 - settings.max_wrong_share
-    few = accepted.sum() < share * len(accepted) and remaining < _MIN_CONSTRAINTS
+    few = accepted.sum() < share * len(accepted) and remaining < 8
     enough = remaining >= share * all_constraints and not few
     return accepted if enough else np.ones(len(accepted), dtype=np.bool_)
 
 
-def _can_image(problem: Problem, row: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _can_image(problem: Problem, row: Floats) -> Flags:
     """Return a mask of the clicked points (n,) that a camera (22,) can image."""
     camera = camera_from_row(row, problem.image_size)
     return np.asarray(np.isfinite(camera.project(problem.evidence.points_world)).all(axis=-1))
 
 
-def _median_spread(length: NDArray[np.float64]) -> float:
+def _median_spread(length: Floats) -> float:
     # 1.1774 is the median length of a standard Gaussian in two dimensions.
     return float(np.median(length)) / 1.1774 if len(length) else 1.0
 
@@ -417,30 +353,27 @@ class _Noise:
     @classmethod
     def estimate(cls, squared: float, freedom: float) -> _Noise:
         """Return the stated noise, unless the residuals clearly contradict it."""
+        prior = 4.0  # degrees of freedom of the stated noise: correct within a factor of 1.4
+        significance = 0.002  # of the test that residuals contradict the stated noise
         stated = cls(1.0, np.inf, squared, freedom)
         if freedom < 1.0:
             return stated
-        low, high = chdtri(freedom, [1.0 - 0.5 * _SIGNIFICANCE, 0.5 * _SIGNIFICANCE])
+        low, high = chdtri(freedom, [1.0 - 0.5 * significance, 0.5 * significance])
         if low <= squared <= high:
             return stated
-        worth = _STATED_FREEDOM + freedom
-        scale = np.sqrt((_STATED_FREEDOM + squared) / (worth - 2.0))
-        return cls(min(float(scale), _MAX_SCALE), worth, squared, freedom)
+        worth = prior + freedom
+        scale = np.sqrt((prior + squared) / (worth - 2.0))
+        # Beyond five times the stated noise, names are wrong.
+        return cls(min(float(scale), 5.0), worth, squared, freedom)
 
 
 def _judge_clicks(
-    problem: Problem, kept: Problem, fit: Fits, inliers: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], _Noise, NDArray[np.float64]]:
+    problem: Problem, kept: Problem, fit: Fits, inliers: Flags
+) -> tuple[Floats, _Noise, Floats]:
     """Return the covariance (12, 12), the noise, and each click's Mahalanobis distance (n,).
 
     Distances are as for a Gaussian: if the noise is only an estimate, the distance shrinks
     (Student's t-distribution in two dimensions).
-
-    Args:
-        problem: clicks, noise and prior.
-        kept: the problem restricted to its inliers.
-        fit: a single fit to `kept`.
-        inliers: (n,) clicks of `kept`.
     """
     covariance, noise = _covariance(kept, fit)
     row = fit.rows[0]
@@ -454,19 +387,15 @@ def _judge_clicks(
             others = _Noise.estimate(left, noise.freedom - 2.0)
         # Drawn pixels that are more accurate than stated do not make clicks more accurate.
         scale = max(others.scale, 1.0)
-        mahalanobis[index] = _gaussian_distance(own * noise.scale / scale, others.worth)
+        mahalanobis[index] = own * noise.scale / scale
+        if others.worth < np.inf:  # the distance of the same tail probability for a 2D Gaussian
+            squared, worth = mahalanobis[index] ** 2, others.worth
+            mahalanobis[index] = np.sqrt(worth * np.log1p(squared / worth))
     mahalanobis[~_can_image(problem, row)] = np.inf
     return covariance, noise, mahalanobis
 
 
-def _gaussian_distance(distance: float, worth: float) -> float:
-    """Return the Mahalanobis distance with the same tail probability for a 2D Gaussian."""
-    if not worth < np.inf:
-        return distance
-    return float(np.sqrt(worth * np.log1p(distance**2 / worth)))
-
-
-def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Noise]:
+def _covariance(problem: Problem, fit: Fits) -> tuple[Floats, _Noise]:
     """Return the covariance (12, 12), and the noise estimated from the residuals."""
     observed = fit.evidence_information[0]
     prior = fit.information[0] - observed
@@ -488,7 +417,7 @@ def _covariance(problem: Problem, fit: Fits) -> tuple[NDArray[np.float64], _Nois
     return covariance, noise
 
 
-def _is_invertible(information: NDArray[np.float64]) -> bool:
+def _is_invertible(information: Floats) -> bool:
     """Return whether an information matrix is invertible after scaling of its parameters.
 
     Coefficients of the lens and meters differ by many powers of ten.
@@ -496,7 +425,8 @@ def _is_invertible(information: NDArray[np.float64]) -> bool:
     size = np.sqrt(np.abs(np.diag(information)))
     if not (np.isfinite(information).all() and size.all()):
         return False
-    return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > _MIN_EIGENVALUE)
+    # Below, a point lies in the camera's center, and rounding decides.
+    return bool(np.linalg.eigvalsh(information / np.outer(size, size))[0] > 1e-14)
 
 
 def _no_camera(problem: Problem, count: int) -> InputError:
@@ -518,11 +448,8 @@ def _drawn_loss(problem: Problem, rows: Residuals) -> float:
 
 
 def _leave_one_out_distances(
-    rows: Residuals,
-    covariance: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    inliers: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+    rows: Residuals, covariance: Floats, noise: Floats, inliers: Flags
+) -> Floats:
     """Return each click's Mahalanobis distance from its prediction by the other clicks."""
     spread = np.einsum("nij,jk,nlk->nil", rows.by_click, covariance, rows.by_click)
     # An inlier has moved the fit towards itself.

@@ -10,12 +10,10 @@ and the tangent is no approximation over that length.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import Surface
 from worldpose.static_calibration.adjustment import (
@@ -35,24 +33,15 @@ from worldpose.static_calibration.parameters import (
     step_jacobian,
 )
 
-_POSE_SPREAD: Final = np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6)
-"""Pose prior of a camera refined on painted lines [rad, m]: far wider than its uncertainty; it
-keeps the covariance finite in directions that the clicks do not observe."""
-
 
 def add_curvature(problem: Problem, row: Floats, covariance: Floats, scale: float) -> Floats:
-    """Return the covariance (12, 12) about the best camera, to second order.
+    """Return the covariance (12, 12) about the best camera (22,), to second order.
 
-    Along one standard deviation t of the step, the best cameras bend away by
-    ``a(t, t) / 2``, with ``a = -C J' r''`` of the whitened residuals' second differences
-    (the Gauss-Newton answer to them). For a Gaussian along the tangents this adds half the sum
-    of ``a a'`` over pairs of directions, and the square of the mean bend.
-
-    Args:
-        problem: evidence, noise and prior of the fit.
-        row: (22,) the best camera.
-        covariance: (12, 12) covariance to first order.
-        scale: factor on the stated noise of the evidence.
+    Along one standard deviation t of the step, the best cameras bend away by ``a(t, t) / 2``, with
+    ``a = -C J' r''`` of the whitened residuals' second differences (the Gauss-Newton answer to
+    them). For a Gaussian along the tangents this adds half the sum of ``a a'`` over pairs of
+    directions, and the square of the mean bend. The covariance (12, 12) is that to first order, the
+    scale a factor on the stated noise of the evidence.
     """
     free = np.ix_(problem.free, problem.free)
     size = np.sqrt(np.diag(covariance[free]))
@@ -79,20 +68,16 @@ def add_curvature(problem: Problem, row: Floats, covariance: Floats, scale: floa
 
 
 def linearize_at(problem: Problem, row: Floats, scale: float, surface: Surface) -> CameraOnPitch:
-    """Return the Gaussian of clicks and priors, linearized at a given camera and surface.
+    """Return the Gaussian of clicks and priors, linearized at a given camera (22,) and surface.
 
-    A Gaussian about the clicks' own best camera is wrong at a distant camera along an
-    ill-conditioned direction, such as one from the painted lines; this Gaussian is correct there.
-
-    Args:
-        problem: clicks, noise and prior.
-        row: (22,) camera near the truth.
-        scale: factor on the stated noise of the evidence.
-        surface: prior of the pitch's surface.
+    A Gaussian about the clicks' own best camera is wrong at a distant camera along an ill-
+    conditioned direction, such as one from the painted lines; this Gaussian is correct there. The
+    scale is a factor on the stated noise of the evidence.
     """
     residuals, rows = weight_residuals(problem, row, scale, surface)
     free = free_on_pitch(problem)
-    kept = np.concatenate([1.0 / _POSE_SPREAD, np.zeros(2)])
+    # A pose prior [m, rad] keeps the covariance finite in directions that clicks do not observe.
+    kept = np.concatenate([1.0 / np.array([1.0] * 3 + [100.0] * 3 + [np.inf] * 6), np.zeros(2)])
     rows = np.concatenate([rows, np.diag(kept)])[:, free]
     residuals = np.concatenate([residuals, np.zeros(len(kept))])
     size = np.linalg.norm(rows, axis=0)
@@ -107,7 +92,7 @@ def linearize_at(problem: Problem, row: Floats, scale: float, surface: Surface) 
     return replace(start, covariance=turn @ covariance @ turn.T)
 
 
-def free_on_pitch(problem: Problem) -> NDArray[np.bool_]:
+def free_on_pitch(problem: Problem) -> Flags:
     """Return the (14,) mask of free parameters of the camera, and of the surface."""
     return np.concatenate([problem.free, [True, True]])
 
@@ -115,23 +100,19 @@ def free_on_pitch(problem: Problem) -> NDArray[np.bool_]:
 def weight_residuals(
     problem: Problem, row: Floats, scale: float, surface: Surface
 ) -> tuple[Floats, Floats]:
-    """Return residuals (m,) at a camera and derivatives (m, 14), times the roots of their weights.
+    """Return residuals (m,) at a camera (22,) and derivatives (m, 14), with the roots of weights.
 
-    The last two residuals are those of the surface's prior.
-
-    Args:
-        problem: clicks, noise and prior.
-        row: (22,) camera.
-        scale: factor on the stated noise of the evidence.
-        surface: prior of the pitch's surface.
+    The last two residuals are those of the surface's prior. The scale is a factor on the stated
+    noise.
     """
+    nudge_m = 0.01  # of crown and end fall, for finite differences
     residuals, by_camera = whiten_residuals(problem, row, np.zeros(SIZE), scale)
     columns = []
-    for change in _NUDGE_M * np.eye(2):
+    for change in nudge_m * np.eye(2):
         there = problem.evidence.on_surface(problem.evidence.surface + change)
         other = replace(problem, evidence=there)
         columns.append(whiten_residuals(other, row, np.zeros(SIZE), scale)[0] - residuals)
-    rows = np.column_stack([by_camera, np.stack(columns, axis=-1) / _NUDGE_M])
+    rows = np.column_stack([by_camera, np.stack(columns, axis=-1) / nudge_m])
     drawn = slice(2 * len(problem.evidence.points), len(residuals) - PRIORS)
     root = np.ones(len(residuals))
     root[drawn] = 1.0 / np.hypot(1.0, scale * residuals[drawn] / problem.drawn_loss)
@@ -163,31 +144,11 @@ def whiten_residuals(
     return np.concatenate(residuals), np.concatenate(rows)
 
 
-_NUDGE_M: Final = 0.01
-"""Change of crown and end fall for finite differences [m]."""
-_MAX_STEPS: Final = 20
-"""Gauss-Newton steps at most [1]."""
-_MIN_STEP: Final = 0.01
-"""Step length at which the iteration stops [standard deviations]."""
-_MAX_HALVINGS: Final = 6
-"""Maximum halvings of a step that does not lower the cost [1]."""
-_TEST_DRAWS: Final = 8
-_DRAWS: Final = 64
-"""Sampled cameras before the linearity test, and in total [1]."""
-_MAX_DEVIATION: Final = 0.3
-"""Root mean square deviation of the first cameras from their tangents below which sampling stops
-[standard deviations]."""
-
-
 @dataclass(frozen=True, eq=False)
 class ClicksAndBars:
-    """Evidence of a camera after line refinement: clicks, priors and bars.
+    """Evidence of a camera after line refinement: clicks, bars on lines, and priors.
 
-    Attributes:
-        problem: the clicks and the prior of the camera.
-        scale: factor on the stated noise of the clicks.
-        bars: found on the lines.
-        surface: prior of the pitch's surface.
+    The scale is a factor on the stated noise of the clicks.
     """
 
     problem: Problem
@@ -206,22 +167,19 @@ class ClicksAndBars:
     def fit(
         self, camera: Camera, surface: Floats, noise: Floats | None = None
     ) -> tuple[Camera, Floats]:
-        """Return the camera and the surface of least cost.
+        """Return the camera and the surface (2,) [m] of least cost near given ones.
 
-        Args:
-            camera: near the answer.
-            surface: (2,) near the answer [m].
-            noise: (m,) noise to add to the residuals; None = none.
+        The noise (m,) is added to the residuals; None = none.
         """
         residuals, rows = self.residuals(camera, surface)
         free = free_on_pitch(self.problem)
         noise = np.zeros(len(residuals)) if noise is None else noise
-        for _ in range(_MAX_STEPS):
+        for _ in range(20):
             size = np.linalg.norm(rows, axis=0)
             step = np.zeros(len(free))
             free_step = -np.linalg.lstsq(rows / size, residuals + noise)[0] / size
             before = float(((residuals + noise) ** 2).sum())
-            for _ in range(_MAX_HALVINGS):
+            for _ in range(6):
                 step[free] = free_step
                 trial, higher = step_camera(camera, step[:SIZE]), surface + step[SIZE:]
                 ahead, by_ahead = self.residuals(trial, higher)
@@ -233,7 +191,7 @@ class ClicksAndBars:
                 return camera, surface
             length = float(np.linalg.norm(rows @ free_step))
             camera, surface, residuals, rows = trial, higher, ahead, by_ahead
-            if length < _MIN_STEP:
+            if length < 0.01:
                 break
         return camera, surface
 
@@ -244,11 +202,9 @@ def fit_with_curvature(evidence: ClicksAndBars, camera: Camera) -> CameraOnPitch
     The function samples noise of clicks, prior and bars, and fits a camera to each sample. To first
     order these cameras have the inverse information as covariance; the function adds the mean
     square of their deviations from the tangent.
-
-    Args:
-        evidence: the inlying clicks, the bars on the lines, and the priors.
-        camera: near the answer.
     """
+    max_deviation = 0.3  # from the tangent, root mean square [standard deviations]
+    test_draws = 8  # cameras before the linearity test
     camera, surface = evidence.fit(camera, evidence.bars.surface)
     rows = evidence.residuals(camera, surface)[1]
     best = CameraOnPitch(camera, surface, np.empty(0))
@@ -259,17 +215,15 @@ def fit_with_curvature(evidence: ClicksAndBars, camera: Camera) -> CameraOnPitch
     # A fixed seed: the same evidence gives bitwise equal results.
     rng = np.random.default_rng(0)
     deviations: list[Floats] = []
-    for _ in range(_DRAWS // 2):
+    for _ in range(64 // 2):
         noise = rng.standard_normal(len(rows))
         for sign in (1.0, -1.0):
             tangent = -sign * size * (answer @ noise)
             sampled = best.step_to(*evidence.fit(camera, surface, sign * noise))
             deviations.append((sampled[free] - tangent) / size)
-        if len(deviations) == _TEST_DRAWS:
+        if len(deviations) == test_draws:
             rest = np.array(deviations)
-            if (
-                rest * np.linalg.solve(covariance, rest.T).T
-            ).sum() < _TEST_DRAWS * _MAX_DEVIATION**2:
+            if (rest * np.linalg.solve(covariance, rest.T).T).sum() < test_draws * max_deviation**2:
                 break
     rest = np.array(deviations)
     whole = np.zeros((len(free), len(free)))

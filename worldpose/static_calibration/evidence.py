@@ -6,27 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats, Integers
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.ground_error import points_off_line
 
-_MAX_DRAWN: Final = 200
-"""Maximum drawn pixels per marking [1]: more cost time and add no information."""
-_MAX_OUTSIDE: Final = 1.0
-"""Maximum distance of a click outside the image [px]: rounding at its border."""
 _FEWEST: Final = 4
 """Minimum clicked points without a drawn marking [1]: those of a homography."""
-_MIN_CONSTRAINTS: Final = 6
-"""Minimum constraints with a drawn marking [1]: pose; the prior holds the focal length."""
-_LINE_CONSTRAINTS: Final = 2
-"""Constraints of a straight marking, whatever its drawn length [1]."""
-_ARC_CONSTRAINTS: Final = 4
-"""Constraints of an arc [1]: five of its ellipse, less one for the rotation of the circle."""
-_MIN_SPREAD: Final = 1.0
-"""Root mean square distance from a line below which points count as collinear [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +37,19 @@ class Evidence:
     """
 
     points: tuple[str, ...]
-    points_world: NDArray[np.float64]
-    points_image: NDArray[np.float64]
-    points_by_surface: NDArray[np.float64]
+    points_world: Floats
+    points_image: Floats
+    points_by_surface: Floats
     markings: tuple[str, ...]
-    samples_world: NDArray[np.float64]
-    samples_by_surface: NDArray[np.float64]
-    bounds: NDArray[np.int64]
-    drawn_image: NDArray[np.float64]
-    drawn_marking: NDArray[np.int64]
-    surface: NDArray[np.float64]
-    straight: NDArray[np.bool_]
+    samples_world: Floats
+    samples_by_surface: Floats
+    bounds: Integers
+    drawn_image: Floats
+    drawn_marking: Integers
+    surface: Floats
+    straight: Flags
 
-    def select(self, points: NDArray[np.bool_], markings: NDArray[np.bool_]) -> Evidence:
+    def select(self, points: Flags, markings: Flags) -> Evidence:
         """Return the evidence restricted to some clicked points (n,) and drawn markings (m,)."""
         keep, on = points, markings[self.drawn_marking]
         return replace(
@@ -74,7 +62,7 @@ class Evidence:
             drawn_marking=self.drawn_marking[on],
         )
 
-    def on_surface(self, surface: NDArray[np.float64]) -> Evidence:
+    def on_surface(self, surface: Floats) -> Evidence:
         """Return the evidence at its places on another surface.
 
         Args:
@@ -99,18 +87,11 @@ def gather_evidence(
     spacing: float,
     where: str,
 ) -> Evidence:
-    """Return the evidence of one image.
-
-    Args:
-        pitch: template that defines the names.
-        clicked: points and drawn markings.
-        image_size: width, height [px].
-        spacing: spacing of the samples along markings [m].
-        where: file or camera, for messages.
+    """Return the evidence of one image, with samples along markings at a spacing [m].
 
     Raises:
         InputError: there are no clicks, a name is unknown or given twice, or a pixel lies outside
-            the image.
+            the image of a width and height [px].
     """
     if not clicked.points and not clicked.drawn:
         raise InputError(
@@ -163,7 +144,7 @@ def gather_evidence(
     )
 
 
-def count_neighbors(evidence: Evidence, reach: float) -> NDArray[np.float64]:
+def count_neighbors(evidence: Evidence, reach: float) -> Floats:
     """Return per drawn pixel (d,) the count of its marking's pixels within `reach` [px].
 
     Errors of hand drawing are correlated along a line: pixels within `reach` count as one.
@@ -179,13 +160,14 @@ def count_neighbors(evidence: Evidence, reach: float) -> NDArray[np.float64]:
 
 def _thin(pixels: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return at most `_MAX_DRAWN` of a marking's pixels, evenly spaced in their order."""
-    chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), _MAX_DRAWN)).astype(np.int64)
+    chosen = np.linspace(0, len(pixels) - 1, min(len(pixels), 200)).astype(np.int64)
     return [pixels[index] for index in chosen]
 
 
 def _check_inside(where: str, pixel: tuple[float, float], image_size: tuple[int, int]) -> None:
     width, height = image_size
-    inside = all(-_MAX_OUTSIDE <= v <= n for v, n in zip(pixel, (width, height), strict=True))
+    # Rounding at the border.
+    inside = all(-1.0 <= v <= n for v, n in zip(pixel, (width, height), strict=True))
     if not inside:
         raise InputError(
             where,
@@ -217,9 +199,7 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
                 found=found,
                 todo=f"Click further points, far from the others, for example {', '.join(new)}.",
             )
-        plan = evidence.points_world[:, :2]
-        spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
-        if spread < _MIN_SPREAD * np.sqrt(points):
+        if not has_enough_points(evidence):
             more = points_off_line(pitch, evidence.points_world)
             raise InputError(
                 where,
@@ -231,8 +211,10 @@ def check_amount(evidence: Evidence, pitch: PitchTemplate, where: str) -> None:
     numbers = 2 * points
     for index in range(len(evidence.markings)):
         pixels = int((evidence.drawn_marking == index).sum())
-        numbers += min(pixels, _LINE_CONSTRAINTS if evidence.straight[index] else _ARC_CONSTRAINTS)
-    if numbers < _MIN_CONSTRAINTS:
+        # An arc has five constraints of its ellipse, less one for the rotation of the circle.
+        numbers += min(pixels, 2 if evidence.straight[index] else 4)
+    # The pose; the prior holds the focal length.
+    if numbers < 6:
         places = np.concatenate([evidence.points_world, evidence.samples_world])
         more = points_off_line(pitch, places)
         raise InputError(
@@ -249,7 +231,8 @@ def has_enough_points(evidence: Evidence) -> bool:
     if len(plan) < _FEWEST:
         return False
     spread = np.linalg.svd(plan - plan.mean(axis=0), compute_uv=False)[1]
-    return bool(spread >= _MIN_SPREAD * np.sqrt(len(plan)))
+    # Within a metre of a line, root mean square, points are collinear.
+    return bool(spread >= np.sqrt(len(plan)))
 
 
 def describe_clicks(evidence: Evidence) -> str:

@@ -7,20 +7,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.parameters import CameraEstimate, project_with_jacobian
-
-_MARGIN = 2.0
-"""Margin of the map beyond the outer lines [m]: people stand there."""
-_SLOPE_STEP = 0.01
-"""Step of the surface's slope [m]."""
-_MAX_GROUND_HEIGHT = 0.5
-"""Height below which a named point is on the ground [m]."""
-_MIN_AREA = 1e-9
-"""Minimum image area of a square metre of ground [px^2]: less is the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +26,9 @@ class GroundErrorMap:
             field of view.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    x: Floats
+    y: Floats
+    expected: Floats
 
     @property
     def median(self) -> float:
@@ -55,16 +46,11 @@ class GroundErrorMap:
 
 
 def ground_error_map(estimate: CameraEstimate, pitch: PitchTemplate, step: float) -> GroundErrorMap:
-    """Return the expected ground error of an estimate on a grid over the pitch.
-
-    Args:
-        estimate: camera and covariance.
-        pitch: template with size and surface.
-        step: maximum grid spacing [m].
-    """
+    """Return the expected ground error of an estimate on a grid over the pitch, with a step [m]."""
+    margin = 2.0  # beyond the outer lines [m]: people stand there
     x, y = (
         np.linspace(-half, half, int(np.ceil(2.0 * half / step)) + 1)
-        for half in (0.5 * pitch.length + _MARGIN, 0.5 * pitch.width + _MARGIN)
+        for half in (0.5 * pitch.length + margin, 0.5 * pitch.width + margin)
     )
     across, along = np.meshgrid(y, x, indexing="ij")
     places = np.stack([along, across, pitch.height(along, across)], axis=-1).reshape(-1, 3)
@@ -75,63 +61,40 @@ def ground_error_map(estimate: CameraEstimate, pitch: PitchTemplate, step: float
     return GroundErrorMap(x, y, np.where(seen, expected, np.nan).reshape(across.shape))
 
 
-def expected_ground_error(
-    estimate: CameraEstimate, pitch: PitchTemplate, places: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the expected ground error (n,) [m] at places on the surface.
+def expected_ground_error(estimate: CameraEstimate, pitch: PitchTemplate, places: Floats) -> Floats:
+    """Return the expected ground error (n,) [m] at places (n, 3) [m] on the surface, world.
 
-    Args:
-        estimate: camera and covariance.
-        pitch: template with the surface.
-        places: (n, 3) [m], world, on the surface.
-
-    Returns:
-        NaN where the camera cannot image the place.
+    It is NaN where the camera cannot image the place.
     """
     motion = surface_motion(estimate.camera, pitch, places)
     squared = np.einsum("nij,jk,nik->n", motion, estimate.covariance, motion)
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def surface_motion(
-    camera: Camera, pitch: PitchTemplate, places: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return derivatives of back-projected places on the surface by the camera's step.
+def surface_motion(camera: Camera, pitch: PitchTemplate, places: Floats) -> Floats:
+    """Return derivatives (n, 2, 12) [m] of back-projected places by the step of a single camera.
 
-    The pixel of a place moves with the step; the place on the surface with this pixel moves by the
-    inverse of the pixel's derivative along the surface.
-
-    Args:
-        camera: a single camera.
-        pitch: template with the surface.
-        places: (n, 3) [m], world, on the surface.
-
-    Returns:
-        (n, 2, 12) [m]; NaN where the camera cannot image the place.
+    The pixel of a place (n, 3) [m] on the surface moves with the step; the place on the surface
+    with this pixel moves by the inverse of the pixel's derivative along the surface. NaN where the
+    camera cannot image the place.
     """
+    step = 0.01  # [m]
     _, by_step = project_with_jacobian(camera, places)
     by_place = camera.project_with_jacobians(places).d_points
     slopes = [
-        (pitch.height(places[:, 0] + dx, places[:, 1] + dy) - places[:, 2]) / _SLOPE_STEP
-        for dx, dy in ((_SLOPE_STEP, 0.0), (0.0, _SLOPE_STEP))
+        (pitch.height(places[:, 0] + dx, places[:, 1] + dy) - places[:, 2]) / step
+        for dx, dy in ((step, 0.0), (0.0, step))
     ]
     surface = by_place[:, :, :2] + by_place[:, :, 2:] * np.stack(slopes, axis=-1)[:, None, :]
     (a, b), (c, d) = np.moveaxis(surface, 0, -1)
     area = a * d - b * c
     with np.errstate(invalid="ignore", divide="ignore"):
-        area = np.where(np.abs(area) > _MIN_AREA, area, np.nan)
+        # A square metre of less image is at the horizon.
+        area = np.where(np.abs(area) > 1e-9, area, np.nan)
     inverse = np.moveaxis(np.array([[d, -b], [-c, a]]) / area, -1, 0)
     return np.asarray(inverse @ by_step)
 
 
-_MAX_POINT_DISTANCE = 45.0
-"""Maximum distance of proposed points from the mean of the given ones [m]."""
-_GAIN_SPACING = 5.0
-"""Grid spacing of the summed gain over the pitch [m]."""
-_DRAWN_PIXELS = 5
-"""Assumed number of drawn pixels per marking [1]."""
-_PROPOSED_CLICKS = 3
-"""Names to propose after a calibration [1]."""
 _NAMED_POINTS = 4
 """Points to name in a message [1]: as many as a camera needs."""
 
@@ -144,13 +107,8 @@ def propose_clicks(
 ) -> tuple[str, ...]:
     """Return the points and markings whose clicks would lower the expected ground error most.
 
-    Greedy selection among the visible points and markings.
-
-    Args:
-        estimate: the current camera.
-        pitch: the template.
-        clicked: names that already have clicks.
-        noise: noise of a click [px].
+    Greedy selection among the visible points and markings without a click; the noise is that of a
+    click [px].
     """
     motion = _visible_motion(estimate, pitch)
     if not len(motion):
@@ -163,7 +121,7 @@ def propose_clicks(
     }
     covariance = estimate.covariance
     chosen: list[str] = []
-    while candidates and len(chosen) < _PROPOSED_CLICKS:
+    while candidates and len(chosen) < 3:
         best, gain, best_update = "", 0.0, np.zeros_like(covariance)
         for name, rows in candidates.items():
             through = covariance @ rows.T
@@ -181,22 +139,23 @@ def propose_clicks(
     return tuple(chosen)
 
 
-def points_off_line(pitch: PitchTemplate, points_world: NDArray[np.float64]) -> tuple[str, ...]:
+def points_off_line(pitch: PitchTemplate, points_world: Floats) -> tuple[str, ...]:
     """Return four points of the pitch near given ones and farthest off the line through them."""
     middle = points_world.mean(axis=0)
     _, _, axes = np.linalg.svd(points_world[:, :2] - middle[:2])
     offsets = {
         name: place[:2] - middle[:2] for name, place in pitch.points.items() if "post" not in name
     }
-    near = {name: off for name, off in offsets.items() if np.linalg.norm(off) < _MAX_POINT_DISTANCE}
+    near = {name: off for name, off in offsets.items() if np.linalg.norm(off) < 45.0}
     ranked = sorted(near, key=lambda name: -abs(float(near[name] @ axes[1])))
     return tuple(ranked[:_NAMED_POINTS])
 
 
-def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[np.float64]:
+def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> Floats:
     """Return derivatives (n, 2, 12) of visible places on the pitch by the camera's step [m]."""
-    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, _GAIN_SPACING)
-    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, _GAIN_SPACING)
+    spacing = 5.0  # of the grid [m]
+    x = np.arange(-0.5 * pitch.length, 0.5 * pitch.length + 1e-9, spacing)
+    y = np.arange(-0.5 * pitch.width, 0.5 * pitch.width + 1e-9, spacing)
     along, across = (grid.ravel() for grid in np.meshgrid(x, y))
     places = np.stack([along, across, pitch.height(along, across)], axis=1)
     seen = _inside(estimate, estimate.camera.project(places))
@@ -204,8 +163,9 @@ def _visible_motion(estimate: CameraEstimate, pitch: PitchTemplate) -> NDArray[n
     return motion[np.isfinite(motion).all(axis=(1, 2))]
 
 
-def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, NDArray[np.float64]]:
+def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, Floats]:
     """Return residual derivatives (k, 12) by a step [px] of each visible point and marking."""
+    pixels_per_marking = 5  # assumed
     names = tuple(pitch.points)
     pixels, by_step = project_with_jacobian(estimate.camera, pitch.positions(names))
     inside = _inside(estimate, pixels)
@@ -217,9 +177,9 @@ def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, NDA
         pitch.marking_names, pairwise(np.cumsum([0, *map(len, samples)])), strict=True
     ):
         visible = first + np.flatnonzero(inside[first:stop])
-        if len(visible) < _DRAWN_PIXELS:
+        if len(visible) < pixels_per_marking:
             continue
-        chosen = visible[np.linspace(0, len(visible) - 1, _DRAWN_PIXELS).astype(np.int64)]
+        chosen = visible[np.linspace(0, len(visible) - 1, pixels_per_marking).astype(np.int64)]
         along = np.gradient(pixels[visible], axis=0)[np.searchsorted(visible, chosen)]
         normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -227,21 +187,15 @@ def _candidates(estimate: CameraEstimate, pitch: PitchTemplate) -> dict[str, NDA
     return found
 
 
-def _inside(estimate: CameraEstimate, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(estimate: CameraEstimate, pixels: Floats) -> Flags:
     with np.errstate(invalid="ignore"):
         within = (pixels >= 0.0) & (pixels <= estimate.camera.image_size - 1.0)
     return np.asarray(within.all(axis=1))
 
 
 def points_in_view(camera: Camera, pitch: PitchTemplate, lines: Collection[str]) -> tuple[str, ...]:
-    """Return four points on the ground that a camera sees, ends of some lines first, far apart.
-
-    Args:
-        camera: a single camera.
-        pitch: the template.
-        lines: lines that the image shows.
-    """
-    names = [name for name, place in pitch.points.items() if place[2] < _MAX_GROUND_HEIGHT]
+    """Return four points on the ground that a camera sees, ends of some lines first, far apart."""
+    names = [name for name, place in pitch.points.items() if place[2] < 0.5]
     pixels = camera.project(pitch.positions(names))
     inside = np.all((pixels >= 0.0) & (pixels <= camera.image_size - 1.0), axis=1).tolist()
     left = {name: pixel for name, pixel, seen in zip(names, pixels, inside, strict=True) if seen}

@@ -11,8 +11,8 @@ from itertools import pairwise, product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.static_calibration.adjustment import Problem, adjust, camera_row
@@ -21,25 +21,21 @@ from worldpose.static_calibration.settings import CameraPrior, StaticCalibration
 
 _PLANE_SCALE = 50.0
 """Half a pitch [m]: coordinates of order one keep the DLT well conditioned."""
-_MAX_HEIGHT = 0.5
-"""Maximum height of points for a homography [m]: includes the crown, excludes the goals' upper
-ends."""
-_MAX_SUBSETS = 300
-"""Maximum subsets of four clicks [1]: with two outliers of twelve, 40 % of them are clean."""
 
 
 def plane_from_image(
-    points_image: NDArray[np.float64],
-    points_plane: NDArray[np.float64],
-    line_pixels: NDArray[np.float64],
-    lines: NDArray[np.float64],
+    points_image: Floats,
+    points_plane: Floats,
+    line_pixels: Floats,
+    lines: Floats,
     scale: float,
-    middle: NDArray[np.float64],
-) -> NDArray[np.float64] | None:
+    middle: Floats,
+) -> Floats | None:
     """Return the (3, 3) homography from pixels to the plane [m] by the DLT, or None.
 
     A point gives two equations; a pixel drawn anywhere on a straight line gives one, which is
-    linear as well in this direction: line . (H pixel) = 0.
+    linear as well in this direction: line . (H pixel) = 0. None if they do not determine one
+    homography.
 
     Args:
         points_image: (n, 2) [px].
@@ -48,9 +44,6 @@ def plane_from_image(
         lines: (d, 3) line per pixel, a x + b y + c = 0 with a^2 + b^2 = 1 [m].
         scale: half the image diagonal [px].
         middle: (2,) image center [px].
-
-    Returns:
-        None if the equations do not determine one homography.
     """
     pixel = _homogeneous((points_image - middle) / scale)
     x, y = (points_plane / _PLANE_SCALE).T
@@ -68,7 +61,7 @@ def plane_from_image(
     _, values, basis = np.linalg.svd(system)
     if values[7] < 1e-3 * values[0] / np.sqrt(len(system)):
         return None
-    homography: NDArray[np.float64] = (
+    homography: Floats = (
         np.diag([_PLANE_SCALE, _PLANE_SCALE, 1.0])
         @ basis[8].reshape(3, 3)
         @ np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]])
@@ -77,26 +70,17 @@ def plane_from_image(
 
 
 def camera_from_homography(
-    image_from_plane: NDArray[np.float64],
+    image_from_plane: Floats,
     image_size: tuple[int, int],
-    seen: NDArray[np.float64],
+    seen: Floats,
     focal_range: tuple[float, float],
 ) -> Camera | None:
-    """Return the camera of a homography from the plane z = 0, or None.
+    """Return the camera of a homography (3, 3) from the plane z = 0, or None (C2).
 
-    The function assumes square pixels and the principal point in the image center: a plane gives
-    two equations for the internal parameters, here both for the focal length. Where they contradict
-    each other or are degenerate (a view straight down), the function clips the focal length to its
-    range.
-
-    Args:
-        image_from_plane: (3, 3).
-        image_size: width, height [px].
-        seen: (2,) [px], a pixel on the pitch: the plane is in front of the camera there.
-        focal_range: minimum and maximum plausible focal length [px].
-
-    Note:
-        C2.
+    Pixels are square and the principal point is the image center: a plane gives two equations for
+    the internal parameters, here both for the focal length. Where they contradict each other or are
+    degenerate (a view straight down), the focal length is clipped to its range [px]. The pitch is
+    in front of the camera at the pixel `seen` (2,) [px].
     """
     width, height = image_size
     middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
@@ -135,22 +119,18 @@ def camera_from_homography(
 
 def homographies(
     evidence: Evidence, image_size: tuple[int, int], tolerance: float, *, leave_out: bool
-) -> list[NDArray[np.float64]]:
+) -> list[Floats]:
     """Return candidate homographies (3, 3) from the plane to pixels, the best one first.
 
     Candidates are: the DLT over straight markings and the inliers of RANSAC (four clicks at a time,
     from five clicks on), the DLT over straight markings and all clicks, and the DLT over straight
-    markings alone.
-
-    Args:
-        evidence: clicks and drawn markings.
-        image_size: width, height [px].
-        tolerance: maximum inlier distance [px]; covers distortion and the crown.
-        leave_out: also leave out each straight marking in turn.
+    markings alone; also without each straight marking in turn, if asked for. The tolerance of
+    inliers [px] covers distortion and the crown.
     """
     middle = np.array([0.5 * (image_size[0] - 1), 0.5 * (image_size[1] - 1)])
     scale = 0.5 * float(np.hypot(image_size[0], image_size[1]))
-    low = np.abs(evidence.points_world[:, 2]) < _MAX_HEIGHT
+    # Includes the crown, excludes the goals' upper ends.
+    low = np.abs(evidence.points_world[:, 2]) < 0.5
     plane, pixels = evidence.points_world[low, :2], evidence.points_image[low]
     line_pixels, lines, marking = _surface_lines(evidence)
     consensus = _consensus(pixels, plane, middle, scale, tolerance)
@@ -159,7 +139,7 @@ def homographies(
     choices = [(kept, every_line) for kept in (consensus, everything, nothing)]
     if leave_out:
         choices += [(consensus, marking != index) for index in np.unique(marking)]
-    candidates: list[NDArray[np.float64]] = []
+    candidates: list[Floats] = []
     for kept, on in choices:
         found = plane_from_image(
             pixels[kept], plane[kept], line_pixels[on], lines[on], scale, middle
@@ -170,19 +150,16 @@ def homographies(
 
 
 def _consensus(
-    pixels: NDArray[np.float64],
-    plane: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    scale: float,
-    tolerance: float,
-) -> NDArray[np.bool_]:
+    pixels: Floats, plane: Floats, middle: Floats, scale: float, tolerance: float
+) -> Flags:
     """Return the inlier mask (n,) of the best homography from four clicks."""
+    max_subsets = 300  # with two outliers of twelve clicks, 40 % of them are clean
     best = np.ones(len(plane), dtype=np.bool_)
     if len(plane) < 5:
         return best
     subsets = np.array(list(itertools.combinations(range(len(plane)), 4)))
-    if len(subsets) > _MAX_SUBSETS:
-        chosen = np.random.default_rng(0).choice(len(subsets), _MAX_SUBSETS, replace=False)
+    if len(subsets) > max_subsets:
+        chosen = np.random.default_rng(0).choice(len(subsets), max_subsets, replace=False)
         subsets = subsets[chosen]
     source = plane / _PLANE_SCALE
     target = (pixels - middle) / scale
@@ -207,9 +184,7 @@ def _consensus(
     return np.asarray(errors[winner] < tolerance)
 
 
-def _surface_lines(
-    evidence: Evidence,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def _surface_lines(evidence: Evidence) -> tuple[Floats, Floats, Integers]:
     """Return pixels (d, 2) on straight surface markings, their lines (d, 3) and markings (d,)."""
     straight = evidence.straight[evidence.drawn_marking]
     lines = np.zeros((len(evidence.markings), 3))
@@ -222,72 +197,54 @@ def _surface_lines(
     return evidence.drawn_image[straight], lines[marking], marking
 
 
-def _homogeneous(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _homogeneous(points: Floats) -> Floats:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
 _COMPARISON_LOSS: Final = 60.0
 """Cauchy scale of all residuals while starts compete [standard deviations]: it bounds the influence
 of residuals of hundreds of pixels, but not of tens."""
-_MAX_MISFIT: Final = 4.0
-"""Mean loss per observation [1] above which the search over plausible cameras replaces the camera
-of a homography."""
-_TRIAL_ITERATIONS: Final = 12
-"""Iterations per start before the best start is chosen [1]."""
-_INLIER_DISTANCE: Final = 0.012
-"""Maximum inlier distance of a homography, in image widths [1]: distortion of a few percent at the
-border and the crown's height."""
-_AZIMUTHS: Final = 16
-"""Directions of the grid about the centre spot [1]: 22 degrees apart, so that the fit converges."""
-_GRID_SPREADS: Final = (-1.0, 0.3)
-"""Heights and distances of the grid, in spreads from the middle [1]."""
-_FOCALS: Final = (-1.0, 0.0, 1.0)
-"""Focal lengths of the grid, in spreads from the middle [1]."""
-_MAX_FOCAL_SPREADS: Final = 2.5
-"""Maximum deviation of a homography's focal length, in spreads about the middle [1]."""
 
 
-def cameras_from_homographies(
-    problem: Problem, prior: CameraPrior, *, leave_out: bool
-) -> NDArray[np.float64]:
+def cameras_from_homographies(problem: Problem, prior: CameraPrior, *, leave_out: bool) -> Floats:
     """Return cameras (b, 22) of the homographies from points and straight markings.
 
-    Args:
-        problem: evidence and image size.
-        prior: the range of focal lengths.
-        leave_out: also leave out each straight marking in turn: one name may be wrong.
+    Each straight marking may be left out in turn: one name may be wrong.
     """
     evidence, width = problem.evidence, problem.image_size[0]
-    spread = np.exp(_MAX_FOCAL_SPREADS * prior.log_focal_std)
+    spread = np.exp(2.5 * prior.log_focal_std)
     focal_range = (prior.focal * width / spread, prior.focal * width * spread)
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
     seen = np.median(pixels, axis=0)
+    # The tolerance covers distortion of a few percent at the border, and the crown's height.
     found = [
         camera_from_homography(homography, problem.image_size, seen, focal_range)
         for homography in homographies(
-            evidence, problem.image_size, _INLIER_DISTANCE * width, leave_out=leave_out
+            evidence, problem.image_size, 0.012 * width, leave_out=leave_out
         )
     ]
     rows = [camera_row(camera) for camera in found if camera is not None]
     return np.array(rows).reshape(-1, 22)
 
 
-def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float64]:
+def plausible_cameras(problem: Problem, prior: CameraPrior) -> Floats:
     """Return level cameras (b, 22) all around the stadium, oriented towards the clicks.
 
     The mean of the clicked pixels shows the mean of the clicked points, or each of the places along
     the drawn markings in turn.
-
-    Args:
-        problem: evidence and image size.
-        prior: heights, distances and focal lengths.
     """
+    spreads = (-1.0, 0.3)  # of heights and distances from the middle
+    azimuths = 16  # 22 degrees apart, so that the fit converges
     evidence = problem.evidence
     pixels = np.concatenate([evidence.points_image, evidence.drawn_image])
-    height = prior.height_m * np.exp(np.array(_GRID_SPREADS) * prior.log_height_std)
-    distance = prior.distance_m * np.exp(np.array(_GRID_SPREADS) * prior.log_distance_std)
-    focal = problem.image_size[0] * prior.focal * np.exp(np.array(_FOCALS) * prior.log_focal_std)
-    azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    height = prior.height_m * np.exp(np.array(spreads) * prior.log_height_std)
+    distance = prior.distance_m * np.exp(np.array(spreads) * prior.log_distance_std)
+    focal = (
+        problem.image_size[0]
+        * prior.focal
+        * np.exp(np.array((-1.0, 0.0, 1.0)) * prior.log_focal_std)
+    )
+    azimuth = 2.0 * np.pi * np.arange(azimuths) / azimuths
     grid = np.array(list(product(azimuth, distance, height, focal, range(len(_aims(problem))))))
     centers = np.stack(
         [grid[:, 1] * np.cos(grid[:, 0]), grid[:, 1] * np.sin(grid[:, 0]), grid[:, 2]], axis=1
@@ -303,7 +260,7 @@ def plausible_cameras(problem: Problem, prior: CameraPrior) -> NDArray[np.float6
     return rows
 
 
-def _aims(problem: Problem) -> NDArray[np.float64]:
+def _aims(problem: Problem) -> Floats:
     """Return places (a, 3) [m], world, that the mean of the clicked pixels may show."""
     evidence = problem.evidence
     middles = [
@@ -316,16 +273,11 @@ def _aims(problem: Problem) -> NDArray[np.float64]:
         for first, stop in pairwise(evidence.bounds):
             inner = np.linspace(first, stop - 1, 7)[1:-1:2].astype(np.int64)
             aims.extend(evidence.samples_world[inner])
-    unique: NDArray[np.float64] = np.unique(np.round(aims, -1), axis=0)
+    unique: Floats = np.unique(np.round(aims, -1), axis=0)
     return unique
 
 
-def _rotations_towards(
-    centers: NDArray[np.float64],
-    aims: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    focal: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _rotations_towards(centers: Floats, aims: Floats, offsets: Floats, focal: Floats) -> Floats:
     """Return rotations (b, 3, 3) of level cameras with `aims` at `offsets` [px] from the center."""
     forward = aims - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -339,13 +291,13 @@ def _rotations_towards(
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def find_start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray[np.float64]:
+def find_start(problem: Problem, settings: StaticCalibrationSettings) -> Floats:
     """Return the (22,) camera that the outlier search starts from."""
     count = 2 * len(problem.evidence.points) + len(problem.evidence.drawn_image)
     rows = cameras_from_homographies(problem, settings.prior, leave_out=False)
     if len(rows):
         best, cost = fit_from_starts(problem, rows, settings.wrong_click)
-        if cost < 0.5 * _MAX_MISFIT * count:
+        if cost < 0.5 * 4.0 * count:
             return best
     coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
     everywhere = plausible_cameras(problem, settings.prior)
@@ -355,18 +307,17 @@ def find_start(problem: Problem, settings: StaticCalibrationSettings) -> NDArray
     return fit_from_starts(problem, np.concatenate([rows, chosen]), settings.wrong_click)[0]
 
 
-def fit_from_starts(
-    problem: Problem, rows: NDArray[np.float64], click_loss: float
-) -> tuple[NDArray[np.float64], float]:
+def fit_from_starts(problem: Problem, rows: Floats, click_loss: float) -> tuple[Floats, float]:
     """Return the best camera (22,) reached from starts (b, 22), and its robust cost.
 
     A wide loss first moves every start into its basin; then a sharper loss decides, which a marking
     under a wrong name cannot dominate.
     """
+    iterations = 12
     coarse = replace(problem, drawn_loss=_COMPARISON_LOSS)
-    near = adjust(coarse, rows, click_loss=_COMPARISON_LOSS, iterations=_TRIAL_ITERATIONS)
-    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=_TRIAL_ITERATIONS)
-    direct = adjust(problem, rows, click_loss=click_loss, iterations=_TRIAL_ITERATIONS)
+    near = adjust(coarse, rows, click_loss=_COMPARISON_LOSS, iterations=iterations)
+    sharp = adjust(problem, near.rows, click_loss=click_loss, iterations=iterations)
+    direct = adjust(problem, rows, click_loss=click_loss, iterations=iterations)
     cost = np.concatenate([sharp.cost, direct.cost])
     best = int(np.argmin(cost))
     return np.concatenate([sharp.rows, direct.rows])[best], float(cost[best])

@@ -171,10 +171,6 @@ def _read(grey: Image, place: Floats, normal: Floats, curvature: float, profile:
 _BLUR: Final = 0.75
 """Standard deviation of a bar's edges [px]: of a sharp lens, 0.7, and of a pixel's own size."""
 _ROOT_2, _ROOT_2PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
-_MAX_PIXELS: Final = 1000
-"""Pixels of a fitted bar, at most [1]: no bar is 190 px wide."""
-_FITTINGS: Final = 5
-"""Gauss-Newton steps per bar; the search before is accurate to half a pixel."""
 
 
 @compile_kernel
@@ -196,9 +192,10 @@ def fit_bars(
         offsets: (n,) along the normal [px], written; NaN where no bar fits.
         variances: (n,) [px^2], written.
     """
+    max_pixels = 1000  # no bar is 190 px wide
     places, normals = sections.places, sections.normals
     widths, curvatures = sections.widths, sections.curvatures
-    across, values = np.empty(_MAX_PIXELS), np.empty(_MAX_PIXELS)
+    across, values = np.empty(max_pixels), np.empty(max_pixels)
     for i in range(len(places)):
         offsets[i] = np.nan
         variances[i] = np.inf
@@ -275,7 +272,8 @@ def _fit_bar(across: Floats, values: Floats, half: float) -> tuple[float, float,
     normal, right = np.empty((4, 4)), np.empty(4)
     row = np.empty(4)
     variance = np.inf
-    for fitting in range(_FITTINGS):
+    # Gauss-Newton steps; the search before is accurate to half a pixel.
+    for fitting in range(5):
         normal[:] = 0.0
         right[:] = 0.0
         squares = 0.0

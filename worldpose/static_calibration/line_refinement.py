@@ -16,12 +16,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from data_contracts.arrays import Floats
+from data_contracts.arrays import Flags, Floats, Image, Integers
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate, Surface
 from worldpose.static_calibration.adjustment import Problem, camera_row
 from worldpose.static_calibration.click_outliers import (
@@ -106,7 +104,7 @@ class LineRefinement:
 def refine_on_lines(
     start: CameraOnPitch,
     pitch: PitchTemplate,
-    picture: NDArray[np.uint8],
+    picture: Image,
     settings: LineRefinementSettings | None = None,
     *,
     survey_error: float = SURVEY_ERROR,
@@ -131,24 +129,24 @@ def refine_on_lines(
         InputError: the image size is not that of the start's camera.
     """
     grey = brightness(picture)
-    _check_size(start.camera, grey)
+    width, height = (int(n) for n in start.camera.image_size)
+    if grey.shape != (height, width):
+        raise InputError(
+            "refine_on_lines: picture",
+            expected=f"an image of {width} x {height} px, the camera's image_size",
+            found=f"{grey.shape[1]} x {grey.shape[0]}",
+            todo="Give an image of this camera in its full size.",
+        )
     search = LineSearch(start, pitch, grey, survey_error, settings or LineRefinementSettings())
-    return refine_by_search(search, pitch, begin)
+    return _refine_by_search(search, pitch, begin or start)
 
 
-def refine_by_search(
-    search: LineSearch, pitch: PitchTemplate, begin: CameraOnPitch | None = None
+def _refine_by_search(
+    search: LineSearch, pitch: PitchTemplate, begin: CameraOnPitch
 ) -> LineRefinement:
-    """Return the camera that a line search finds, as `refine_on_lines` does.
-
-    Args:
-        search: prepared for the image, with the start and the settings.
-        pitch: the template.
-        begin: camera to begin the search at; the start of the search if None.
-    """
     start, settings = search.start, search.settings
-    begin = begin or start
-    everywhere = sample_markings(pitch, _WORLD_SPACING)
+    # The nearest paint has 40 px per metre.
+    everywhere = sample_markings(pitch, 0.2)
     everywhere = everywhere.raise_surface(begin.surface - pitch.surface)
     seen = search.look(begin.camera, everywhere)
     index = thin_samples(seen, everywhere, settings.spacing_px, settings.samples)
@@ -159,8 +157,13 @@ def refine_by_search(
     if found is None:
         return _keep_start(start, "too few painted lines were found")
     found = search.learn_noise(found)
-    inliers = found.adjusted.weights > _MIN_INLIER_WEIGHT
-    inliers &= _have_inliers(found, inliers, settings.min_inlier_share)
+    # Within one scale of the loss.
+    inliers = found.adjusted.weights > 0.25
+    # Chance detections on a marking that is absent would move the camera.
+    marking, names = found.samples.marking, len(found.samples.names)
+    seen_there = np.bincount(marking, found.seen.visible, names)
+    found_there = np.bincount(marking, inliers, names)
+    inliers &= (found_there >= settings.min_inlier_share * seen_there)[marking]
     count, visible = int(inliers.sum()), int(found.seen.visible.sum())
     if count < max(settings.min_found, settings.min_inlier_share * visible):
         return _keep_start(start, f"only {count} of {visible} samples of lines were found")
@@ -188,65 +191,33 @@ def refine_by_search(
     )
 
 
-_WORLD_SPACING: Final = 0.2
-"""Spacing of samples before thinning [m]; the nearest paint has 40 px per metre."""
-_MIN_INLIER_WEIGHT: Final = 0.25
-"""Weight above which a sample is an inlier: within one scale of the loss [1]."""
-_MAX_CORRELATION: Final = 0.95
-_PRIOR: Final = 20.0
-"""Weight of the expected noise in the estimate of a marking's noise [residuals]."""
-_MIN_FREEDOM_SHARE: Final = 0.5
-"""Minimum share of the samples that remain as degrees of freedom [1]."""
-
-
-def _check_size(camera: Camera, grey: NDArray[np.uint8]) -> None:
-    width, height = (int(n) for n in camera.image_size)
-    if grey.shape != (height, width):
-        raise InputError(
-            "refine_on_lines: picture",
-            expected=f"an image of {width} x {height} px, the camera's image_size",
-            found=f"{grey.shape[1]} x {grey.shape[0]}",
-            todo="Give an image of this camera in its full size.",
-        )
-
-
-def _have_inliers(found: LineFit, inliers: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
-    """Return a mask of samples (n,) whose markings have enough inliers.
-
-    Chance detections on a marking that is absent would move the camera.
-    """
-    marking, count = found.samples.marking, len(found.samples.names)
-    seen = np.bincount(marking, found.seen.visible, count)
-    there = np.bincount(marking, inliers, count)
-    return np.asarray((there >= least * seen)[marking])
-
-
-def _residual_noise(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _residual_noise(found: LineFit, inliers: Flags) -> tuple[Floats, Floats]:
     """Return correlation and excess variance of neighbouring residuals.
 
     Both per sample (n,), from its whole marking: grass is rougher about a far line as narrow as a
     pixel than about a near one, and affects neighbours alike.
     """
+    prior = 20.0  # weight of the expected noise of a marking [residuals]
     marking = found.samples.marking
-    scaled = np.where(inliers, found.adjusted.residuals / np.sqrt(found.measured.variances), 0.0)
+    scaled = np.where(inliers, found.adjusted.residuals / np.sqrt(found.variances), 0.0)
     pairs = inliers[1:] & inliers[:-1] & (np.diff(marking) == 0)
 
-    def total(values: Floats, labels: NDArray[np.int64]) -> Floats:
+    def total(values: Floats, labels: Integers) -> Floats:
         return np.bincount(labels, values, len(found.samples.names)).astype(np.float64)
 
     # The fit's degrees of freedom are missing from its residuals.
     used = float(inliers.sum())
-    kept = max(1.0 - found.adjusted.spent / used, _MIN_FREEDOM_SHARE)
+    kept = max(1.0 - found.adjusted.spent / used, 0.5)
     squares = total(scaled**2, marking) / kept
     products = total(np.where(pairs, scaled[1:] * scaled[:-1], 0.0), marking[1:])
     # For a few samples, the mean square of all samples is the better estimate.
     mean = squares.sum() / used + np.finfo(np.float64).tiny
-    correlation = products / np.maximum(squares, _PRIOR * mean)
-    excess = (squares + _PRIOR) / (total(inliers.astype(np.float64), marking) + _PRIOR)
-    return np.clip(correlation, 0.0, _MAX_CORRELATION)[marking], excess[marking]
+    correlation = products / np.maximum(squares, prior * mean)
+    excess = (squares + prior) / (total(inliers.astype(np.float64), marking) + prior)
+    return np.clip(correlation, 0.0, 0.95)[marking], excess[marking]
 
 
-def _marking_fits(found: LineFit, inliers: NDArray[np.bool_]) -> tuple[MarkingFit, ...]:
+def _marking_fits(found: LineFit, inliers: Flags) -> tuple[MarkingFit, ...]:
     """Return the detection result of each marking in the image."""
     samples, fits = found.samples, []
     visible, residuals = found.seen.visible, found.adjusted.residuals
@@ -266,27 +237,18 @@ def _keep_start(start: CameraOnPitch, reason: str) -> LineRefinement:
 _NOISE_FACTORS: Final = (2.0, 4.0)
 """Factors on the click noise, tried in turn where the clicks do not lead to the lines [1]; the last
 is the largest plausible one."""
-_MAX_STATED_RATIO: Final = 1.5
-"""Noise ratio from the lines up to which the stated noise stands [1]: the median residual of a few
-clicks exceeds it by chance."""
 
 
 def refine_and_judge(
-    found: Explanation, pitch: PitchTemplate, picture: NDArray[np.uint8]
+    found: Explanation, pitch: PitchTemplate, picture: Image
 ) -> tuple[Explanation, LineRefinement]:
-    """Return stage 2 with inliers chosen by the painted lines, and stage 3 from there.
+    """Return stage 2 with inliers chosen by the painted lines of an image, and stage 3 from there.
 
-    Its clicks are then on the surface that the lines show.
-
-    A few clicks close together determine neither their own noise nor the outliers among them. The
-    lines do: a camera fitted to the lines gives the residual of every click. Where the search finds
-    no lines, or the lines contradict the clicks, it retries with twice and four times the stated
-    noise, then without one click at a time. If every attempt fails, the clicks decide the camera.
-
-    Args:
-        found: stage 2; its settings have the thresholds of outliers.
-        pitch: the template.
-        picture: image of the camera.
+    Its clicks are then on the surface that the lines show. A few clicks close together determine
+    neither their own noise nor the outliers among them. The lines do: a camera fitted to the lines
+    gives the residual of every click. Where the search finds no lines, or the lines contradict the
+    clicks, it retries with twice and four times the stated noise, then without one click at a time.
+    If every attempt fails, the clicks decide the camera.
     """
     problem, fit, settings = found.problem, found.fit, found.settings
 
@@ -332,7 +294,7 @@ def _leave_one_out_fits(problem: Problem, fit: InlierFit) -> Iterator[InlierFit]
 
 
 def _judge(
-    found: Explanation, lines: LineRefinement, pitch: PitchTemplate, picture: NDArray[np.uint8]
+    found: Explanation, lines: LineRefinement, pitch: PitchTemplate, picture: Image
 ) -> tuple[Explanation, LineRefinement] | None:
     """Return the fit to the inliers of a camera refined on lines, and stage 3 from there.
 
@@ -344,7 +306,8 @@ def _judge(
     problem = _on_surface(found.problem, lines.estimate)
     row = camera_row(lines.estimate.camera)
     ratio = noise_ratio(problem, row)
-    factor = 1.0 if ratio <= _MAX_STATED_RATIO else min(ratio, _NOISE_FACTORS[-1])
+    # The median residual of a few clicks exceeds the stated noise by chance.
+    factor = 1.0 if ratio <= 1.5 else min(ratio, _NOISE_FACTORS[-1])
     wider = scale_noise(problem, factor, settings)[0]
     mahalanobis = mahalanobis_distances(wider, lines.estimate.estimate)
     inliers = mahalanobis < settings.wrong_click
@@ -378,7 +341,7 @@ def _on_surface(problem: Problem, found: CameraOnPitch) -> Problem:
 def _refine(
     start: CameraOnPitch,
     pitch: PitchTemplate,
-    picture: NDArray[np.uint8],
+    picture: Image,
     settings: StaticCalibrationSettings,
     begin: CameraOnPitch | None = None,
 ) -> LineRefinement:

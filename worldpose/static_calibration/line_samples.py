@@ -10,28 +10,17 @@ from dataclasses import astuple, dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Integers
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
+from worldpose.geometry.rows import Index, take_rows
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.line_detection import CrossSections
 from worldpose.static_calibration.parameters import by_step
 
 FIRST_KNOT: Final = -1_000_000
 """Number of the first knot's unknown; others follow downwards."""
-_PRIOR_WEIGHT: Final = 4.0
-"""Degrees of freedom of a standard deviation before the residuals [1]."""
-_MAX_UNKNOWN: Final = 3.0
-"""Value of an unknown [standard deviations] beyond which it is an outlier for the noise."""
-_MIN_UNEVENNESS_M: Final = 0.0002
-"""Below, errors of readings are larger in any image [m]."""
-_MAX_UNEVENNESS_M: Final = 0.1
-"""Largest unevenness [m]; beyond, lines have wrong names."""
-_MAX_READING: Final = 8.0
-_GAUSSIAN_MEDIAN: Final = 0.6745
-"""Median absolute value of a standard Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -62,22 +51,24 @@ class PaintNoise:
         return float(np.abs(np.divide(astuple(self), astuple(other)) - 1.0).max())
 
     def update(self, least: PaintNoise, paint: PaintUnknowns, residuals: Floats) -> PaintNoise:
-        """Return the noise after one step of the evidence maximization.
+        """Return the noise after one step of the evidence maximization, at least the stated one.
 
-        Args:
-            least: the minimum, and the prior.
-            paint: unknowns of a fit with this noise.
-            residuals: (n,) residuals of this fit, in standard deviations of the present reading.
+        The unknowns of the paint and the residuals (n,), in standard deviations of the present
+        reading, are those of a fit with this noise.
         """
+        gaussian_median = 0.6745  # median absolute value of a standard Gaussian
+        max_uneven = 0.1  # [m]; beyond, lines have wrong names
+        weight = 4.0  # degrees of freedom of the prior
         mine = paint.numbers <= FIRST_KNOT
-        squares = float(np.minimum(paint.values[mine] ** 2, _MAX_UNKNOWN**2).sum())
-        total = _PRIOR_WEIGHT * least.unevenness_m**2 + squares * self.unevenness_m**2
-        uneven = float(np.sqrt(total / (_PRIOR_WEIGHT + paint.freedom[mine].sum())))
-        middle = float(np.median(np.abs(residuals))) if len(residuals) else _GAUSSIAN_MEDIAN
+        # Beyond three standard deviations an unknown is an outlier for the noise.
+        squares = float(np.minimum(paint.values[mine] ** 2, 3.0**2).sum())
+        total = weight * least.unevenness_m**2 + squares * self.unevenness_m**2
+        uneven = float(np.sqrt(total / (weight + paint.freedom[mine].sum())))
+        middle = float(np.median(np.abs(residuals))) if len(residuals) else gaussian_median
         return replace(
             self,
-            unevenness_m=float(np.clip(uneven, least.unevenness_m, _MAX_UNEVENNESS_M)),
-            reading=float(np.clip(self.reading * middle / _GAUSSIAN_MEDIAN, 1.0, _MAX_READING)),
+            unevenness_m=float(np.clip(uneven, least.unevenness_m, max_uneven)),
+            reading=float(np.clip(self.reading * middle / gaussian_median, 1.0, 8.0)),
         )
 
 
@@ -103,21 +94,10 @@ class PaintUnknowns:
 def stated_noise(survey_error: float, shift: float) -> PaintNoise:
     """Return the noise of a surveyed pitch without unevenness: the minimum.
 
-    Args:
-        survey_error: survey error of the points that define markings, each axis, standard deviation
-            [m].
-        shift: shift of a whole marking in the image, standard deviation [px].
+    Points that define markings have a survey error [m], each axis, and whole markings a shift [px].
     """
-    return PaintNoise(max(survey_error, 1e-6), _MIN_UNEVENNESS_M, max(shift, 1e-6), 1.0)
-
-
-_STRIDE: Final = 0.1
-"""Step along an arc for finite differences of its curvature [m]."""
-_KNOT_SPACING: Final = 6.0
-"""Spacing of the knots of a marking's unevenness [m]: residuals of real markings keep their sign
-over 3 to 10 m."""
-_MIN_WIDTH: Final = 0.5
-"""Minimum projected width of paint to search [px]."""
+    # Below 0.2 mm, errors of readings are larger in any image.
+    return PaintNoise(max(survey_error, 1e-6), 0.0002, max(shift, 1e-6), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +121,12 @@ class LineSamples:
     points_world: Floats
     across_world: Floats
     bend_world: Floats
-    ends: NDArray[np.int64]
+    ends: Integers
     shares: Floats
-    knots: NDArray[np.int64]
+    knots: Integers
     knot_shares: Floats
     by_surface: Floats
-    marking: NDArray[np.int64]
+    marking: Integers
     names: tuple[str, ...]
 
     @property
@@ -160,28 +140,13 @@ class LineSamples:
         return self.points_world + way * self.along_world + 0.5 * way**2 * self.bend_world
 
     def raise_surface(self, change: Floats) -> LineSamples:
-        """Return the samples at their places on a changed surface.
-
-        Args:
-            change: (2,) change of the crown and of the end fall [m].
-        """
+        """Return the samples at their places after a change (2,) of crown and end fall [m]."""
         places = self.points_world.copy()
         places[:, 2] += self.by_surface @ change
         return replace(self, points_world=places)
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> LineSamples:
-        return LineSamples(
-            self.points_world[index],
-            self.across_world[index],
-            self.bend_world[index],
-            self.ends[index],
-            self.shares[index],
-            self.knots[index],
-            self.knot_shares[index],
-            self.by_surface[index],
-            self.marking[index],
-            self.names,
-        )
+    def __getitem__(self, index: Index) -> LineSamples:
+        return take_rows(self, index, "names")
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,34 +174,20 @@ class ProjectedLines:
     curvatures: Floats
     by_camera: Floats
     by_paint: Floats
-    unknowns: NDArray[np.int64]
-    visible: NDArray[np.bool_]
+    unknowns: Integers
+    visible: Flags
 
     @property
     def sections(self) -> CrossSections:
         """Cross sections at the samples, to look for bars in."""
         return CrossSections(self.places, self.normals, self.widths, self.curvatures)
 
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> ProjectedLines:
-        return ProjectedLines(
-            self.places[index],
-            self.normals[index],
-            self.widths[index],
-            self.curvatures[index],
-            self.by_camera[index],
-            self.by_paint[index],
-            self.unknowns[index],
-            self.visible[index],
-        )
+    def __getitem__(self, index: Index) -> ProjectedLines:
+        return take_rows(self, index)
 
 
 def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
-    """Return samples of all painted markings.
-
-    Args:
-        pitch: the template, with its crown.
-        spacing: maximum distance between neighbours [m].
-    """
+    """Return samples of all painted markings, with neighbours at most a spacing [m] apart."""
     samples = pitch.sample_lines(spacing)
     points, marking = samples.points_world, samples.marking
     along, share = np.empty_like(points), np.empty(len(points))
@@ -269,16 +220,15 @@ def sample_markings(pitch: PitchTemplate, spacing: float) -> LineSamples:
     )
 
 
-def _place_knots(
-    points: Floats, marking: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.int64], Floats]:
+def _place_knots(points: Floats, marking: Integers, count: int) -> tuple[Integers, Floats]:
     """Return the knots (n, 2) on either side of samples, and their linear weights (n, 2)."""
     knots, weights, first = np.zeros((len(points), 2), np.int64), np.zeros((len(points), 2)), 0
     for index in range(count):
         mine = np.flatnonzero(marking == index)
         steps = np.linalg.norm(np.diff(points[mine, :2], axis=0), axis=1)
         way = np.concatenate([[0.0], np.cumsum(steps)])
-        parts = max(1, round(way[-1] / _KNOT_SPACING))
+        # Residuals of real markings keep their sign over 3 to 10 m.
+        parts = max(1, round(way[-1] / 6.0))
         place = np.minimum(way / max(way[-1], 1e-9) * parts, parts - 1e-9)
         before = np.floor(place).astype(np.int64)
         knots[mine] = first + before[:, None] + [0, 1]
@@ -291,14 +241,7 @@ def _place_knots(
 def project_lines(
     camera: Camera, samples: LineSamples, line_width: float, noise: PaintNoise
 ) -> ProjectedLines:
-    """Return samples projected into a camera's image, with derivatives.
-
-    Args:
-        camera: a single camera.
-        samples: samples of `sample_markings`.
-        line_width: width of the paint [m].
-        noise: noise of the paint.
-    """
+    """Return samples projected into a single camera's image, with derivatives."""
     points = samples.points_world
     projected = camera.project_with_jacobians(points)
     image, jacobian = projected.points_image, by_step(camera, projected)
@@ -312,7 +255,7 @@ def project_lines(
         side = (spread * normals).sum(-1)
         widths = np.abs(side) * line_width
         inside = ((image > 0.0) & (image < camera.image_size - 1.0)).all(-1)
-        visible = inside & (widths >= _MIN_WIDTH) & np.isfinite(jacobian).all((1, 2))
+        visible = inside & (widths >= 0.5) & np.isfinite(jacobian).all((1, 2))
     curvatures = _curvatures(camera, samples, normals)
     by_place = np.einsum("nij,ni->nj", projected.d_points, normals)
     by_point = noise.points_m * by_place
@@ -345,10 +288,11 @@ def project_lines(
 
 def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats:
     """Return curvatures (n,) of projected markings towards their normals (n, 2) [1/px]."""
+    stride = 0.1  # [m], for finite differences
     curvatures = np.zeros(len(normals))
     arcs = np.flatnonzero(samples.bend_world.any(axis=1))
     before, middle, after = (
-        camera.project(samples[arcs].beside(s)) for s in (-_STRIDE, 0.0, _STRIDE)
+        camera.project(samples[arcs].beside(s)) for s in (-stride, 0.0, stride)
     )
     turned = ((before + after - 2.0 * middle) * normals[arcs]).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -356,16 +300,10 @@ def _curvatures(camera: Camera, samples: LineSamples, normals: Floats) -> Floats
     return curvatures
 
 
-def thin_samples(
-    seen: ProjectedLines, samples: LineSamples, spacing: float, most: int
-) -> NDArray[np.int64]:
-    """Return indices of visible samples at about even spacing in the image.
+def thin_samples(seen: ProjectedLines, samples: LineSamples, spacing: float, most: int) -> Integers:
+    """Return indices of visible samples at about even spacing [px] in the image.
 
-    Args:
-        seen: the samples in the image.
-        samples: the same samples in the world.
-        spacing: between neighbours [px], more if `most` requires it.
-        most: approximate maximum count.
+    The spacing grows where there would be more than about `most` samples.
     """
     index = np.flatnonzero(seen.visible)
     if not len(index):
@@ -378,11 +316,6 @@ def thin_samples(
     fresh = np.diff(bins, prepend=-1) > 0
     fresh |= np.diff(samples.marking[index], prepend=-1) != 0
     return np.asarray(index[fresh])
-
-
-_STEP: Final = 0.5
-"""Spacing of the polylines' corners [m]: the error of a corner arc is then 3 cm, a quarter of its
-width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +334,8 @@ class WhiteStructures:
 
 def white_structures(pitch: PitchTemplate) -> WhiteStructures:
     """Return the polylines of a template's markings and goals."""
-    parts = [pitch.marking_points(name, _STEP) for name in pitch.white_names]
+    # The error of a corner arc is then 3 cm, a quarter of its width.
+    parts = [pitch.marking_points(name, 0.5) for name in pitch.white_names]
     return WhiteStructures(
         np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     )
@@ -414,7 +348,7 @@ def clear(
     places: Floats,
     room: Floats,
     marking: Integers,
-) -> NDArray[np.bool_]:
+) -> Flags:
     """Return a mask of places (n,) with no structure but their own marking within a distance.
 
     Args:
@@ -442,7 +376,7 @@ def _clear(
     places: Floats,
     room: Floats,
     marking: Integers,
-    result: NDArray[np.bool_],
+    result: Flags,
 ) -> None:
     for i in range(len(places)):
         x, y = places[i, 0], places[i, 1]

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Integers
+from data_contracts.arrays import Flags, Floats, Image, Integers
 from worldpose.compiled import compile_kernel
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
@@ -37,9 +36,6 @@ from worldpose.static_calibration.parameters import (
 )
 from worldpose.static_calibration.settings import LineRefinementSettings
 
-_STRIDE: Final = 0.1
-"""Step along a marking for finite differences of its projection [m]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Bars:
@@ -60,7 +56,7 @@ class Bars:
     noise: Floats
     surface: Floats
     by_paint: Floats
-    unknowns: NDArray[np.int64]
+    unknowns: Integers
     paint: PaintNoise
 
     @cached_property
@@ -91,8 +87,9 @@ class Bars:
         Residuals are distances to the nearest point: a marking that slides along itself fits as
         well as before.
         """
+        stride = 0.1  # [m], for finite differences of the projection
         samples = self.samples.raise_surface(surface - self.surface)
-        before, after = (camera.project(samples.beside(way)) for way in (-_STRIDE, _STRIDE))
+        before, after = (camera.project(samples.beside(way)) for way in (-stride, stride))
         seen = camera.project_with_jacobians(samples.points_world)
         middle, by_height = seen.points_image, seen.d_points[..., 2:]
         jacobian = np.concatenate(
@@ -217,39 +214,6 @@ def _accumulate(
                 normal[free + index[i, a], free + index[i, b]] += left * by_paint[i, b]
 
 
-_MAX_PASSES: Final = 8
-"""Maximum iterations of search and fit; one or two from ordinary clicks."""
-_COARSE_ERROR: Final = 1.0
-"""Standard deviation of a detected bar before its subpixel fit [px]."""
-_COARSE: Final = 500
-"""Approximate number of samples in coarse iterations [1]."""
-_MIN_REACH: Final = 1.5
-"""Margin of the search beyond three standard deviations [px]."""
-_FINE_REACH: Final = 5.5
-"""Search width up to which bars are fitted to subpixel accuracy [px]."""
-_SEARCHED_SHARE: Final = 1.0 / 3.0
-"""Share of the samples to search where all have a large uncertainty [1]."""
-_FINE_SHARE: Final = 0.8
-"""Minimum share of the samples within this search width [1]."""
-_MAX_FITS: Final = 4
-"""Maximum fits to subpixel bars, each relinearized at the last camera."""
-_MIN_MOTION: Final = 0.02
-"""Maximum sample displacement at which these fits stop [px]."""
-_MIN_WEIGHT: Final = 1e-3
-"""Weight up to which a sample is excluded from the result [1]."""
-_MIN_READING_STD: Final = 0.05
-"""Minimum standard deviation of a fitted bar [px]."""
-_MIN_STRENGTH: Final = 0.5
-"""Strength of a bar below which it is no paint, relative to its marking's median [1]."""
-_FULL_WIDTH: Final = 1.5
-"""Width of paint from which its middle is as bright as the paint [px]."""
-_INITIAL_NOISE: Final = PaintNoise(points_m=0.0, unevenness_m=0.02, shift_px=0.0, reading=2.5)
-"""Noise with which the search begins: that of a real pitch on artificial turf."""
-_WEAK_TRUST: Final = 1e-3
-"""Weight of the start while the noise is learned [1]."""
-_LEARN_PASSES: Final = 40
-_NOISE_TOLERANCE: Final = 0.01
-"""Relative change of the noise at which learning stops [1]."""
 _COARSE_SCALES: Final = (np.inf, 12.0, 6.0, 4.0, 3.0, 3.0)
 _FINE_SCALES: Final = (12.0, 6.0)
 """Decreasing scales of the loss [standard deviations]: outliers lose their influence one by one,
@@ -257,22 +221,18 @@ which avoids the nearest local minimum."""
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredBars:
-    """Bars across samples: offsets (n,) along the normals [px] and their variances (n,) [px^2]."""
-
-    offsets: Floats
-    variances: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class MeasuredLines:
-    """A camera, the pitch's surface (2,), samples on it, their projections and the bars there."""
+    """A camera, the pitch's surface (2,), n samples on it, their projections and the bars there.
+
+    Bars have offsets (n,) along the normals [px] and variances (n,) [px^2].
+    """
 
     camera: Camera
     surface: Floats
     samples: LineSamples
     seen: ProjectedLines
-    measured: MeasuredBars
+    offsets: Floats
+    variances: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +242,9 @@ class LineFit(MeasuredLines):
     adjusted: LineStep
 
 
+Lines = TypeVar("Lines", bound=MeasuredLines)
+
+
 class LineSearch:
     """Line search in one image, from a start with a Gaussian prior."""
 
@@ -289,14 +252,16 @@ class LineSearch:
         self,
         start: CameraOnPitch,
         pitch: PitchTemplate,
-        grey: NDArray[np.uint8],
+        grey: Image,
         survey_error: float,
         settings: LineRefinementSettings,
     ) -> None:
+        # The noise of a real pitch on artificial turf.
+        begin = PaintNoise(points_m=0.0, unevenness_m=0.02, shift_px=0.0, reading=2.5)
         self.start, self.grey, self.settings = start, grey, settings
         self.least = stated_noise(survey_error, settings.line_shift_px)
         self.noise = PaintNoise(
-            *(max(pair) for pair in zip(astuple(self.least), astuple(_INITIAL_NOISE), strict=True))
+            *(max(pair) for pair in zip(astuple(self.least), astuple(begin), strict=True))
         )
         self.whites = white_structures(pitch)
         spread = np.sqrt(np.diag(start.covariance))
@@ -312,31 +277,27 @@ class LineSearch:
         """Return the samples projected into a camera's image."""
         return project_lines(camera, samples, self.settings.line_width_m, self.noise)
 
-    def clear(
-        self, camera: Camera, samples: LineSamples, seen: ProjectedLines
-    ) -> NDArray[np.bool_]:
+    def clear(self, camera: Camera, samples: LineSamples, seen: ProjectedLines) -> Flags:
         """Return a mask of the samples (n,) with grass on both sides in the image."""
         room, half = 0.5 * seen.widths + CLEARANCE, 0.5 * self.settings.line_width_m
         return clear(camera, self.whites, half, seen.places, room, samples.marking)
 
     def run(self, begin: CameraOnPitch, samples: LineSamples) -> LineFit | None:
-        """Return the result of the coarse-to-fine search; None without lines.
-
-        Args:
-            begin: camera and surface to begin at.
-            samples: samples of the markings, on that surface.
-        """
+        """Return the result of the coarse-to-fine search from a camera and surface, if any."""
+        coarse = 500  # approximate number of samples in coarse passes
         camera, covariance = begin.camera, begin.covariance[np.ix_(self.free, self.free)]
         surface = begin.surface
-        few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // _COARSE))]
+        few = samples[np.arange(0, len(samples.marking), max(1, len(samples.marking) // coarse))]
         found = None
-        for left in reversed(range(_MAX_PASSES)):
+        # One or two passes suffice from ordinary clicks.
+        for left in reversed(range(8)):
             chosen = few
             seen = self.look(camera, few)
             if seen.visible.sum() < 0.5 * self.settings.min_found:
                 return None
             reach, sure = self._reach(seen, covariance)
-            fine = left == 0 or bool((sure <= _FINE_REACH)[seen.visible].mean() >= _FINE_SHARE)
+            # Bars are fitted to subpixel accuracy once four of five samples need a narrow search.
+            fine = left == 0 or bool((sure <= 5.5)[seen.visible].mean() >= 0.8)
             if fine:
                 seen = self.look(camera, samples)
                 alone = self.clear(camera, samples, seen)
@@ -344,12 +305,11 @@ class LineSearch:
                 reach, _ = self._reach(seen, covariance)
             if not seen.visible.any():
                 return None
-            measured = self._measure(seen, reach, chosen.marking if fine else None)
+            bars = self._measure(seen, reach, chosen.marking if fine else None)
             least = self.settings.min_found * len(chosen.marking) / len(samples.marking)
-            if np.isfinite(measured.offsets).sum() < max(least, 1.0):
+            if np.isfinite(bars[0]).sum() < max(least, 1.0):
                 return None
-            place = MeasuredLines(camera, surface, chosen, seen, measured)
-            found = self.converge(place, fine)
+            found = self.converge(MeasuredLines(camera, surface, chosen, seen, *bars), fine)
             if fine:
                 break
             change = found.surface - surface
@@ -358,16 +318,16 @@ class LineSearch:
             covariance = np.asarray(np.linalg.inv(found.adjusted.information))
         return found
 
-    def reweight(self, found: LineFit, used: NDArray[np.bool_], inflation: Floats) -> LineFit:
+    def reweight(self, found: LineFit, used: Flags, inflation: Floats) -> LineFit:
         """Return the fit to the used samples (n,), with variances times `inflation` (n,)."""
-        measured = MeasuredBars(
-            np.where(used, found.measured.offsets, np.nan), found.measured.variances * inflation
+        now = replace(
+            found,
+            offsets=np.where(used, found.offsets, np.nan),
+            variances=found.variances * inflation,
         )
         scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)
-        now: MeasuredLines = replace(found, measured=measured)
         adjusted = self._adjust(now, scales)
-        now = self._step(now, adjusted.step)
-        return LineFit(now.camera, now.surface, now.samples, now.seen, measured, adjusted)
+        return replace(self._step(now, adjusted.step), adjusted=adjusted)
 
     def learn_noise(self, found: LineFit) -> LineFit:
         """Return the fit at the noise that its residuals show; `noise` becomes that noise.
@@ -375,25 +335,21 @@ class LineSearch:
         The camera is free meanwhile: uneven paint must not explain a start that the lines
         contradict.
         """
-        own = found.measured.variances / self.noise.reading**2
+        own = found.variances / self.noise.reading**2
         scale = self.settings.loss_scale
-        for _ in range(_LEARN_PASSES):
+        for _ in range(40):
             before = self.noise
             variances = own * before.reading**2
-            now = replace(
-                found,
-                seen=self.look(found.camera, found.samples),
-                measured=replace(found.measured, variances=variances),
-            )
-            adjusted = self._adjust(now, (np.inf, 2.0 * scale, scale), trust=_WEAK_TRUST)
+            seen = self.look(found.camera, found.samples)
+            now = replace(found, seen=seen, variances=variances)
+            adjusted = self._adjust(now, (np.inf, 2.0 * scale, scale), trust=1e-3)
             known = np.isfinite(adjusted.residuals)
             scaled = (adjusted.residuals / np.sqrt(variances))[known]
             self.noise = before.update(self.least, adjusted.paint, scaled)
-            if self.noise.relative_difference(before) < _NOISE_TOLERANCE:
+            if self.noise.relative_difference(before) < 0.01:
                 break
-        measured = replace(found.measured, variances=own * self.noise.reading**2)
-        seen = self.look(found.camera, found.samples)
-        return self.converge(replace(found, seen=seen, measured=measured), True)
+        seen, variances = self.look(found.camera, found.samples), own * self.noise.reading**2
+        return self.converge(replace(found, seen=seen, variances=variances), True)
 
     def distance(self, found: LineFit) -> float:
         """Return the Mahalanobis distance of a fit from the start."""
@@ -409,9 +365,9 @@ class LineSearch:
     def collect_bars(self, found: LineFit) -> Bars:
         """Return the bars that contribute to a fit."""
         seen, weights = found.seen, found.adjusted.weights
-        used = weights > _MIN_WEIGHT
-        pixels = seen.places + found.measured.offsets[:, None] * seen.normals
-        variances = found.measured.variances[used] / weights[used]
+        used = weights > 1e-3
+        pixels = seen.places + found.offsets[:, None] * seen.normals
+        variances = found.variances[used] / weights[used]
         return Bars(
             found.samples[used],
             pixels[used],
@@ -423,32 +379,24 @@ class LineSearch:
         )
 
     def converge(self, at: MeasuredLines, fine: bool) -> LineFit:
-        """Return the converged fit to bars at fixed pixels.
-
-        Args:
-            at: camera, surface, samples and bars to begin at.
-            fine: whether the bars are fitted to a subpixel.
-        """
-        bars = at.seen.places + at.measured.offsets[:, None] * at.seen.normals
+        """Return the converged fit to bars at fixed pixels, fitted to a subpixel if fine."""
+        bars = at.seen.places + at.offsets[:, None] * at.seen.normals
         final = (self.settings.loss_scale,) * 3
         scales: tuple[float, ...] = (*_FINE_SCALES, *final) if fine else _COARSE_SCALES
-        for _ in range(_MAX_FITS if fine else 1):
+        for _ in range(4 if fine else 1):
             adjusted = self._adjust(at, scales)
-            scales = (
-                2.0 * self.settings.loss_scale,
-                self.settings.loss_scale,
-                self.settings.loss_scale,
-            )
+            scales = (2.0 * self.settings.loss_scale, *(self.settings.loss_scale,) * 2)
             moved = np.abs(at.seen.by_camera[:, self.free] @ adjusted.step)[at.seen.visible]
             at = self._step(at, adjusted.step)
             seen = self.look(at.camera, at.samples)
             offsets = ((bars - seen.places) * seen.normals).sum(-1)
-            at = replace(at, seen=seen, measured=replace(at.measured, offsets=offsets))
-            if moved.max(initial=0.0) < _MIN_MOTION:
+            at = replace(at, seen=seen, offsets=offsets)
+            if moved.max(initial=0.0) < 0.02:
                 break
-        return LineFit(at.camera, at.surface, at.samples, at.seen, at.measured, adjusted)
+        parts = (at.camera, at.surface, at.samples, at.seen, at.offsets, at.variances)
+        return LineFit(*parts, adjusted)
 
-    def _step(self, at: MeasuredLines, step: Floats) -> MeasuredLines:
+    def _step(self, at: Lines, step: Floats) -> Lines:
         """Return camera, surface and samples after a step (f,) of the free parameters."""
         whole = np.zeros(len(self.free))
         whole[self.free] = step
@@ -464,25 +412,20 @@ class LineSearch:
 
         The second ones leave out the paint's own errors, which a search does not reduce.
         """
+        margin = 1.5  # beyond three standard deviations [px]
         rows = np.where(seen.visible[:, None], seen.by_camera[:, self.free], 0.0)
         own = np.where(seen.visible, (seen.by_paint**2).sum(-1), 0.0)
         variance = ((rows @ covariance) * rows).sum(-1)
         whole, camera = 3.0 * np.sqrt(variance + own), 3.0 * np.sqrt(variance)
-        return whole + _MIN_REACH, camera + _MIN_REACH
+        return whole + margin, camera + margin
 
     def _measure(
         self, seen: ProjectedLines, reach: Floats, marking: Integers | None
-    ) -> MeasuredBars:
-        """Return the bars matched to the samples.
-
-        Args:
-            seen: the samples.
-            reach: (n,) half widths of the search [px].
-            marking: (n,) marking of the samples, for bars to a subpixel; None = to a pixel.
-        """
+    ) -> tuple[Floats, Floats]:
+        """Return offsets and variances (n,) of the bars matched to the samples."""
         s, count = self.settings, len(reach)
         # If all uncertainties are large, begin with the third of smallest uncertainty.
-        limit = max(s.search_px, float(np.quantile(reach[seen.visible], _SEARCHED_SHARE)))
+        limit = max(s.search_px, float(np.quantile(reach[seen.visible], (1.0 / 3.0))))
         usable = seen.visible & (reach <= limit)
         offsets, strengths = np.empty((count, CANDIDATES)), np.empty((count, CANDIDATES))
         looked = np.where(usable, reach, -1.0)
@@ -495,25 +438,19 @@ class LineSearch:
             merit = np.where(np.isnan(offsets), -np.inf, np.log(strengths) - 0.5 * away**2)
         best = offsets[np.arange(count), merit.argmax(axis=1)]
         if marking is None:
-            return MeasuredBars(best, np.full(count, _COARSE_ERROR**2))
+            return best, np.ones(count)
         exact, variances = np.empty(count), np.empty(count)
         fit_bars(self.grey, seen.sections, best, s.contrast, exact, variances)
-        return MeasuredBars(exact, (variances + _MIN_READING_STD**2) * self.noise.reading**2)
+        return exact, (variances + 0.05**2) * self.noise.reading**2
 
     def _adjust(self, at: MeasuredLines, scales: tuple[float, ...], trust: float = 1.0) -> LineStep:
-        """Return the step from a camera to the best one.
-
-        Args:
-            at: camera, surface, samples and bars.
-            scales: scales of the loss [standard deviations], one per iteration.
-            trust: weight of the start [1].
-        """
-        seen, measured = at.seen, at.measured
+        """Return the step from a camera to the best one."""
+        seen = at.seen
         information, mean = self._prior(at)
         known = np.flatnonzero(seen.visible)
         adjusted = adjust(
-            measured.offsets[known],
-            measured.variances[known],
+            at.offsets[known],
+            at.variances[known],
             np.ascontiguousarray(seen.by_camera[np.ix_(known, np.flatnonzero(self.free))]),
             np.ascontiguousarray(seen.by_paint[known]),
             seen.unknowns[known],
@@ -539,10 +476,11 @@ def _drop_faint(offsets: Floats, strengths: Floats, marking: Integers, widths: F
     Rough grass has bars as well; paint of one marking is about equally bright along it, and blurred
     where it is narrower than a pixel.
     """
-    bright = strengths / np.minimum(widths / _FULL_WIDTH, 1.0)[:, None]
+    # From 1.5 px of width, the middle of paint is as bright as the paint.
+    bright = strengths / np.minimum(widths / 1.5, 1.0)[:, None]
     for index in np.unique(marking):
         mine = marking == index
         strongest = bright[mine, 0]
         if (strongest > 0.0).any():
-            faint = bright[mine] < _MIN_STRENGTH * np.median(strongest[strongest > 0.0])
+            faint = bright[mine] < 0.5 * np.median(strongest[strongest > 0.0])
             offsets[mine] = np.where(faint, np.nan, offsets[mine])

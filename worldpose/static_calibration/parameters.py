@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from data_contracts.arrays import Floats, Integers
 from data_contracts.static_calibration import CAMERA_STEP
@@ -35,7 +35,7 @@ class CameraEstimate:
     """
 
     camera: Camera
-    covariance: NDArray[np.float64]
+    covariance: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,8 @@ class CameraOnPitch:
     """
 
     camera: Camera
-    surface: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    surface: Floats
+    covariance: Floats
 
     @classmethod
     def on_known_surface(cls, found: CameraEstimate, surface: tuple[float, float]) -> CameraOnPitch:
@@ -66,18 +66,13 @@ class CameraOnPitch:
         """The camera, whose covariance includes the uncertainty of the surface."""
         return CameraEstimate(self.camera, self.covariance[:-2, :-2])
 
-    def step_to(self, camera: Camera, surface: NDArray[np.float64]) -> NDArray[np.float64]:
+    def step_to(self, camera: Camera, surface: Floats) -> Floats:
         """Return the (14,) step from here to another camera and surface."""
         return np.concatenate([step_between(self.camera, camera), surface - self.surface])
 
 
 def step_camera(camera: Camera, step: ArrayLike) -> Camera:
-    """Return the camera after a step.
-
-    Args:
-        camera: cameras (...) with square pixels.
-        step: (..., 12) step in the order of `PARAMETERS`.
-    """
+    """Return cameras (...) with square pixels after a step (..., 12), see `PARAMETERS`."""
     step = np.asarray(step, dtype=np.float64)
     distortion = camera.distortion.copy()
     distortion[..., [0, 1, 4]] += step[..., 9:]
@@ -95,9 +90,6 @@ def drop_k3(camera: Camera) -> Camera:
 
     A coefficient that no fit changes is a statement about the lens. That of a guessed lens moved
     two real cameras by 2 and 7 px.
-
-    Args:
-        camera: a single camera.
     """
     k1, k2, _, _, k3 = camera.distortion
     corner = 0.5 * float(np.hypot(*camera.image_size)) / float(camera.focal[0])
@@ -112,12 +104,8 @@ def drop_k3(camera: Camera) -> Camera:
     return replace(camera, distortion=distortion)
 
 
-def step_jacobian(step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivative (n, n) of a step by a further step after it.
-
-    Args:
-        step: (n,) step of a camera, or of a camera and the surface of the pitch.
-    """
+def step_jacobian(step: Floats) -> Floats:
+    """Return the derivative (n, n) of a camera's step (n,) by a further step after it."""
     chain = np.eye(len(step))
     x, y, z = step[3:6]
     # A further rotation also rotates the translation so far.
@@ -125,7 +113,7 @@ def step_jacobian(step: NDArray[np.float64]) -> NDArray[np.float64]:
     return chain
 
 
-def step_between(start: Camera, camera: Camera) -> NDArray[np.float64]:
+def step_between(start: Camera, camera: Camera) -> Floats:
     """Return the (12,) step from one camera to another."""
     moved = camera.cam_from_world @ start.cam_from_world.inverse()
     return np.concatenate(
@@ -139,29 +127,17 @@ def step_between(start: Camera, camera: Camera) -> NDArray[np.float64]:
     )
 
 
-def project_with_jacobian(
-    camera: Camera, points_world: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return pixels (n, 2) [px] of world points and their derivatives (n, 2, 12) by a step.
+def project_with_jacobian(camera: Camera, points_world: ArrayLike) -> tuple[Floats, Floats]:
+    """Return pixels (n, 2) [px] of places (n, 3) [m], world, and derivatives (n, 2, 12) by a step.
 
-    Args:
-        camera: a single camera with square pixels.
-        points_world: (n, 3) [m].
-
-    Returns:
-        NaN for points behind the camera, and where the lens model is not one to one.
+    They are NaN for points behind the single camera, and where the lens model is not one to one.
     """
     seen = camera.project_with_jacobians(points_world)
     return seen.points_image, by_step(camera, seen)
 
 
-def by_step(camera: Camera, seen: Projection) -> NDArray[np.float64]:
-    """Return derivatives (n, 2, 12) by a step, converted from those of a projection.
-
-    Args:
-        camera: a single camera with square pixels.
-        seen: projection of n points.
-    """
+def by_step(camera: Camera, seen: Projection) -> Floats:
+    """Return derivatives (n, 2, 12) by a step, from those of a single camera's projection."""
     by_focal = (seen.d_intrinsics[..., :2] * camera.focal).sum(axis=-1, keepdims=True)
     parts = (
         seen.d_pose,
@@ -179,11 +155,6 @@ PRIORS: Final = 9
 
 _LOST_RESIDUAL: Final = 1e3
 """Residual [px] of points that the camera cannot image: larger than any true residual."""
-_MIN_DEPTH: Final = 0.5
-"""Minimum depth of a drawn marking's sample [m]."""
-_MAX_RADIUS: Final = 1.5
-"""Radius, in half image diagonals, up to which samples are distorted: beyond, polynomials may fold
-a marking back into the image."""
 
 
 @compile_kernel
@@ -265,12 +236,13 @@ def nearest_on_markings(
         place: (d, 3) [m], world, written; NaN where the marking is not in front of the camera.
         normal: (d, 2), written: from the marking to the pixel, either sign.
     """
-    cap = min((_MAX_RADIUS * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
+    max_radius = 1.5  # beyond, polynomials may fold a marking back into the image
+    cap = min((max_radius * reach / c[0]) ** 2, fold_squared(c[4], c[5], c[8]))
     image = np.empty((len(samples), 2))
     for i in range(len(samples)):
         p = samples[i]
         z = c[15] * p[0] + c[16] * p[1] + c[17] * p[2] + c[20]
-        if z < _MIN_DEPTH:
+        if z < 0.5:
             image[i] = np.nan
             continue
         x = (c[9] * p[0] + c[10] * p[1] + c[11] * p[2] + c[18]) / z

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Floats
 from data_contracts.cameras import LensCalibration
 from worldpose.geometry.cameras import Camera, camera_arrays
 from worldpose.geometry.rays import RayStatus
@@ -44,8 +45,8 @@ class PointResidual:
     """
 
     name: str
-    pixel: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    pixel: Floats
+    residual: Floats
     mahalanobis: float
     inlier: bool
     problem: str = ""
@@ -130,14 +131,6 @@ _CANNOT_IMAGE: Final = {
     RayStatus.BEHIND: "cannot be imaged: the point is behind the camera",
     RayStatus.BEYOND_FOLD: "cannot be imaged: the point is outside the lens's field of view",
 }
-_MIN_SCALE_CHANGE: Final = 0.01
-"""Difference from the stated noise too small to report [1]."""
-_MAX_MISFIT: Final = 4.0
-"""Maximum mean loss per observation [1] without a warning: twice the stated noise."""
-
-
-_LENS_CONTRADICTED: Final = 4.0
-"""Deviation from a given lens above which the camera needs review [standard deviations]."""
 
 
 def build_report(
@@ -147,30 +140,25 @@ def build_report(
     pitch: PitchTemplate,
     stated: float,
 ) -> CalibrationReport:
-    """Return the report of a calibrated camera.
+    """Return the report of the final camera, with stated click noise [px].
 
-    Args:
-        estimate: the final camera.
-        found: stage 2; its settings have the estimated click noise.
-        lines: stage 3; None without an image.
-        pitch: the template.
-        stated: stated click noise [px].
+    `found` is stage 2; its settings have the estimated click noise. `lines` is stage 3; None
+    without an image.
     """
     problem, fit, settings = found.problem, found.fit, found.settings
     evidence = problem.evidence
     scale = fit.noise_scale * settings.click_noise_px / stated
     residuals = compute_residuals(problem, camera_row(estimate.camera))
     points = _point_residuals(estimate.camera, found, residuals.click)
-    drawn = [
-        _marking_residual(
-            name, residuals.drawn[evidence.drawn_marking == index], bool(fit.markings[index])
-        )
-        for index, name in enumerate(evidence.markings)
-    ]
+    drawn = []
+    for index, name in enumerate(evidence.markings):
+        off = residuals.drawn[evidence.drawn_marking == index]
+        rms, worst = float(np.sqrt(np.mean(off**2))), float(np.abs(off).max())
+        drawn.append(MarkingResidual(name, len(off), rms, worst, bool(fit.markings[index])))
     ground_error = ground_error_map(estimate, pitch, settings.map_step_m)
     reasons = _accuracy_reasons(ground_error, fit, settings)
     decisions = list(found.assumptions)
-    if abs(scale - 1.0) > _MIN_SCALE_CHANGE:
+    if abs(scale - 1.0) > 0.01:
         decisions.append(
             f"the errors of clicks and drawn pixels are {scale:.2g} times the stated noise; the "
             "calibration uses this noise"
@@ -182,10 +170,10 @@ def build_report(
             reasons.append(f"no painted lines to confirm it: {lines.reason}")
     deviations = _lens_deviations(problem.lens, estimate.camera, problem.half_diagonal)
     if deviations:
-        worst = max(deviations, key=lambda name: deviations[name])
-        said = f"the given lens: the {worst} is {deviations[worst]:.1f} standard deviations off it"
+        most = max(deviations, key=lambda name: deviations[name])
+        said = f"the given lens: the {most} is {deviations[most]:.1f} standard deviations off it"
         decisions.append(said)
-        if deviations[worst] > _LENS_CONTRADICTED:
+        if deviations[most] > 4.0:
             reasons.append(
                 f"the clicks contradict {said}. Check that it is this camera's lens at this zoom "
                 "and image size, or state larger deviations"
@@ -195,6 +183,8 @@ def build_report(
         for index in np.flatnonzero(~fit.markings)
     ]
     clicked = (*evidence.points, *evidence.markings)
+    inner = fit.covariance[np.ix_(problem.free, problem.free)]
+    spread = np.sqrt(np.diag(inner))
     return CalibrationReport(
         stage="lines" if lines is not None and lines.refined else "points",
         free=tuple(name for name, free in zip(PARAMETERS, problem.free, strict=True) if free),
@@ -208,7 +198,7 @@ def build_report(
         noise_scale=scale,
         click_noise=fit.click_noise,
         click_freedom=fit.click_freedom,
-        condition=_condition(fit.covariance, problem.free),
+        condition=float(np.linalg.cond(inner / np.outer(spread, spread))),
         ground_error=ground_error,
         weak=bool(reasons),
         reasons=tuple(reasons),
@@ -218,7 +208,7 @@ def build_report(
 
 
 def _point_residuals(
-    camera: Camera, found: Explanation, residuals: NDArray[np.float64]
+    camera: Camera, found: Explanation, residuals: Floats
 ) -> tuple[PointResidual, ...]:
     """Return the residuals (n, 2) [px] of all clicks, by falling Mahalanobis distance."""
     evidence, fit = found.problem.evidence, found.fit
@@ -253,14 +243,14 @@ def _accuracy_reasons(
             f"expected ground error {ground_error.p95:.2f} m on the worst twentieth of the seen "
             f"pitch, over {settings.weak_p95_m:g} m"
         )
-    if fit.misfit > _MAX_MISFIT * fit.noise_scale**2:
+    if fit.misfit > 4.0 * fit.noise_scale**2:
         reasons.append(
             f"residuals {np.sqrt(fit.misfit):.1f} times the stated noise: a name may be wrong"
         )
     return reasons
 
 
-def image_problems(camera: Camera, places: NDArray[np.float64]) -> tuple[str, ...]:
+def image_problems(camera: Camera, places: Floats) -> tuple[str, ...]:
     """Return why a camera cannot image places (n, 3) [m], world; empty strings if it can."""
     status = camera.project_with_jacobians(places).status
     return tuple(_CANNOT_IMAGE.get(RayStatus(code), "") for code in status.tolist())
@@ -289,11 +279,6 @@ def _lens_deviations(
     }
 
 
-def _marking_residual(name: str, off: NDArray[np.float64], inlier: bool) -> MarkingResidual:
-    rms, worst = float(np.sqrt(np.mean(off**2))), float(np.abs(off).max())
-    return MarkingResidual(name, len(off), rms, worst, inlier)
-
-
 def _true_name(
     index: int,
     estimate: CameraEstimate,
@@ -318,12 +303,6 @@ def _true_name(
     if worst[nearest] > settings.wrong_marking * settings.drawn_noise_px:
         return f"{drawn} on no marking"
     return f"{drawn} on {nearest}, {worst[nearest]:.1f} px off at most"
-
-
-def _condition(covariance: NDArray[np.float64], free: NDArray[np.bool_]) -> float:
-    inner = covariance[np.ix_(free, free)]
-    spread = np.sqrt(np.diag(inner))
-    return float(np.linalg.cond(inner / np.outer(spread, spread)))
 
 
 def calibration_arrays(calibration: StaticCalibration) -> dict[str, NDArray[Any]]:

@@ -23,19 +23,8 @@ MIN_EVIDENCE: Final = 7.0
 """Minimum log probability ratio that decides a side [1]: a thousand to one."""
 INDEPENDENT_S: Final = 1.0
 """Time after which people stand elsewhere [s]: frames closer together count together as one."""
-_SHARES: Final = np.array([0.3, 0.6, 0.9])
-"""Shares of one camera's people that the other may have found [1]; the likeliest counts."""
-_CALIBRATION_STD: Final = 0.5
-"""Standard deviation of places by the error of a proposed camera and its clock, each axis [m]."""
-_MAX_OUTSIDE: Final = 0.5
-"""Largest distance of people outside of the lines [m]: benches behind both touch lines are as
-alike as the lines."""
 _CELL_M: Final = 2.0
 """Cells in which the shared view is measured [m]."""
-_IMAGE_MARGIN: Final = 0.01
-"""Border of the image in which people may be cut off, in image widths [1]."""
-_MIN_AREA: Final = 50.0
-"""Minimum shared area for a comparison [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +62,6 @@ class SideDecision:
     def require_side(self, where: str) -> bool:
         """Return whether the camera has to be turned.
 
-        Args:
-            where: file or camera, for messages.
-
         Raises:
             InputError: the people do not tell the side, or they contradict the stated one.
         """
@@ -99,14 +85,6 @@ class SideDecision:
         return self.turned
 
 
-class _Points(NamedTuple):
-    """People of one camera on the pitch and in view of another: places and covariances."""
-
-    xy: Floats
-    noise: Floats
-    frame: Integers
-
-
 def turn_camera(camera: Camera) -> Camera:
     """Return a camera after half a turn about the vertical axis through the centre spot."""
     pose = camera.cam_from_world
@@ -114,12 +92,10 @@ def turn_camera(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=Rigid(pose.rotation * half, pose.translation))
 
 
-_HALF_TURN: Final = {"left": "right", "right": "left", "near": "far", "far": "near"}
-
-
 def turn_name(name: str) -> str:
     """Return the name of the marking that lies half a turn about the centre spot away."""
-    return "_".join(_HALF_TURN.get(word, word) for word in name.split("_"))
+    other = {"left": "right", "right": "left", "near": "far", "far": "near"}
+    return "_".join(other.get(word, word) for word in name.split("_"))
 
 
 def decide_sides(
@@ -131,13 +107,7 @@ def decide_sides(
     """Return for every camera whether it has to be turned by half a turn.
 
     Groups of cameras with known relative sides are joined, the surest two first. Those joined to a
-    camera whose side is stated are decided.
-
-    Args:
-        seen: people of each camera, at the same times.
-        stated: cameras whose side is known; they are not turned.
-        pitch: the template.
-        seconds: (frames,) time of each frame [s].
+    camera whose side is stated are decided. All have people at the same times (frames,) [s].
     """
     names = tuple(seen)
     views = [_View(seen[name], _seen_cells(seen[name].camera, pitch)) for name in names]
@@ -183,10 +153,6 @@ def _find_contradicted(evidence: Floats, anchored: list[int]) -> set[int]:
 def _join(evidence: Floats, groups: list[list[int]]) -> tuple[list[list[int]], Floats, Floats]:
     """Join groups of cameras whose relative side the evidence decides, the surest two first.
 
-    Args:
-        evidence: (n, n) log probability ratio of pairs that stand as assumed to turned ones.
-        groups: indices of cameras with known relative sides.
-
     Returns:
         The groups; the sign (n,) of every camera, -1 if it is turned against the first camera of
         its group; the evidence (n,) of the least sure join that decides the camera.
@@ -221,13 +187,7 @@ def compare_sides(
 
     Each is the log probability ratio to people who have nothing to do with each other, under the
     likeliest share of people that both cameras detect; it is 0 or more, since people that only one
-    camera found decide nothing.
-
-    Args:
-        first: people of the first camera.
-        second: people of the second camera, at the same times.
-        pitch: the template.
-        seconds: (frames,) time of each frame [s].
+    camera found decide nothing. Both cameras have the same times (frames,) [s].
     """
     views = (_View(each, _seen_cells(each.camera, pitch)) for each in (first, second))
     return _compare(next(views), next(views), pitch, seconds)
@@ -279,44 +239,45 @@ def _seen_cells(camera: Camera | None, pitch: PitchTemplate) -> Flags:
 
 
 def _agreement(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate, area: float) -> float:
-    """Return the log probability ratio of one camera's people, given those of the other.
-
-    Args:
-        own: people of the one camera.
-        other: people of the other camera.
-        pitch: the template.
-        area: what both cameras see of the pitch [m^2].
-    """
-    if area < _MIN_AREA:
+    """Return the log probability ratio of one camera's people, given those of the other."""
+    # Shares of people that the other camera found; the likeliest counts.
+    shares = np.array([0.3, 0.6, 0.9])
+    if area < 50.0:
         return 0.0
     density: list[Floats] = []
-    points, partners = (_people_in_both(a, b, pitch) for a, b in ((own, other), (other, own)))
-    for frame in np.unique(points.frame):
-        here, there = points.frame == frame, partners.frame == frame
+    (xy, noise, frames), (other_xy, other_noise, other_frames) = (
+        _people_in_both(a, b, pitch) for a, b in ((own, other), (other, own))
+    )
+    for frame in np.unique(frames):
+        here, there = frames == frame, other_frames == frame
         if not there.any():
             density.append(np.zeros(np.count_nonzero(here)))
             continue
-        away = points.xy[here][:, None] - partners.xy[there]
-        spread = points.noise[here][:, None] + partners.noise[there]
-        spread = spread + _CALIBRATION_STD**2 * np.eye(2)
+        away = xy[here][:, None] - other_xy[there]
+        spread = noise[here][:, None] + other_noise[there]
+        # The error [m] of a proposed camera and its clock.
+        spread = spread + 0.5**2 * np.eye(2)
         squared = (away * np.linalg.solve(spread, away[..., None])[..., 0]).sum(axis=-1)
         peak = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(spread)))
         density.append((peak * np.exp(-0.5 * squared)).mean(axis=1))
     if not density:
         return 0.0
     ratio = area * np.concatenate(density)
-    scores = np.log1p(_SHARES[:, None] * (ratio - 1.0)).sum(axis=1)
+    scores = np.log1p(shares[:, None] * (ratio - 1.0)).sum(axis=1)
     return float(max(0.0, scores.max()))
 
 
-def _people_in_both(own: SeenPeople, other: SeenPeople, pitch: PitchTemplate) -> _Points:
-    """Return one camera's people on the pitch that the other should detect."""
-    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + _MAX_OUTSIDE
+def _people_in_both(
+    own: SeenPeople, other: SeenPeople, pitch: PitchTemplate
+) -> tuple[Floats, Floats, Integers]:
+    """Return places, covariances and frames of people on the pitch that the other should detect."""
+    # Benches behind both touch lines are as alike as the lines.
+    limits = np.array([0.5 * pitch.length, 0.5 * pitch.width]) + 0.5
     known = np.isfinite(own.xy[..., 0])
     frame, _ = np.nonzero(known)
     xy = own.xy[known]
     kept = (np.abs(xy) <= limits).all(axis=1) & _sees(other.camera, xy, pitch)
-    return _Points(xy[kept], own.noise[known][kept], frame[kept])
+    return xy[kept], own.noise[known][kept], frame[kept]
 
 
 def _sees(camera: Camera | None, xy: Floats, pitch: PitchTemplate) -> Flags:
@@ -325,7 +286,8 @@ def _sees(camera: Camera | None, xy: Floats, pitch: PitchTemplate) -> Flags:
         return np.ones(len(xy), np.bool_)
     ground = np.concatenate([xy, pitch.height(xy[:, 0], xy[:, 1])[:, None]], axis=1)
     pixels = camera.project(ground)
-    margin = _IMAGE_MARGIN * float(camera.image_size[0])
+    # People may be cut off at the border.
+    margin = 0.01 * float(camera.image_size[0])
     with np.errstate(invalid="ignore"):
         inside = (pixels >= margin) & (pixels <= camera.image_size - 1.0 - margin)
     return np.asarray(inside.all(axis=1))

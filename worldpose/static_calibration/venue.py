@@ -67,12 +67,7 @@ class VenueEvidence:
 
 
 def gather_venue_evidence(evidence: ClicksAndBars, best: CameraOnPitch) -> VenueEvidence:
-    """Return what a camera refined on painted lines tells about the venue.
-
-    Args:
-        evidence: clicks, bars and priors.
-        best: the camera and the surface that fit them best.
-    """
+    """Return what a camera refined on painted lines tells about the venue."""
     bars, free = evidence.bars, np.flatnonzero(evidence.problem.free)
     there = evidence.problem.evidence.on_surface(best.surface)
     problem = replace(evidence.problem, evidence=there)
@@ -180,18 +175,9 @@ def join_cameras(calibrations: Sequence[Mapping[Any, ArrayLike]]) -> Venue:
         cameras[index] = step_camera(cameras[index], one.response @ (pooled[at] - one.mean))
         change = spread[np.ix_(at, at)] - one.covariance
         covariance[index] += one.response @ change @ one.response.T
-    shape, certain = pooled[_surface(numbers)], spread[_block(numbers)]
+    at = np.array([int(np.flatnonzero(numbers == each)[0]) for each in SURFACE])
+    shape, certain = pooled[at], spread[np.ix_(at, at)]
     return Venue(Camera.stack(cameras), covariance, Surface(shape, certain))
-
-
-def _surface(numbers: Integers) -> Integers:
-    """Return the positions of crown and end fall among numbers."""
-    return np.array([int(np.flatnonzero(numbers == each)[0]) for each in SURFACE])
-
-
-def _block(numbers: Integers) -> tuple[NDArray[Any], ...]:
-    at = _surface(numbers)
-    return np.ix_(at, at)
 
 
 def _solve(matrix: Floats, right: Floats) -> Floats:

@@ -6,129 +6,19 @@ Videos are written from images, or cut from another video without re-encoding.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import dropwhile, islice, pairwise
 from pathlib import Path
-from typing import Final, Self
 
 import av
 import numpy as np
 from av.container import InputContainer
-from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from data_contracts.arrays import Image
 from worldpose.errors import InputError
-
-MOST_FRAMES: Final = 10_000_000
-"""Most frames of a video's clock, two days at 60 frames/s: one wrong stamp would fill memory."""
-RATE_SLACK: Final = 0.1
-"""Share of missing or duplicate frames from which a video's rate differs from its clock's."""
-SAMPLED_FRAMES: Final = 64
-"""First frames that tell whether packets say when they are shown; no codec delays more than 16."""
-TRIED_KEYS: Final = 3
-"""Key frames from which decoding is tried until one is whole; damaged ones never are."""
-FIRST_LEAD_S: Final = 0.5
-"""Time by which seeking begins earlier where it ended too late [s]: usual codecs delay less."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameIndex:
-    """The frames of a video, in display order.
-
-    A frame's number counts frames in display order, whatever rate the file states: containers round
-    times, begin later than zero, and store frames in decoding order.
-
-    Attributes:
-        stamps: (pictures,) presentation time stamps, rising, in units of `time_base`.
-        key: (pictures,) whether decoding can begin there.
-        time_base: seconds per unit; None where stamps are frame numbers, as in a folder of images.
-        size: width, height of the frames as displayed, after rotation [px].
-        is_counted: whether a frame is known only by counting all frames before it: the file does
-            not say when each one is shown, as AVI with B-frames of H.264.
-    """
-
-    stamps: NDArray[np.int64]
-    key: NDArray[np.bool_]
-    time_base: Fraction | None
-    size: tuple[int, int]
-    is_counted: bool = False
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Return the display times of frames since the first (pictures,) [s]; NaN if unknown."""
-        unit = np.nan if self.time_base is None else float(self.time_base)
-        return np.asarray((self.stamps - self.stamps[0]) * unit)
-
-    @property
-    def fps(self) -> float:
-        """Return frames per second, from the median step between frames; NaN if unknown."""
-        if len(self) < 2 or self.time_base is None:
-            return float("nan")
-        # The median of the single steps is rounded to the time base; the whole length is not.
-        step = np.diff(self.stamps)
-        away = np.abs(step - np.median(step))
-        usual = away <= max(1.0, float(away.min()))
-        return float(1.0 / (step[usual].mean() * float(self.time_base)))
-
-    def on_clock(self, fps: float, where: str) -> NDArray[np.int64]:
-        """Return the number of the video frame for each clock frame (frames,); -1 if missing.
-
-        Frame n is shown n / fps after the first one. A frame that a recorder dropped leaves its
-        clock frame empty and shifts no later one; of two video frames for one clock frame the
-        nearer counts.
-
-        Args:
-            fps: frames per second of the clock.
-            where: the video, for messages.
-
-        Raises:
-            InputError: the video has another rate or none, or implausibly many frames.
-        """
-        if self.time_base is None:
-            exact = (self.stamps - self.stamps[0]).astype(np.float64)
-        else:
-            exact = self.times * fps
-        if exact[-1] >= MOST_FRAMES:
-            raise InputError(
-                where,
-                expected=f"pictures within {MOST_FRAMES} frames, as numbers and time stamps say",
-                found=f"the last one {exact[-1]:.0f} frames after the first",
-                todo="Correct the numbers of the images, or write the video again.",
-            )
-        slot = np.rint(exact).astype(np.int64)
-        late = np.abs(exact - slot)
-        # By clock frame, then by falling distance, so that the nearest one stays.
-        order = np.lexsort((-late, slot))
-        picture = np.full(slot[-1] + 1, -1, dtype=np.int64)
-        picture[slot[order]] = order
-        filled = int(np.count_nonzero(picture >= 0))
-        odd = (len(picture) - filled) + (len(slot) - filled)
-        if self.time_base is not None and odd > RATE_SLACK * max(len(picture), len(slot)):
-            raise self._rate_error(fps, where)
-        return picture
-
-    def _rate_error(self, fps: float, where: str) -> InputError:
-        """Return the error of a video that does not follow a clock."""
-        step = np.diff(self.times)
-        if abs(self.fps - fps) > RATE_SLACK * fps:
-            return InputError(
-                where,
-                expected=f"{fps:g} frames per second, the rate in match.yaml",
-                found=f"{self.fps:.4g}",
-                todo="Correct fps in match.yaml, or convert the video to that rate.",
-            )
-        return InputError(
-            where,
-            expected=f"{fps:g} frames per second throughout",
-            found=f"a rate that varies: images are {step.min():.4g} to {step.max():.4g} s apart, "
-            f"most of all after {self.times[step.argmax()]:.2f} s",
-            todo="Convert the video to a constant frame rate with any video tool.",
-        )
+from worldpose.video.pictures import FrameIndex, Pictures, convert_pixels
 
 
 def index_frames(path: Path) -> FrameIndex:
@@ -161,7 +51,8 @@ def index_frames(path: Path) -> FrameIndex:
         is_told = len(set(given)) == len(packets)
         # The order of decoding, although the codec may decode a frame before one shown earlier?
         if is_told and reorders and given == sorted(given):
-            is_told = _rise(_shown_stamps(path, SAMPLED_FRAMES))
+            # No codec delays more than 16 frames.
+            is_told = _rise(_shown_stamps(path, 64))
         if not is_told:
             return _count_frames(path, given, len(packets), base, size)
     except (av.error.FFmpegError, OSError) as error:
@@ -175,18 +66,7 @@ def index_frames(path: Path) -> FrameIndex:
 def _count_frames(
     path: Path, given: Sequence[int], count: int, base: Fraction, size: tuple[int, int]
 ) -> FrameIndex:
-    """Return the index of a video whose packets do not say when each frame is shown.
-
-    Args:
-        path: the video.
-        given: the time stamps that its packets have.
-        count: number of its packets.
-        base: unit of the time stamps [s].
-        size: width, height of its frames as shown [px].
-
-    Raises:
-        InputError: a frame cannot be decoded, or the frames with a time are not evenly spaced.
-    """
+    """Return the index of a video whose packets do not say when each frame is shown."""
     shown = _shown_stamps(path)
     if len(shown) != count:
         raise _no_video(path, f"{count} pictures without their order, {len(shown)} can be decoded")
@@ -260,7 +140,7 @@ def _no_video(path: Path, found: str) -> InputError:
     )
 
 
-class VideoReader:
+class VideoReader(Pictures):
     """A video file with access to frames by number, forwards without seeking."""
 
     def __init__(self, path: Path, index: FrameIndex | None = None) -> None:
@@ -279,15 +159,6 @@ class VideoReader:
         self._lead = 0
         self._open()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self.close()
-
-    def __len__(self) -> int:
-        return len(self.index)
-
     def _open(self) -> None:
         self._container = av.open(str(self.path))
         self._stream = self._container.streams.video[0]
@@ -297,34 +168,6 @@ class VideoReader:
         """Close the file."""
         self._container.close()
 
-    def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one frame (height, width, 3) RGB.
-
-        Raises:
-            InputError: there is no such frame, or it cannot be decoded.
-        """
-        for _, picture in self.frames(number, number + 1):
-            return picture
-        raise self._damage_error(number)
-
-    def frames(
-        self, start: int = 0, stop: int | None = None, *, grey: bool = False
-    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield frame numbers from `start` up to before `stop`, each with its image.
-
-        Args:
-            start: first frame.
-            stop: one past the last; the end of the video if None.
-            grey: luma (height, width) as stored, in half the time, instead of RGB.
-
-        Raises:
-            InputError: there are no such frames, or one cannot be decoded.
-        """
-        for number, picture in self.readable(start, stop, grey=grey):
-            if picture is None:
-                raise self._damage_error(number)
-            yield number, picture
-
     def readable(
         self,
         start: int = 0,
@@ -333,7 +176,7 @@ class VideoReader:
         grey: bool = False,
         width: int | None = None,
         only: Collection[int] | None = None,
-    ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    ) -> Iterator[tuple[int, Image | None]]:
         """Yield frames as `frames` does, with None for each damaged or undecodable one.
 
         Frames after a damaged one up to the next key frame are None too: they may be predicted from
@@ -359,7 +202,7 @@ class VideoReader:
             )
         for number, picture in self._sound_pictures(start, stop) if start < stop else ():
             if number >= start and (only is None or number in only):
-                yield number, None if picture is None else _pixels(picture, grey, width)
+                yield number, None if picture is None else convert_pixels(picture, grey, width)
 
     def _sound_pictures(self, start: int, stop: int) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """Yield every frame from the last key frame up to `start` on; None if damaged."""
@@ -401,7 +244,8 @@ class VideoReader:
         Where the picture is refreshed stripe by stripe, a key frame itself is whole only if
         decoding began before it.
         """
-        keys = self._keys(start)[-TRIED_KEYS:]
+        # Damaged key frames are never whole.
+        keys = self._keys(start)[-3:]
         first = None
         for begin in keys[::-1].tolist():
             shown = self._number_shown(begin)
@@ -442,7 +286,7 @@ class VideoReader:
                 if not is_key:
                     before.append(packet)
             assert self.index.time_base is not None  # of a video file
-            lead = 2 * lead or max(1, round(FIRST_LEAD_S / self.index.time_base))
+            lead = 2 * lead or max(1, round(0.5 / self.index.time_base))
         self.close()
         self._open()
         packets = _packets(self._container, self._stream)
@@ -450,40 +294,14 @@ class VideoReader:
             packets = dropwhile(lambda packet: packet.pts != stamp, packets)
         yield from packets
 
-    def _damage_error(self, number: int) -> InputError:
+    def damage_error(self, number: int) -> InputError:
+        """Return the error of a frame that cannot be decoded."""
         return InputError(
             f"{self.path}: frame {number}",
             expected="a picture",
             found="one that cannot be decoded",
             todo="Convert the video with any video tool.",
         )
-
-
-def _pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
-    """Return the frame as displayed: RGB, or luma alone."""
-    pixels = _stored_pixels(picture, grey, width)
-    quarters = round(picture.rotation / 90.0) % 4  # counterclockwise, as in np.rot90
-    return pixels if quarters == 0 else np.ascontiguousarray(np.rot90(pixels, quarters))
-
-
-def _stored_pixels(picture: av.VideoFrame, grey: bool, width: int | None) -> NDArray[np.uint8]:
-    """Return RGB, or luma of 8 bits as stored, without the padding of its rows."""
-    if not grey and width is None:
-        return np.asarray(picture.to_ndarray(format="rgb24"))
-    if not grey and width is not None:
-        height = round(picture.height * width / picture.width)
-        small = picture.reformat(width, height, "rgb24", interpolation="AREA")
-        return np.asarray(small.to_ndarray())
-    form = picture.format
-    if not form.name.startswith(("yuv4", "yuvj4", "gray")) or form.components[0].bits != 8:
-        # One range for both: luma stays as stored, as in the plane below.
-        small = picture.reformat(
-            format="gray", src_color_range=ColorRange.JPEG, dst_color_range=ColorRange.JPEG
-        )
-        return np.asarray(small.to_ndarray())
-    plane = picture.planes[0]
-    rows = np.frombuffer(bytes(plane), dtype=np.uint8).reshape(picture.height, plane.line_size)
-    return np.ascontiguousarray(rows[:, : picture.width])
 
 
 def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
@@ -532,9 +350,7 @@ def cut_video(path: Path, start: int, stop: int, out: Path) -> int:
     return start - begin
 
 
-def write_video(
-    path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 20
-) -> int:
+def write_video(path: Path, pictures: Iterable[Image], fps: float, *, quality: int = 20) -> int:
     """Write images to a file and return their number; the same images give the same bytes.
 
     H.264 with a key frame per second if the installed FFmpeg can write it, else MPEG-4 part 2.

@@ -10,14 +10,15 @@ import re
 import struct
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Image
+from data_contracts.arrays import Flags, Image
 from worldpose.errors import InputError
-from worldpose.video.files import FrameIndex, VideoReader, index_frames
+from worldpose.video.files import VideoReader, index_frames
+from worldpose.video.pictures import FrameIndex, Pictures
 
 HEADER_BYTES: Final = 1 << 20
 """First bytes of a file that must hold its image's size [byte]; camera metadata may precede it."""
@@ -25,7 +26,7 @@ MAX_PIXELS: Final = 200_000_000
 """No camera takes larger images; a few hundred bytes can declare gigabytes."""
 
 
-def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[np.uint8] | None:
+def decode_image(content: Image, *, grey: bool = False) -> Image | None:
     """Return an image (height, width, 3) RGB, or (height, width) grey.
 
     Args:
@@ -47,7 +48,7 @@ def decode_image(content: NDArray[np.uint8], *, grey: bool = False) -> NDArray[n
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
 
 
-def declared_size(content: NDArray[np.uint8]) -> tuple[int, int] | None:
+def declared_size(content: Image) -> tuple[int, int] | None:
     """Return width and height [px] in the header of a PNG or JPEG file; None for other files."""
     header = content[:HEADER_BYTES].tobytes()
     if header[:8] == b"\x89PNG\r\n\x1a\n" and header[12:16] == b"IHDR" and len(header) >= 24:
@@ -67,11 +68,9 @@ def declared_size(content: NDArray[np.uint8]) -> tuple[int, int] | None:
 
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
-_DIGITS: Final = 18
-"""Most digits of an image's number: 64 bits hold no longer one."""
 
 
-class ImageFolder:
+class ImageFolder(Pictures):
     """Images whose names end in their number; the lowest is frame 0, a gap a missing frame."""
 
     def __init__(self, folder: Path, index: FrameIndex | None = None) -> None:
@@ -88,49 +87,6 @@ class ImageFolder:
         self._files = [file for _, file in numbered_images(folder)]
         self.index = index_images(folder) if index is None else index
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self.close()
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
-
-    def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one image (height, width, 3) RGB.
-
-        Raises:
-            InputError: the file is no image.
-        """
-        return next(self.frames(number, number + 1))[1]
-
-    def frames(
-        self, start: int = 0, stop: int | None = None, *, grey: bool = False
-    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield image numbers from `start` up to before `stop`, each with its image.
-
-        Args:
-            start: first image, in the order of the numbers.
-            stop: one past the last; all if None.
-            grey: (height, width) instead of RGB.
-
-        Raises:
-            InputError: a file is no image.
-        """
-        for number, picture in self.readable(start, stop, grey=grey):
-            if picture is None:
-                raise InputError(
-                    str(self._files[number]),
-                    expected="a PNG or JPEG picture",
-                    found="none",
-                    todo="Write it again.",
-                )
-            yield number, picture
-
     def readable(
         self,
         start: int = 0,
@@ -138,18 +94,20 @@ class ImageFolder:
         *,
         grey: bool = False,
         only: Collection[int] | None = None,
-    ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-        """Yield image numbers from `start` up to before `stop` and images; None if unreadable.
-
-        Args:
-            start: first image, in the order of the numbers.
-            stop: one past the last; all if None.
-            grey: (height, width) instead of RGB.
-            only: images to read and yield; None = all.
-        """
+    ) -> Iterator[tuple[int, Image | None]]:
+        """Yield images as `frames` does, with None for each unreadable one; see `VideoReader`."""
         for number in range(start, len(self) if stop is None else stop):
             if only is None or number in only:
                 yield number, _read(self._files[number], grey=grey)
+
+    def damage_error(self, number: int) -> InputError:
+        """Return the error of a file that is no image."""
+        return InputError(
+            str(self._files[number]),
+            expected="a PNG or JPEG picture",
+            found="none",
+            todo="Write it again.",
+        )
 
 
 def numbered_images(folder: Path) -> list[tuple[int, Path]]:
@@ -158,17 +116,18 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     Raises:
         InputError: no images, or names without a number or with the same one.
     """
+    digits = 18  # 64 bits hold no longer number
     files = sorted(
         file
         for file in folder.iterdir()
         if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
     )
     ends = [re.search(r"\d+$", file.stem) for file in files]
-    too_long = next((end.group() for end in ends if end and len(end.group()) > _DIGITS), None)
+    too_long = next((end.group() for end in ends if end and len(end.group()) > digits), None)
     if too_long is not None:
         raise InputError(
             str(folder),
-            expected=f"images whose names end in numbers of at most {_DIGITS} digits",
+            expected=f"images whose names end in numbers of at most {digits} digits",
             found=too_long,
             todo="Name them in order, for example 000123.jpg.",
         )
@@ -216,18 +175,14 @@ def open_video(
     return ImageFolder(path, index) if path.is_dir() else VideoReader(path, index)
 
 
-def _read(file: Path, *, grey: bool) -> NDArray[np.uint8] | None:
+def _read(file: Path, *, grey: bool) -> Image | None:
     """Return an image as displayed, RGB or grey; None if the file is no image."""
     return decode_image(np.fromfile(file, dtype=np.uint8), grey=grey)
 
 
-MIN_SKIPPED_FRAMES: Final = 8
-"""Frames that a jump to a key frame must save: a restart costs about as many."""
-
-
 def some_pictures(
     video: VideoReader | ImageFolder, numbers: NDArray[np.integer]
-) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+) -> Iterator[tuple[int, Image | None]]:
     """Yield selected frames in order; None where one cannot be decoded.
 
     Args:
@@ -239,7 +194,7 @@ def some_pictures(
         yield from video.readable(int(group[0]), int(group[-1]) + 1, only=only)
 
 
-def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
+def jumps(numbers: NDArray[np.integer], key: Flags) -> list[NDArray[np.integer]]:
     """Return groups of frames, each decoded in one pass.
 
     Args:
@@ -251,15 +206,12 @@ def jumps(numbers: NDArray[np.integer], key: NDArray[np.bool_]) -> list[NDArray[
     keys = np.flatnonzero(key)
     begin = keys[np.maximum(np.searchsorted(keys, numbers, side="right") - 1, 0)]
     saved = begin[1:] - numbers[:-1] - 1
-    return np.split(numbers, np.flatnonzero(saved >= MIN_SKIPPED_FRAMES) + 1)
-
-
-_BAND: Final = 64
-"""Rows per median computation, which then stay in the processor's cache."""
+    # A restart costs about as many frames.
+    return np.split(numbers, np.flatnonzero(saved >= 8) + 1)
 
 
 def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
-    """Return the median of a clip's frames, which shows no moving people.
+    """Return the median of a clip's frames, which shows no moving people (C4).
 
     At most `most` frames are in memory, evenly spread over the clip: when the limit is reached, the
     function drops every second frame and doubles the stride.
@@ -270,10 +222,8 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
 
     Raises:
         InputError: there are no frames, their sizes differ, or `most` is below two.
-
-    Note:
-        C4.
     """
+    band = 64  # rows, which stay in the processor's cache
     if most < 2:
         raise InputError(
             "median_picture: most",
@@ -296,8 +246,8 @@ def median_picture(frames: Iterable[Image], most: int = 64) -> Image:
     if not kept:
         raise _sizes("no frames")
     median = np.empty_like(kept[0])
-    for top in range(0, len(median), _BAND):
-        median[top : top + _BAND] = _median_level([frame[top : top + _BAND] for frame in kept])
+    for top in range(0, len(median), band):
+        median[top : top + band] = _median_level([frame[top : top + band] for frame in kept])
     return median
 
 

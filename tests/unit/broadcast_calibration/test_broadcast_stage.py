@@ -31,7 +31,6 @@ FIRST, COUNT, OFFSET = 7, 10, 4.4
 and people are 0.4 frames earlier than those of the same number."""
 VIDEO = 16
 FPS = 25.0
-SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
 
 
 def joints(frames):
@@ -39,7 +38,7 @@ def joints(frames):
     x, y = np.meshgrid([-8.0, -2.0, 4.0, 10.0], [-9.0, 0.0, 9.0])
     way = np.random.default_rng(1).uniform(-6.0, 6.0, (12, 2))
     places = np.stack([x.ravel(), y.ravel()], axis=-1) + frames[:, None, None] / FPS * way
-    return np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1)[:, :, None] + SHAPE
+    return np.concatenate([places, np.zeros((*places.shape[:2], 1))], -1)[:, :, None] + clip.SHAPE
 
 
 def observed(frame, keypoints):
@@ -115,14 +114,7 @@ def folder(tmp_path_factory):
 
 
 def clicks(true, frame):
-    """Return the drawn centre circle, halfway line and far touch line of one frame."""
-    drawn = []
-    for name in ("center_circle", "halfway_line", "touch_line_far"):
-        pixels = true.camera[frame].project(clip.PITCH.marking_points(name, 0.5))
-        inside = pixels[((pixels > 3.0) & (pixels < true.image_size - 4.0)).all(axis=-1)]
-        some = inside[np.linspace(0, len(inside) - 1, 9).astype(int)]
-        drawn.append({"name": name, "xy": [(float(x), float(y)) for x, y in some]})
-    return ClickedMarkings.model_validate({"points": [], "drawn": drawn})
+    return ClickedMarkings.model_validate({"points": [], "drawn": clip.draw(true, frame)})
 
 
 def prepared(store, work, first, places):

@@ -98,12 +98,3 @@ def test_errors_that_last_count_as_one_sample():
     spread = spread_noise(points, 4.0)
     np.testing.assert_allclose(spread.whitening, 0.5 * points.whitening)
     np.testing.assert_allclose(spread.loss, 0.5 * points.loss)
-
-
-def test_the_spread_of_the_paint_follows_the_offsets_that_the_clip_determines():
-    errors = PitchErrors.of(pitch(), SETTINGS)
-    points, determined = np.arange(20), np.zeros((20, 3))
-    wide = errors.learn_paint(np.full((20, 3), 2.0), determined, points)
-    assert wide.paint_m == pytest.approx(0.06, rel=0.1)
-    unknown = errors.learn_paint(np.zeros((20, 3)), np.ones((20, 3)), points)
-    assert unknown.paint_m == pytest.approx(0.03)

@@ -98,14 +98,6 @@ def test_only_live_pans_of_the_main_camera_are_proposed(found):
     assert "shorter than 4 s" in said["short"]
 
 
-def test_a_pan_is_measured_in_widths_of_the_picture(found):
-    # 40 m at 77.6 m, and half of it to either side: 27 degrees of 0.533 rad wide images.
-    turned = np.arctan((25.0 + 15.0) / 2.0 / np.hypot(76.0, 16.0)) * 2.0 / (320.0 / 600.0)
-    # Aimed at 25 m to the left and 15 m to the right, which is not the same angle to both sides,
-    # and followed at a twentieth of the image's size.
-    assert abs(found[0].pan - turned) < 0.15 * turned
-
-
 def test_a_person_close_by_is_tall():
     lawn = np.full((180, 320, 3), (70, 130, 50), np.uint8)
     assert grass_and_people(lawn) == (1.0, 0.0)

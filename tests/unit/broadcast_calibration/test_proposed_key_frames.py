@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from data_contracts.keypoints import KeypointDetections
+from worldpose.broadcast_calibration import key_frames
 from worldpose.broadcast_calibration.key_frames import KnownPeople, propose_key_frames
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scene import look_at
+from worldpose.static_calibration.from_paint.proposal import propose_camera
 
 PITCH = PitchTemplate.standard()
 GRASS = np.full((720, 1280, 3), (60, 120, 50), np.uint8)
@@ -30,12 +32,12 @@ def frame(x, center=(2.0, -70.0, 18.0)):
     return camera, render_pitch(camera, PITCH, None, 5)
 
 
-def test_frames_with_one_center_become_key_frames():
-    frames = {10: frame(-38.0), 40: frame(38.0)}
-    pictures = [(number, picture) for number, (_, picture) in frames.items()]
-    pictures.insert(1, (25, GRASS))
-    found = propose_key_frames(pictures, PITCH, side="near", where="clip")
-    assert [each.frame for each in found] == [10, 40]
+def pictures_of(frames):
+    return [(number, picture) for number, (_, picture) in frames.items()]
+
+
+def assert_drawn_on_the_lines(found, frames):
+    assert [each.frame for each in found] == list(frames)
     for key in found:
         camera = frames[key.frame][0]
         assert len(key.markings.drawn) >= 3
@@ -44,6 +46,32 @@ def test_frames_with_one_center_become_key_frames():
             line = line[np.isfinite(line).all(axis=1)]
             away = np.linalg.norm(np.array(marking.xy)[:, None] - line, axis=-1).min(axis=1)
             assert np.median(away) < 2.0, marking.name
+
+
+@pytest.fixture(scope="module")
+def proposals():
+    return {}
+
+
+@pytest.fixture(autouse=True)
+def _propose_once(monkeypatch, proposals):
+    """Proposes a camera for each rendered image and side in one test alone."""
+
+    def propose_once(picture, pitch, *, side, where):
+        key = (id(picture), side)  # rendered images stay in memory
+        if key not in proposals:
+            proposals[key] = propose_camera(picture, pitch, side=side, where=where)
+        return proposals[key]
+
+    monkeypatch.setattr(key_frames, "propose_camera", propose_once)
+
+
+def test_frames_with_one_center_become_key_frames():
+    frames = {10: frame(-38.0), 40: frame(38.0)}
+    pictures = pictures_of(frames)
+    pictures.insert(1, (25, GRASS))
+    found = propose_key_frames(pictures, PITCH, side="near", where="clip")
+    assert_drawn_on_the_lines(found, frames)
 
 
 def test_frames_of_two_centers_are_refused():
@@ -83,21 +111,10 @@ FAR = {number: frame(x, (2.0, 70.0, 18.0)) for number, x in ((10, -38.0), (40, 3
 PLACES = np.random.default_rng(3).uniform([-50.0, -30.0], [50.0, 20.0], (24, 2))
 
 
-def pictures_of(frames):
-    return [(number, picture) for number, (_, picture) in frames.items()]
-
-
 def test_people_of_known_places_tell_the_side_of_a_camera_that_has_none():
     people = people_of(FAR, PLACES)
     found = propose_key_frames(pictures_of(FAR), PITCH, side=None, where="clip", people=people)
-    assert [each.frame for each in found] == [10, 40]
-    for key in found:
-        camera = FAR[key.frame][0]
-        for marking in key.markings.drawn:
-            line = camera.project(PITCH.marking_points(marking.name, 0.05))
-            line = line[np.isfinite(line).all(axis=1)]
-            away = np.linalg.norm(np.array(marking.xy)[:, None] - line, axis=-1).min(axis=1)
-            assert np.median(away) < 2.0, marking.name
+    assert_drawn_on_the_lines(found, FAR)
 
 
 def test_people_who_are_elsewhere_do_not_tell_the_side():

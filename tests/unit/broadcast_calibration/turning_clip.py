@@ -5,8 +5,8 @@ import numpy as np
 from worldpose.broadcast_calibration.evidence import (
     MARKING,
     FlowEvidence,
-    ObservedPoints,
     PointEvidence,
+    whiten_across,
 )
 from worldpose.broadcast_calibration.moving_camera import MovingCamera
 from worldpose.pitch.template import PitchTemplate
@@ -15,6 +15,21 @@ from worldpose.simulation.scene import look_at
 PITCH = PitchTemplate.standard()
 SIZE = (960, 540)
 CENTER = np.array([0.5, -74.0, 16.0])
+SHAPE = np.stack([np.tile([-0.2, 0.2], 9)[:17], np.zeros(17), np.linspace(0.1, 1.8, 17)], axis=-1)
+"""Joints (17, 3) of a person at the origin [m]."""
+
+
+def draw(true, frame, noise=0.0, rng=None):
+    """The centre circle, halfway line and far touch line drawn in one frame."""
+    drawn = []
+    for name in ("center_circle", "halfway_line", "touch_line_far"):
+        pixels = true.camera[frame].project(PITCH.marking_points(name, 0.5))
+        inside = pixels[((pixels > 3.0) & (pixels < true.image_size - 4.0)).all(axis=-1)]
+        some = inside[np.linspace(0, len(inside) - 1, 9).astype(int)]
+        if rng is not None:
+            some = some + noise * rng.standard_normal(some.shape)
+        drawn.append({"name": name, "xy": some.tolist()})
+    return drawn
 
 
 def moving(frames=40, pan=(-3.0, 4.0), zoom=(1900.0, 2100.0), size=SIZE):
@@ -49,18 +64,16 @@ def ground_points(camera, rng, each=40, noise=0.3):
         image.append(seen[t, chosen])
     frame, which, image = (np.concatenate(part) for part in (frame, which, image))
     turn = rng.uniform(0.0, np.pi, len(frame))
-    return PointEvidence.across_lines(
-        ObservedPoints(
-            frame=frame,
-            world=places[which],
-            image=image + noise * rng.standard_normal(image.shape),
-            kind=MARKING,
-            source=np.zeros(len(frame), dtype=np.int64),
-        ),
-        np.stack([np.cos(turn), np.sin(turn)], axis=-1),
-        np.full(len(frame), noise),
-        1.0,
-        np.inf,
+    normals = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return PointEvidence.observe(
+        MARKING,
+        frame,
+        places[which],
+        image + noise * rng.standard_normal(image.shape),
+        whiten_across(normals, np.full(len(frame), noise)),
+        source=np.zeros(len(frame), dtype=np.int64),
+        weight=1.0,
+        loss=np.inf,
     )
 
 

@@ -179,3 +179,9 @@ def joint_error(lab, joints, aligned=False):
         left, _, right = np.linalg.svd(ours.T @ true)
         ours = ours @ (left * [1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     return float(np.linalg.norm(ours - true, axis=-1).mean())
+
+
+def errors(cameras, true):
+    """Return the mean reprojection error [px] of people's positions per camera."""
+    places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
+    return np.linalg.norm(cameras.project(places) - true.project(places), axis=-1).mean(axis=-1)

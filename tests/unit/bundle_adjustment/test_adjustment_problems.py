@@ -11,8 +11,6 @@ from worldpose.bundle_adjustment.problems import (
     camera_knowledge,
     estimate_noise,
     estimate_variance_factor,
-    known_covariance,
-    markings_problem,
     players_problem,
 )
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, GivenCameraPrior
@@ -48,15 +46,6 @@ def test_a_given_camera_moves_in_pose_and_focal_length_alone(clip):
     ]
     # The cameras stand 52 m from the middle: 0.2 m.
     assert 1.0 / np.sqrt(information[0, 3, 3]) == pytest.approx(0.2, rel=0.15)
-
-
-def test_a_source_may_be_believed_less_than_it_states(clip):
-    made, *_ = clip()
-    made = replace(made, on_lines=np.array([True, False, False, False, True]))
-    believed = known_covariance(made, SETTINGS)
-    settings = BundleAdjustmentSettings(clicks_uncertainty=2.0, lines_uncertainty=3.0)
-    ratio = known_covariance(made, settings)[:, 0, 0] / believed[:, 0, 0]
-    np.testing.assert_allclose(ratio, [9.0, 4.0, 4.0, 4.0, 9.0])
 
 
 def test_observations_are_those_of_joints_that_enough_cameras_agree_on(clip):
@@ -105,15 +94,6 @@ def test_scale_and_correlation_of_errors_are_found(clip, noise, lasting):
     # series tell that to 5 %.
     share = (20.0 * lasting**2 + noise**2) / (lasting**2 + noise**2)
     assert found.correlation == pytest.approx(share, rel=0.15)
-
-
-def test_markings_alone_free_everything_where_there_are_clicks(clip):
-    made, *_ = clip()
-    problem = markings_problem(made, np.array([False, True, False, False, False]), SETTINGS)
-    assert problem.free[0].all()
-    assert not problem.free[1].any()
-    assert np.isinf(problem.point_information).all()
-    assert len(problem.image) == 5 * 12
 
 
 @pytest.mark.parametrize("claimed", [1.0, 0.2])

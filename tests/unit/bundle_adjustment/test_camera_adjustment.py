@@ -4,29 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lab import errors
 
-from worldpose.bundle_adjustment import adjustment
 from worldpose.bundle_adjustment.adjustment import adjust_cameras
 from worldpose.bundle_adjustment.clip import Clicks
 from worldpose.bundle_adjustment.settings import BundleAdjustmentSettings, SolverSettings
-from worldpose.static_calibration.parameters import step_camera
-from worldpose.triangulation.passes import triangulate_joints
 
 QUICK = BundleAdjustmentSettings(max_frames=8, folds=2, solver=SolverSettings(min_cost_change=1e-6))
-
-
-def errors(cameras, true):
-    """Return the mean reprojection error [px] of people's positions per camera."""
-    places = np.array([[x, y, 1.0] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 0.0, 8.0)])
-    off = np.linalg.norm(cameras.project(places) - true.project(places), axis=-1)
-    return off.mean(axis=-1)
 
 
 def test_people_bring_cameras_together(clip):
     made, true, _ = clip()
     adjusted = adjust_cameras(made, QUICK)
     assert adjusted.accepted.all()
-    assert adjusted.converged
     # Scatter of a pixel's rotation and of decimetres becomes what 800 keypoints per camera leave;
     # what all cameras share stays as calibration has it.
     assert errors(adjusted.cameras, true).mean() < 0.4 * errors(made.cameras, true).mean()
@@ -75,37 +65,6 @@ def test_markings_alone_are_refused_where_they_bend_the_camera(clip):
     assert all(reason.startswith("refused: the loss of") for reason in adjusted.reasons)
 
 
-def test_people_taken_for_others_in_one_camera_spoil_little(clip):
-    made, true, _ = clip(cameras=6)
-    keypoints = made.detections.keypoints.copy()
-    keypoints[:, 5, :2] += np.random.default_rng(4).normal(0.0, 40.0, (24, 2, 1, 2))
-    adjusted = adjust_cameras(
-        replace(made, detections=replace(made.detections, keypoints=keypoints)), QUICK
-    )
-    assert adjusted.accepted[:5].all()
-    before, after = errors(made.cameras, true)[:5], errors(adjusted.cameras, true)[:5]
-    # Without these people it is a factor of three.
-    assert after.mean() < 0.6 * before.mean()
-
-
-def test_given_cameras_are_adjusted_as_far_as_their_prior_lets_them(clip):
-    made, true, _ = clip()
-    step = 5e-4 * np.random.default_rng(2).standard_normal((5, 12))
-    step[:, 3:] = 0.0
-    given = replace(
-        made, cameras=step_camera(true, step), covariance=np.zeros_like(made.covariance)
-    )
-    detections = made.detections
-    placed = triangulate_joints(given.cameras, detections, made.triangulation)
-    given = replace(given, joints=placed.joints)
-    adjusted = adjust_cameras(given, QUICK)
-    assert adjusted.accepted.all()
-    np.testing.assert_array_equal(adjusted.cameras.principal_point, given.cameras.principal_point)
-    # No keypoint reveals their common error, which remains.
-    assert errors(adjusted.cameras, true).mean() < 0.85 * errors(given.cameras, true).mean()
-    assert adjusted.evidence.shift < 0.002
-
-
 def test_frames_that_a_person_chose_are_used_and_the_proposal_kept(clip):
     made, *_ = clip()
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"chosen_frames": (101, 110, 999)}))
@@ -143,37 +102,8 @@ def test_what_tells_nothing_leaves_cameras_as_they_were_and_says_why(clip, case)
     assert all(reason in said for said in adjusted.reasons)
 
 
-def test_clicks_on_one_line_are_refused(clip):
-    made, true, _ = clip(seed=2)
-    rng = np.random.default_rng(3)
-    along = np.linspace(-1.0, 1.0, 12)[:, None] * [18.0, 6.0, 0.0]
-    clicks = tuple(
-        replace(
-            clicks,
-            points_world=along,
-            points_image=true[c].project(along) + rng.standard_normal((12, 2)),
-        )
-        for c, clicks in enumerate(made.clicks)
-    )
-    settings = QUICK.model_copy(update={"evidence": "markings"})
-    adjusted = adjust_cameras(replace(made, clicks=clicks), settings)
-    assert not adjusted.accepted.any()
-    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)
-    assert all(reason.startswith("refused") for reason in adjusted.reasons)
-
-
 def test_too_few_judges_refuse(clip):
     made, *_ = clip()
     adjusted = adjust_cameras(made, QUICK.model_copy(update={"min_judges": 10**6}))
     assert not adjusted.accepted.any()
     assert "at least 1000000 are required" in adjusted.reasons[0]
-
-
-def test_nothing_is_learned_where_every_camera_contradicts_the_others(clip, monkeypatch):
-    made, _, _ = clip()
-    found = adjustment.Contradictions.none(len(made.clicks))
-    found = replace(found, other_people=np.ones(len(made.clicks), dtype=np.bool_))
-    monkeypatch.setattr(adjustment, "find_contradictions", lambda *_: found)
-    adjusted = adjust_cameras(made, QUICK)
-    assert not adjusted.accepted.any()
-    np.testing.assert_array_equal(adjusted.cameras.numbers, made.cameras.numbers)

@@ -153,45 +153,39 @@ def without(detections, camera, frames):
     return replace(detections, confidence=confidence)
 
 
-def test_who_stands_still_tells_nothing(walkers, cameras):
-    first = walkers[:1, :1]
-    place = np.array([*first[0, 0, 11, :2], 0.0])
-    still = np.repeat(first - place, len(walkers), axis=0)
-    with pytest.raises(InputError, match="found people who stand still"):
-        locate_cameras(lenses(cameras), seen(cameras, still), FPS, KnownLength(1.8))
+def stand_still(seen_by, walkers):
+    first = walkers[:1] - np.array([*walkers[0, 0, 11, :2], 0.0])
+    return seen_by(np.repeat(first, len(walkers), axis=0))
 
 
-def test_one_camera_is_refused(walkers, cameras):
-    with pytest.raises(InputError, match="north: expected two cameras or more"):
-        locate_cameras(
-            lenses(cameras)[:1], seen(cameras[:1], walkers[:, :1]), FPS, KnownLength(1.8)
-        )
-
-
-def test_too_few_common_frames_are_refused(walkers, cameras):
-    given = seen(cameras[:2], walkers[:, :1])
+def show_apart(seen_by, walkers):
     half = len(walkers) // 2
-    apart = without(without(given, 0, slice(half, None)), 1, slice(None, half - 5))
-    with pytest.raises(InputError, match="in two cameras at once for 20 frames, found 5"):
-        locate_cameras(lenses(cameras)[:2], apart, FPS, KnownLength(1.8))
+    return without(without(seen_by(walkers), 0, slice(half, None)), 1, slice(None, half - 5))
 
 
-def test_a_camera_that_shows_nobody_is_named(walkers, cameras):
-    given = without(seen(cameras, walkers[:, :1]), 2, slice(None))
-    with pytest.raises(InputError, match="south: expected a person for 20 frames or more"):
-        locate_cameras(lenses(cameras), given, FPS, KnownLength(1.8))
-
-
-def test_a_camera_that_shows_another_person_is_named(walkers, cameras):
-    given = seen(cameras, walkers[:, :1])
+def show_another(seen_by, walkers):
+    given = seen_by(walkers)
     keypoints = given.keypoints.copy()
     keypoints[:, 1] = keypoints[::-1, 1] * [-1.0, 1.0] + [1280.0, 0.0]
-    with pytest.raises(InputError, match="east: expected a person for 20 frames that"):
-        locate_cameras(lenses(cameras), replace(given, keypoints=keypoints), FPS, KnownLength(1.8))
+    return replace(given, keypoints=keypoints)
 
 
-def test_cameras_that_no_keypoint_agrees_with_are_refused(walkers, cameras, monkeypatch):
-    # Every keypoint counts as a gross error.
-    monkeypatch.setattr("worldpose.bundle_adjustment.people_views.GROSS", 0.0)
-    with pytest.raises(InputError, match="joints lie where two cameras show them, found none"):
-        locate_cameras(lenses(cameras), seen(cameras, walkers[:, :1]), FPS, KnownLength(1.8))
+@pytest.mark.parametrize(
+    ("count", "show", "message"),
+    [
+        (1, lambda seen_by, walkers: seen_by(walkers), "north: expected two cameras or more"),
+        (4, stand_still, "found people who stand still"),
+        (2, show_apart, "in two cameras at once for 20 frames, found 5"),
+        (
+            4,
+            lambda seen_by, walkers: without(seen_by(walkers), 2, slice(None)),
+            "south: expected a person for 20 frames or more",
+        ),
+        (4, show_another, "east: expected a person for 20 frames that"),
+    ],
+    ids=["one camera", "still", "too few frames", "nobody", "another person"],
+)
+def test_people_who_determine_no_cameras_are_refused(walkers, cameras, count, show, message):
+    given = show(lambda joints: seen(cameras[:count], joints), walkers[:, :1])
+    with pytest.raises(InputError, match=message):
+        locate_cameras(lenses(cameras)[:count], given, FPS, KnownLength(1.8))

@@ -11,7 +11,6 @@ from worldpose.geometry.optimize.schur_complement import (
     Evidence,
     cost,
     eliminate,
-    substitute,
 )
 from worldpose.static_calibration.parameters import PARAMETERS, project_with_jacobian, step_camera
 
@@ -102,21 +101,3 @@ def test_a_point_behind_a_camera_costs_infinitely_much(scene):
     problem, _, points = scene(cameras=2, markings=1, joints=0, seen=1.0)
     behind = problem.cameras.center[0] + (problem.cameras.center[0] - points[0])
     assert cost(problem.cameras.numbers, behind[None], evidence_of(problem)) == np.inf
-
-
-def test_points_with_still_cameras_go_where_each_alone_would(scene):
-    problem, _, points = scene(markings=0, noise=1.0)
-    start = points + 0.05
-    trial = np.empty_like(points)
-    substitute(
-        problem.cameras.numbers, start, evidence_of(problem), 0.0, np.zeros((4, STEPS)), trial
-    )
-    for p in range(3):
-        rows = problem.point_of == p
-        seen = problem.cameras[problem.camera_of[rows]].project_with_jacobians(
-            np.repeat(start[p][None, None], rows.sum(), axis=0)
-        )
-        jacobian = seen.d_points.reshape(-1, 3)
-        residual = (seen.points_image[:, 0] - problem.image[rows]).ravel()
-        alone = start[p] - np.linalg.lstsq(jacobian, residual, rcond=None)[0]
-        np.testing.assert_allclose(trial[p], alone, atol=1e-9)

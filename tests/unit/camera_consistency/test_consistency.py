@@ -9,7 +9,6 @@ import pytest
 from data_contracts.keypoints import KeypointDetections
 from worldpose.camera_consistency.consistency import check_consistency
 from worldpose.camera_consistency.hypotheses import (
-    LEFT_RIGHT,
     MAX_TANGENTIAL,
     OFF_AXIS,
     lens_hypotheses,
@@ -176,24 +175,18 @@ def test_the_tangential_shift_is_that_of_a_corner_in_opencv():
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("late", [-9, 6])
-def test_a_wrong_clock_is_named_in_frames(late):
+@pytest.mark.parametrize(
+    ("frames", "kind", "value"),
+    # The other camera shows frames 9 earlier, or 50 frames per second stated as 25.
+    [(np.arange(FRAMES) - 9, "clock", 9), (np.arange(FRAMES) // 2, "frame_rate", 2)],
+)
+def test_a_wrong_clock_or_frame_rate_is_named(frames, kind, value):
     cameras = rig()
     keypoints = seen(cameras, walkers())
-    keypoints[:, 2] = shifted(keypoints[:, 2], np.arange(FRAMES) + late)
+    keypoints[:, 2] = shifted(keypoints[:, 2], frames)
     result = check(cameras, keypoints)
-    assert named(result) == [(2, "clock")]
-    assert result.faults[0].value == pytest.approx(-late, abs=1)
-
-
-def test_a_wrong_frame_rate_is_named():
-    cameras = rig()
-    keypoints = seen(cameras, walkers())
-    # A camera of 50 frames per second, stated as 25 per second.
-    keypoints[:, 2] = shifted(keypoints[:, 2], np.arange(FRAMES) // 2)
-    result = check(cameras, keypoints)
-    assert named(result) == [(2, "frame_rate")]
-    assert result.faults[0].value == 2.0
+    assert named(result) == [(2, kind)]
+    assert result.faults[0].value == pytest.approx(value, abs=1)
 
 
 def test_exchanged_videos_of_two_cameras_are_named():
@@ -214,15 +207,6 @@ def test_the_same_video_twice_is_named_once():
     assert result.faults[0].other == 0
 
 
-def test_mirrored_images_are_named():
-    cameras = rig()
-    keypoints = seen(cameras, walkers())
-    mirrored = keypoints[:, 0][..., LEFT_RIGHT, :].copy()
-    mirrored[..., 0] = 1919.0 - mirrored[..., 0]
-    keypoints[:, 0] = mirrored
-    assert named(check(cameras, keypoints)) == [(0, "mirrored")]
-
-
 def test_of_two_cameras_no_one_can_tell_which_is_wrong():
     cameras = [rig()[1], rig()[3]]
     keypoints = seen(cameras, walkers())
@@ -230,13 +214,6 @@ def test_of_two_cameras_no_one_can_tell_which_is_wrong():
     (fault,) = check(cameras, keypoints).faults
     assert (fault.kind, {fault.camera, fault.other}) == ("contradiction", {0, 1})
     assert fault.cause == "flipped"
-
-
-def test_of_three_cameras_the_one_that_contradicts_two_is_wrong():
-    cameras = [rig()[n] for n in (0, 2, 4)]
-    keypoints = seen(cameras, walkers())
-    cameras[1] = stated(cameras[1], "focal")
-    assert named(check(cameras, keypoints)) == [(1, "focal")]
 
 
 def test_a_camera_that_sees_nobody_in_common_cannot_be_confirmed():
@@ -252,7 +229,7 @@ def test_a_camera_that_sees_nobody_in_common_cannot_be_confirmed():
     assert result.unconfirmed == (4,)
 
 
-@pytest.mark.parametrize("cameras", [1, 2, 5])
+@pytest.mark.parametrize("cameras", [1, 5])
 def test_without_people_nothing_is_known(cameras):
     result = check(rig()[:cameras], np.full((FRAMES, cameras, 1, 17, 2), np.nan))
     assert (result.faults, result.confirmed) == ((), ())
@@ -272,13 +249,11 @@ def test_two_cameras_at_one_place_with_videos_of_their_own_are_right():
     assert check(cameras, keypoints).faults == ()
 
 
-@pytest.mark.parametrize("pitch", [PITCH, None])
-@pytest.mark.parametrize("apart", [0.2, 0.6, 0.9])
+@pytest.mark.parametrize(("apart", "pitch"), [(0.2, PITCH), (0.9, None)])
 def test_two_cameras_on_one_mast_blame_each_other_for_nothing(apart, pitch):
     # 36 m from people whose rays meet at 0.3 to 1.4 degrees.
     cameras = [looking((x, -35.0, 3.0), (22.0, 1.0, 1.0)) for x in (22.0, 22.0 + apart)]
-    for seed in range(3):
-        assert check(cameras, seen(cameras, walkers(), seed), pitch=pitch).faults == ()
+    assert check(cameras, seen(cameras, walkers()), pitch=pitch).faults == ()
 
 
 def test_people_who_move_symmetrically_about_the_centre_spot_hide_no_other_fault():

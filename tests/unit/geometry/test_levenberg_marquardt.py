@@ -50,15 +50,6 @@ def test_the_minimum_of_rosenbrocks_function_is_at_one_one():
     )
 
 
-def test_a_linear_problem_is_solved_in_one_undamped_step():
-    # A line through (0, 1), (1, 3), (2, 5) has offset 1 and slope 2.
-    a, b = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]), np.array([1.0, 3.0, 5.0])
-    at, step = dense(lambda x: a @ x - b, lambda x: a)
-    found = minimize(at(np.zeros(2)), step, schedule(damping=0.0, iterations=1))
-    np.testing.assert_allclose(found.state.x, [1.0, 2.0], atol=1e-12)
-    assert found.iterations == 1 and len(found.costs) == 2
-
-
 def test_a_singular_problem_moves_along_what_its_residuals_determine():
     # Only x + y = 2 is observed.
     at, step = dense(lambda x: np.array([x[0] + x[1] - 2.0]), lambda x: np.array([[1.0, 1.0]]))

@@ -96,14 +96,6 @@ def test_what_moves_is_drawn_at_four_moments_of_the_shutter():
     assert sorted(columns) == [[2, 3], [4, 5], [6, 7], [8, 9]]
 
 
-def test_light_and_haze_change_colours():
-    samples = Samples.empty(0, 0, 3, 3)
-    draw(samples, rectangle(0.5, 0.5, 1.5, 1.5), 0, light=0.5)
-    assert (samples.color[1, 1] == 100).all()
-    draw(samples, rectangle(0.5, 0.5, 1.5, 1.5, 5.0), 1, light=9.0)
-    assert (samples.color[1, 1] == 255).all()
-
-
 def test_a_mask_has_the_pixels_whose_middles_are_covered_whichever_way_triangles_face():
     for faces in (FACES, np.ascontiguousarray(FACES[:, ::-1])):
         mask = np.zeros((5, 5), dtype=np.uint8)

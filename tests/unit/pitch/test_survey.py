@@ -46,8 +46,7 @@ def points(fit):
 
 
 # A grid's zone, a pitch that falls by 0.6 %; places are rounded to 0.1 mm in the record.
-@pytest.mark.parametrize("angle", [0.0, 1.0, np.pi, -2.5])
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.006, -0.003)])
+@pytest.mark.parametrize(("angle", "slope"), [(0.0, (0.0, 0.0)), (-2.5, (0.006, -0.003))])
 def test_an_exact_survey_in_any_frame_gives_the_pitch_back(angle, slope):
     fit = fit_survey(surveyed(angle=angle, shift=(512345.6, 5345678.9, 517.25), slope=slope))
     assert fit.pitch.length == pytest.approx(TRUE.length, abs=1e-3)
@@ -77,18 +76,6 @@ def test_a_noisy_survey_keeps_its_own_distances(angle, seed):
     assert 0.005 < np.sqrt(np.mean(fit.offset_plan**2)) < 0.06
 
 
-def test_a_noisy_survey_says_sizes_as_well_as_its_points_can():
-    fits = [fit_survey(surveyed(noise=0.02, seed=seed)).pitch for seed in range(100)]
-    length, width = (
-        np.sqrt(np.mean([(getattr(fit, name) - getattr(TRUE, name)) ** 2 for fit in fits]))
-        for name in ("length", "width")
-    )
-    # Three points of 2 cm on either touchline: 1.63 cm, and a fifth more or less in 100 surveys.
-    assert width == pytest.approx(0.02 * np.sqrt(2.0 / 3.0), rel=0.2)
-    # Two corners at either end would be 2 cm; the areas' fronts, a mark and a post know of it too.
-    assert 0.010 < length < 0.016
-
-
 def test_without_heights_the_crown_is_the_standard_one():
     survey = surveyed()
     survey.places[:, 2] = np.nan
@@ -99,15 +86,6 @@ def test_without_heights_the_crown_is_the_standard_one():
     # corners lie the crown below the centre, the crossbar's end 2.44 m above its own ground
     assert fit.pitch.points["corner_left_near"][2] == pytest.approx(-0.2, abs=1e-3)
     assert fit.pitch.points["goal_post_left_near_top"][2] == pytest.approx(2.4376, abs=1e-3)
-
-
-def test_some_heights_missing_change_nothing_else():
-    survey = surveyed(angle=0.4, slope=(0.004, 0.0), shift=(0.0, 0.0, 50.0))
-    survey.places[[1, 5], 2] = np.nan
-    fit = fit_survey(survey)
-    assert np.isnan(fit.offset_height).tolist() == [n in (1, 5) for n in range(len(NAMES))]
-    truth = PitchTemplate.from_spec(TRUE).positions(NAMES)
-    np.testing.assert_allclose(points(fit), truth, atol=0.015)
 
 
 def test_what_the_survey_cannot_tell_stays_standard():
@@ -133,17 +111,7 @@ def test_a_left_handed_frame_is_refused_unless_it_is_said():
         fit_survey(surveyed(), SurveySettings(left_handed=True))
 
 
-def test_names_with_left_and_right_exchanged_are_a_mirror_image():
-    swap = {"left": "right", "right": "left"}
-    survey = surveyed()
-    names = tuple("_".join(swap.get(part, part) for part in n.split("_")) for n in survey.names)
-    with pytest.raises(InputError, match="mirror image"):
-        fit_survey(Survey("survey.csv", names, survey.places))
-
-
-@pytest.mark.parametrize(
-    ("unit", "said"), [(1 / 0.3048, "feet"), (1 / 0.9144, "yards"), (100, "centimetres"), (1e3, "")]
-)
+@pytest.mark.parametrize(("unit", "said"), [(1 / 0.9144, "yards"), (1e3, "")])
 def test_other_units_are_named(unit, said):
     survey = surveyed()
     with pytest.raises(InputError, match=f"times too large.*{said}") as caught:

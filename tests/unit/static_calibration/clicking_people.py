@@ -8,13 +8,41 @@ import numpy as np
 from data_contracts.cameras import LensCalibration
 from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings, ClickedPoint, DrawnMarking
+from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
 from worldpose.simulation.scenarios import SCENARIOS
-from worldpose.simulation.scene import place_camera
+from worldpose.simulation.scene import look_at, place_camera
+from worldpose.static_calibration.from_paint.paint import Ridges, guess_lens, straighten_paint
+from worldpose.static_calibration.parameters import step_between
 
 SIZE = (1920, 1080)
 PITCH = PitchTemplate.standard()
 DISTORTION = np.array([-0.30, 0.12, 0.002, -0.001, -0.02])
+
+
+def pinhole(center, aim, focal, size=(1280, 720), k1=0.0, roll=0.0):
+    """A camera at a place that looks at another, with its principal point in the middle."""
+    return Camera(
+        focal=np.array([focal, focal]),
+        principal_point=0.5 * (np.array(size) - 1.0),
+        distortion=np.array([k1, 0.0, 0.0, 0.0, 0.0]),
+        cam_from_world=look_at(np.array(center), np.array(aim), roll),
+        image_size=np.array(size),
+    )
+
+
+def paint_of(camera, names, pitch=PITCH):
+    """Paint of markings in a camera's image, as a flawless detector would find it."""
+    points, normals = [], []
+    size = tuple(camera.image_size.tolist())
+    for name in names:
+        pixels = camera.project(pitch.marking_points(name, 0.02))
+        inside = ((pixels >= 0.0) & (pixels <= np.array(size) - 1.0)).all(axis=1)
+        way = np.gradient(pixels, axis=0)
+        points.append(pixels[inside])
+        normals.append((np.arctan2(way[:, 1], way[:, 0]) + 0.5 * np.pi)[inside] % np.pi)
+    ridges = Ridges(np.concatenate(points), np.concatenate(normals))
+    return straighten_paint(ridges, np.ones(size[::-1], np.bool_), guess_lens(0.0, size), 1.0)
 
 
 def seat(index: int, seed: int = 0):
@@ -93,17 +121,7 @@ def on_the_pitch(rng, count=60):
 
 def surprise_of(estimate, truth):
     """Squared Mahalanobis distance of the true camera, and its degrees of freedom."""
-    off = truth.cam_from_world @ estimate.camera.cam_from_world.inverse()
-    camera = estimate.camera
-    step = np.concatenate(
-        [
-            off.rotvec,
-            off.translation,
-            [np.log(truth.focal[0] / camera.focal[0])],
-            truth.principal_point - camera.principal_point,
-            (truth.distortion - camera.distortion)[[0, 1, 4]],
-        ]
-    )
+    step = step_between(estimate.camera, truth)
     free = np.diag(estimate.covariance) > 0
     inner = estimate.covariance[np.ix_(free, free)]
     return float(step[free] @ np.linalg.solve(inner, step[free])), int(free.sum())

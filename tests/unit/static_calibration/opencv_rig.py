@@ -77,8 +77,3 @@ def markings(points, drawn=None):
             ],
         }
     )
-
-
-def exchanged(name, one, other):
-    """Return the name with two of its words exchanged."""
-    return name.replace(one, "@").replace(other, one).replace("@", other)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from worldpose.errors import InputError
-from worldpose.formats.lens_files import read_lens_toml, write_lens_toml
 from worldpose.static_calibration.boards import Board, BoardView, calibrate_lens, choose_views
 
 SIZE = (1280, 720)
@@ -113,10 +112,3 @@ def test_a_wrong_dictionary_or_marker_is_told():
         InputError, match=r"board: marker: expected .* smaller than a square of 0.06"
     ):
         Board(8, 5, 0.06, "DICT_4X4_50", 0.06).find(blank)
-
-
-def test_a_lens_file_is_read_as_it_was_written(tmp_path):
-    rng = np.random.default_rng(8)
-    lens = calibrate_lens("cam", [view(rng) for _ in range(6)], SIZE).lens
-    write_lens_toml(tmp_path / "lenses.toml", {"cam": lens})
-    assert read_lens_toml(tmp_path / "lenses.toml", {"cam": SIZE})["cam"] == lens

@@ -4,10 +4,8 @@ import clicking_people as people
 import numpy as np
 import pytest
 
-from data_contracts.pitch import PitchSpec
 from data_contracts.static_calibration import ClickedMarkings
 from worldpose.errors import InputError
-from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
 from worldpose.static_calibration.settings import StaticCalibrationSettings
 
@@ -21,9 +19,19 @@ def of(clicked, **settings):
 # Degenerate input first.
 
 
-def test_nothing_clicked_is_an_error():
-    with pytest.raises(InputError, match="found none"):
-        of(ClickedMarkings())
+@pytest.mark.parametrize(
+    ("clicked", "message"),
+    [
+        (ClickedMarkings(), "found none"),
+        (people.points({"center_mark": (1950.0, 10.0)}), "1950"),
+        (people.points({"centre_mark": (10.0, 10.0)}), r"'centre_mark'.*center_mark"),
+        (ClickedMarkings(points=people.points({"center_mark": (9.0, 9.0)}).points * 2), "2 times"),
+    ],
+    ids=["nothing", "off the image", "unknown name", "twice"],
+)
+def test_clicks_that_no_image_has_are_refused(clicked, message):
+    with pytest.raises(InputError, match=message):
+        of(clicked)
 
 
 def test_three_points_are_too_few_and_the_message_names_others():
@@ -66,26 +74,10 @@ def test_left_and_right_exchanged_is_told_from_wrong_clicks():
         of(people.points(seen))
 
 
-def test_a_click_off_the_picture_is_an_error():
-    with pytest.raises(InputError, match="1950"):
-        of(people.points({"center_mark": (1950.0, 10.0)}))
-
-
-def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(InputError, match=r"'centre_mark'.*center_mark"):
-        of(people.points({"centre_mark": (10.0, 10.0)}))
-
-
-def test_a_point_clicked_twice_is_an_error():
-    twice = people.points({"center_mark": (10.0, 10.0)}).points * 2
-    with pytest.raises(InputError, match="clicked 2 times"):
-        of(ClickedMarkings(points=twice))
-
-
 # Known truth.
 
 
-@pytest.mark.parametrize("index", range(0, 16, 3))
+@pytest.mark.parametrize("index", [0, 9])
 def test_exact_clicks_give_the_camera_back(index):
     camera, _ = people.seat(index)
     seen = people.visible(camera)
@@ -107,16 +99,6 @@ def test_two_corners_and_one_drawn_line_are_enough():
     assert off < 40.0
     assert result.report.weak
     assert result.report.add_next
-
-
-def test_drawn_lines_arcs_and_goals_are_enough_without_any_point():
-    camera, rng = people.seat(1)
-    drawn = people.draw(camera, PITCH.marking_names, rng, noise=0.5)
-    assert {marking.name.split("_")[0] for marking in drawn} >= {"penalty", "goal", "touch"}
-    result = of(ClickedMarkings(drawn=drawn))
-    places = people.on_the_pitch(np.random.default_rng(0))
-    # 30 to 60 pixels at 0.5 px: a pixel is 5 to 10 cm of ground.
-    assert np.median(people.ground_errors(result.estimate.camera, camera, places)) < 0.1
 
 
 def test_a_marking_under_another_ones_name_is_named_and_left_out():
@@ -145,32 +127,6 @@ def test_a_wrong_click_is_found_and_no_other():
     assert others <= 1
 
 
-def test_the_ground_error_from_clicks_is_what_the_noise_allows():
-    errors = []
-    for index in range(16):
-        camera, rng = people.seat(index, seed=2)
-        result = of(people.click(camera, rng, count=12).clicked)
-        errors.append(
-            people.ground_errors(result.estimate.camera, camera, people.on_the_pitch(rng))
-        )
-    # Clicks of 1 px on these seats leave about 7 cm median in long runs.
-    assert np.median(np.concatenate(errors)) < 0.12
-
-
-def test_a_flat_template_is_measurably_worse_than_the_crowned_one():
-    flat = PitchTemplate.from_spec(PitchSpec(crown=0.0))
-    crowned_errors, flat_errors = [], []
-    for index in range(8):
-        camera, _ = people.seat(index, seed=3)
-        clicked = people.points(people.visible(camera))
-        places = people.on_the_pitch(np.random.default_rng(index))
-        for pitch, errors in ((PITCH, crowned_errors), (flat, flat_errors)):
-            estimate = calibrate_camera(pitch, clicked, SIZE).estimate
-            errors.append(people.ground_errors(estimate.camera, camera, places))
-    # A surface 0.2 m off seen at 20 degrees is decimetres off on the ground.
-    assert np.median(np.concatenate(flat_errors)) > 5 * np.median(np.concatenate(crowned_errors))
-
-
 def test_the_expected_ground_error_is_that_of_repeated_clicks():
     camera, _ = people.seat(4)
     seen = people.visible(camera)
@@ -191,14 +147,6 @@ def test_the_expected_ground_error_is_that_of_repeated_clicks():
     assert rms == pytest.approx(np.median(expected), rel=0.3)
 
 
-def test_the_report_says_what_was_free_and_why_k3_was_not():
-    camera, rng = people.seat(1)
-    report = of(people.click(camera, rng, count=14).clicked).report
-    assert "k2" in report.free
-    assert "k3" not in report.free
-    assert any(decision.startswith("k3 kept 0") for decision in report.decisions)
-
-
 def test_k3_is_earned_by_a_lens_that_has_it():
     camera, rng = people.seat(1)
     bent = replace(camera, distortion=np.array([-0.1, 0.02, 0.0, 0.0, -1.0]))
@@ -206,15 +154,3 @@ def test_k3_is_earned_by_a_lens_that_has_it():
     report = of(ClickedMarkings(drawn=drawn), drawn_noise_px=0.2).report
     assert "k3" in report.free
     assert any(decision.startswith("k3 solved for") for decision in report.decisions)
-
-
-def test_a_picture_without_lines_leaves_the_camera_to_the_clicks():
-    camera, rng = people.seat(0)
-    clicked = people.click(camera, rng).clicked
-    meadow = np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8)
-    with_picture = calibrate_camera(PITCH, clicked, SIZE, picture=meadow)
-    np.testing.assert_array_equal(
-        with_picture.estimate.camera.focal, of(clicked).estimate.camera.focal
-    )
-    assert with_picture.report.stage == "points"
-    assert any(text.startswith("painted lines:") for text in with_picture.report.decisions)

@@ -8,7 +8,6 @@ import pytest
 
 from data_contracts.pitch import PitchSpec
 from worldpose.pitch.template import Surface
-from worldpose.simulation.renderer import render_pitch
 from worldpose.simulation.scenarios import SCENARIOS
 from worldpose.simulation.scene import place_camera
 from worldpose.static_calibration.adjustment import build_problem, camera_row
@@ -97,18 +96,6 @@ def test_shared_survey_is_taken_off_once():
     assert 0.0 < cost <= 4.0 + 1e-6
 
 
-def test_best_camera_is_found_from_metres_away():
-    camera = corner_camera()
-    given = evidence(camera)
-    best = given.fit(camera, HERE)
-    step = np.zeros(12)
-    step[5], step[6] = 0.5, 0.01  # half a metre back, a hundredth longer
-    again = given.fit(step_camera(camera, step), HERE)
-    lowest = float((given.residuals(*best)[0] ** 2).sum())
-    # A hundredth of a deviation ends the search.
-    assert float((given.residuals(*again)[0] ** 2).sum()) == pytest.approx(lowest, abs=1e-3)
-
-
 def test_valley_widens_the_covariance_and_is_the_same_each_time():
     camera = corner_camera()
     given = evidence(camera)
@@ -132,24 +119,3 @@ def test_stills_without_lines_make_a_camera_weak():
     assert found.report.weak
     assert any("no painted lines" in reason for reason in found.report.reasons)
     assert not calibrate_camera(people.PITCH, clicked, people.SIZE).report.weak
-
-
-@pytest.mark.parametrize("index", [2, 4])
-def test_lines_tell_which_of_few_clicks_is_wrong(index):
-    camera, rng = people.seat(index)
-    few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
-    picture = render_pitch(camera, people.PITCH, None, 0)
-    found = calibrate_camera(people.PITCH, few.clicked, people.SIZE, picture=picture)
-    assert found.report.stage == "lines"
-    assert found.report.wrong == (few.first,)
-
-
-def test_lines_find_the_wrong_one_of_five_clicks_of_three_times_the_noise():
-    camera, rng = people.seat(0)
-    few = people.click(camera, rng, count=5, noise=3.0, wrong=150.0)
-    picture = render_pitch(camera, people.PITCH, None, 0)
-    found = calibrate_camera(people.PITCH, few.clicked, people.SIZE, picture=picture)
-    places = people.on_the_pitch(np.random.default_rng(0))
-    assert found.report.stage == "lines"
-    assert found.report.wrong == (few.first,)
-    assert np.median(people.ground_errors(found.estimate.camera, camera, places)) < 0.02

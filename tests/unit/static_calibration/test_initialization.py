@@ -5,10 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_contracts.pitch import PitchSpec
-from data_contracts.static_calibration import ClickedMarkings
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.initialization import (
     camera_from_homography,
@@ -21,14 +18,8 @@ MIDDLE = np.array([959.5, 539.5])
 FLAT = PitchTemplate.from_spec(PitchSpec(crown=0.0))
 
 
-def pinhole(focal=2100.0, center=(10.0, -60.0, 22.0), aim=(15.0, 0.0, 0.0), roll=0.01) -> Camera:
-    return Camera(
-        focal=np.array([focal, focal]),
-        principal_point=MIDDLE,
-        distortion=np.zeros(5),
-        cam_from_world=look_at(np.array(center), np.array(aim), roll),
-        image_size=np.array(SIZE),
-    )
+def pinhole(focal=2100.0, center=(10.0, -60.0, 22.0), aim=(15.0, 0.0, 0.0), roll=0.01):
+    return people.pinhole(center, aim, focal, SIZE, roll=roll)
 
 
 def test_points_on_one_line_give_no_homography():
@@ -36,12 +27,6 @@ def test_points_on_one_line_give_no_homography():
     pixels = np.stack([np.linspace(0, 900, 6), np.full(6, 500.0)], axis=1)
     none = np.empty((0, 2)), np.empty((0, 3))
     assert plane_from_image(pixels, plane, *none, 1000.0, MIDDLE) is None
-
-
-def test_three_points_give_no_homography():
-    plane = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
-    none = np.empty((0, 2)), np.empty((0, 3))
-    assert plane_from_image(10.0 * plane, plane, *none, 1000.0, MIDDLE) is None
 
 
 def test_four_lines_alone_give_the_homography():
@@ -99,10 +84,3 @@ def test_two_wrong_clicks_of_nine_do_not_bend_the_homography():
     place = best @ np.append(FLAT.points[names[5]][:2], 1.0)
     # The crown is not in the flat homography: it moves pixels by up to 5.
     assert np.linalg.norm(place[:2] / place[2] - seen[names[5]]) == pytest.approx(0.0, abs=6.0)
-
-
-def test_without_points_on_the_surface_there_is_no_homography():
-    camera, rng = people.seat(1)
-    drawn = people.draw(camera, ["center_circle", "penalty_arc_left"], rng)
-    evidence = gather_evidence(people.PITCH, ClickedMarkings(drawn=drawn), SIZE, 0.5, "test")
-    assert homographies(evidence, SIZE, 10.0, leave_out=True) == []

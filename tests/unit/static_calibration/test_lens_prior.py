@@ -1,7 +1,5 @@
 """A camera from few clicks whose lens was calibrated before."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from clicking_people import (
@@ -16,7 +14,7 @@ from clicking_people import (
 )
 
 from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.paint_segments import guess_lens
+from worldpose.static_calibration.from_paint.paint import guess_lens
 from worldpose.static_calibration.parameters import drop_k3
 
 
@@ -47,22 +45,6 @@ def test_a_lens_that_the_clicks_contradict_makes_the_camera_weak():
         report = calibrate_camera(PITCH, clicked, SIZE, lens=lens_of(camera, rng, focal)).report
         found = [each for each in report.reasons if "contradict the given lens" in each]
         assert bool(found) == contradicted, report.reasons
-
-
-def test_a_loose_lens_changes_nothing_that_clicks_determine():
-    camera, rng = wide_camera(2)
-    camera = replace(camera, distortion=DISTORTION * [1, 1, 0, 0, 0])
-    clicked = click(camera, rng, count=22).clicked
-    loose = lens_of(camera, rng).model_copy(
-        update={"focal_std_px": 500.0, "principal_point_std_px": 200.0, "distortion_std": 0.2}
-    )
-    places = on_the_pitch(rng)
-    with_lens, without = (
-        calibrate_camera(PITCH, clicked, SIZE, lens=given).estimate.camera
-        for given in (loose, None)
-    )
-    assert np.median(ground_errors(with_lens, without, places)) < 0.1
-    assert with_lens.focal[0] == pytest.approx(without.focal[0], rel=0.02)
 
 
 def test_k1_and_k2_bend_an_image_as_a_guessed_lens_with_k3_does():

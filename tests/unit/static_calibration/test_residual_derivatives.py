@@ -9,7 +9,6 @@ from worldpose.static_calibration.adjustment import build_problem, camera_row, s
 from worldpose.static_calibration.evidence import gather_evidence
 from worldpose.static_calibration.ground_error import surface_motion
 from worldpose.static_calibration.parameters import (
-    PARAMETERS,
     drawn_residuals,
     point_residuals,
     prior_residuals,
@@ -127,7 +126,3 @@ def test_the_motion_of_the_ground_under_a_step():
     predicted = np.linalg.norm(motion @ step, axis=1)
     assert len(places) > 10
     np.testing.assert_allclose(moved, predicted, rtol=1e-3, atol=1e-9)
-
-
-def test_every_parameter_has_a_step():
-    assert len(STEPS) == len(PARAMETERS)

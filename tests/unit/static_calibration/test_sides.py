@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clicking_people import pinhole
 
 from worldpose.errors import InputError
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.scene import look_at
 from worldpose.static_calibration.sides import (
     MIN_EVIDENCE,
     SeenPeople,
@@ -29,14 +28,7 @@ SEATS = {
 
 def camera(seat):
     center, aim = SEATS[seat]
-    focal = 3000.0 if seat == "other_end" else 1100.0
-    return Camera(
-        focal=np.array([focal, focal]),
-        principal_point=np.array([959.5, 539.5]),
-        distortion=np.zeros(5),
-        cam_from_world=look_at(np.array(center), np.array(aim), 0.0),
-        image_size=np.array([1920, 1080]),
-    )
+    return pinhole(center, aim, 3000.0 if seat == "other_end" else 1100.0, (1920, 1080))
 
 
 def watch(seat, places, rng, *, miss=0.2, false=1, noise=0.3):
@@ -81,7 +73,7 @@ def test_people_agree_on_the_true_side_alone(people):
     assert compare_sides(near, turn(far), PITCH, SECONDS) == pytest.approx((turned, same))
 
 
-@pytest.mark.parametrize("wrong", [(), ("far",), ("goal",), ("far", "goal")])
+@pytest.mark.parametrize("wrong", [(), ("far", "goal")])
 def test_one_stated_side_decides_all_cameras(people, wrong):
     rng, places = people
     seen = {seat: watch(seat, places, rng) for seat in ("near", "far", "goal")}
@@ -111,9 +103,9 @@ def test_without_a_stated_side_nothing_is_decided_but_relative_sides_are_named(p
 
 
 def test_unrelated_people_decide_nothing():
-    """Two hundred pairs of cameras whose people have nothing to do with each other."""
+    """Fifty pairs of cameras whose people have nothing to do with each other."""
     rng = np.random.default_rng(71)
-    for _ in range(200):
+    for _ in range(50):
         first, second = (
             watch(seat, rng.uniform([-50.0, -30.0], [0.0, 30.0], (6, 12, 2)), rng)
             for seat in ("near", "far")
@@ -130,12 +122,3 @@ def test_a_wrong_stated_side_is_named(people):
     assert [name for name, each in decided.items() if each.contradicted] == ["goal"]
     with pytest.raises(InputError, match=r"with near, far only after half a turn.*opposite side"):
         decided["goal"].require_side("image of goal")
-
-
-def test_frames_close_together_count_as_one_moment(people):
-    rng, places = people
-    still = np.repeat(places[:1], 6, axis=0)
-    near, far = (watch(seat, still, rng, miss=0.0, false=0) for seat in ("near", "far"))
-    long, _ = compare_sides(near, far, PITCH, SECONDS)
-    short, _ = compare_sides(near, far, PITCH, 1e-3 * SECONDS)
-    assert short == pytest.approx(long / 6.0, rel=0.01)

@@ -5,13 +5,12 @@ import json
 import cv2
 import numpy as np
 import pytest
+from clicking_people import pinhole
 
 from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
-from worldpose.geometry.cameras import Camera
 from worldpose.pitch.template import PitchTemplate
-from worldpose.simulation.scene import look_at
-from worldpose.static_calibration.paint_segments import trace_marking
-from worldpose.static_calibration.proposal import MarkingSupport, Proposal
+from worldpose.static_calibration.from_paint.proposal import MarkingSupport, Proposal
+from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 from worldpose.static_calibration.sides import turn_name
 
 PITCH = PitchTemplate.standard()
@@ -82,13 +81,7 @@ def test_a_marking_outside_of_the_image_is_not_traced():
 
 @pytest.fixture
 def proposal():
-    camera = Camera(
-        focal=np.array([1300.0, 1300.0]),
-        principal_point=np.array([639.5, 359.5]),
-        distortion=np.array([-0.05, 0.0, 0.0, 0.0, 0.0]),
-        cam_from_world=look_at(np.array([-24.0, -60.0, 22.0]), np.array([-33.0, -2.0, 0.0]), 0.01),
-        image_size=np.array([1280, 720]),
-    )
+    camera = pinhole((-24.0, -60.0, 22.0), (-33.0, -2.0, 0.0), 1300.0, k1=-0.05, roll=0.01)
     drawn = []
     for name in ("penalty_area_left_near", "halfway_line", "center_circle", "penalty_arc_left"):
         pixels = camera.project(PITCH.marking_points(name, 2.0))

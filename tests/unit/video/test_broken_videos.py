@@ -126,16 +126,19 @@ def test_images_count_by_their_numbers_and_a_gap_is_a_missing_frame(tmp_path):
     assert numbers_read(tmp_path) == [(0, 7), (1, 8), (2, 10)]
 
 
-def test_images_without_numbers_are_refused(tmp_path):
-    write_still(tmp_path / "first.png", numbered(1)[0])
-    with pytest.raises(InputError, match="end in numbers"):
-        index_video(tmp_path)
-
-
-def test_one_odd_number_of_an_image_does_not_fill_the_memory(tmp_path):
-    for name in ("0", "2000000000"):
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["first"], "end in numbers"),
+        (["9" * 40], "at most 18 digits"),
+        # One odd number does not fill the memory.
+        (["0", "2000000000"], "2000000000 frames after the first"),
+    ],
+)
+def test_images_whose_names_do_not_number_them_are_refused(tmp_path, names, message):
+    for name in names:
         write_still(tmp_path / f"{name}.png", numbered(1)[0])
-    with pytest.raises(InputError, match="2000000000 frames after the first"):
+    with pytest.raises(InputError, match=message):
         index_video(tmp_path).on_clock(25.0, "images")
 
 
@@ -150,9 +153,3 @@ def test_clips_that_are_far_apart_take_only_their_own_frames_of_a_video(tmp_path
     assert footage.frame.tolist() == [3, 4, 5, 6, 40, 41, 42, 43, 44]
     assert footage.picture.tolist() == footage.frame.tolist()
     assert footage.missing == []
-
-
-def test_numbers_of_images_that_no_integer_holds_are_refused(tmp_path):
-    write_still(tmp_path / f"{'9' * 40}.png", numbered(1)[0])
-    with pytest.raises(InputError, match="at most 18 digits"):
-        index_video(tmp_path)

@@ -66,17 +66,10 @@ def eliminate(
     last: int,
     equations: CameraEquations,
 ) -> None:
-    """Add the observations of points `first` to `last` to the cameras' system.
+    """Add the observations of points `first` to `last`, exclusive, to the cameras' system.
 
-    Args:
-        cameras: (cameras, 22).
-        points: (points, 3) [m], world.
-        evidence: evidence of all points.
-        damping: Marquardt damping of the points.
-        first: first point.
-        last: last point, exclusive.
-        equations: equations of the cameras; `rows` is written, for these points alone, `blocks` and
-            `gradient` are added to.
+    `rows` of the equations is written, for these points alone, `blocks` and `gradient` are added
+    to.
     """
     columns, rows = equations.columns, equations.rows
     blocks, gradient = equations.blocks, equations.gradient
@@ -132,16 +125,7 @@ def substitute(
     steps: Floats,
     trial: Floats,
 ) -> None:
-    """Write the points after a step of the cameras.
-
-    Args:
-        cameras: (cameras, 22), before the step.
-        points: (points, 3) [m], world, before it.
-        evidence: evidence of all points.
-        damping: as in the elimination.
-        steps: (cameras, 12).
-        trial: (points, 3) [m], written.
-    """
+    """Write the points after a step (cameras, 12) of the cameras, damped as in the elimination."""
     by_camera = np.empty((2, STEPS))
     by_point = np.empty((2, 3))
     normal = np.empty(6)
@@ -172,13 +156,7 @@ def substitute(
 
 @compile_kernel
 def cost(cameras: Floats, points: Floats, evidence: Evidence) -> float:
-    """Return the robust sum of squares with the points' priors; infinite if one has no image.
-
-    Args:
-        cameras: (cameras, 22).
-        points: (points, 3) [m], world.
-        evidence: evidence of all points.
-    """
+    """Return the robust sum of squares with the points' priors; infinite if one has no image."""
     total = 0.0
     for p in range(len(points)):
         known = evidence.information[p]

@@ -15,69 +15,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image, Integers
+from data_contracts.arrays import Flags, Floats, Image, Singles
 from worldpose.errors import InputError
 from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 
-_WIDTHS: Final = (1280, 1920)
-"""Minimum and maximum width of the image in which paint is searched [px]: far lines of a wide view
-stay one pixel wide."""
-_GREEN: Final = (22, 95)
-"""Hues of grass in OpenCV's range of 180 [1]: yellow-green of dry grass to blue-green of flood
-light."""
-_MIN_HUE_SHARE: Final = 0.1
-"""Hues of grass are as frequent as this share of the most frequent one [1]: mowing stripes and
-shadows differ by up to 25 hues."""
-_MIN_SATURATION: Final = 25
-_MIN_VALUE: Final = 25
-_MIN_GRASS: Final = 0.02
-"""Minimum share of grass in the image [1]; below there is no pitch."""
-_CLOSING: Final = 31
-"""Size of gaps in the grass that belong to the pitch: people and paint [px]."""
-_DIRECTIONS: Final = 12
-"""Directions of ridges to try [1]: 15 degrees apart."""
-_HALF_WIDTHS: Final = (3.0, 5.0, 8.0)
-"""Distances between a ridge's middle and the grass on either side [px]."""
-_CONTRAST: Final = (4.0, 8.0)
-"""Least and greatest minimum brightness of a ridge above both sides, CIE L in 0 to 255 [1]: faded
-paint has 10 to 20, thin far lines and fog 4 to 8."""
-_ABOVE_NOISE: Final = 6.0
-"""This minimum, in medians of all ridges [1]: nearly all are noise of the grass, of 0.5 to 4."""
-_MIN_EXTENT: Final = 20
-"""Minimum extent of connected ridge pixels [px]; shorter ones are noise of the grass."""
-_CLUTTER: Final = (41, 0.12)
-"""Size of a neighborhood [px], and share of ridges in it [1] from which they are no paint: trees,
-nets, letters and people have more than the crossing of two lines."""
-_ANGLES: Final = 360
-"""Directions of the Hough transform [1]."""
-_VOTE_SPREAD: Final = 24
-"""Deviation of a vote's direction, in these directions, either way [1]: 12 degrees."""
 _TOLERANCE: Final = 1.6
 """Distance of a segment's pixels from its line [px]."""
-_MAX_GAP: Final = 60.0
-"""Largest gap within a segment [px]: a player in front of the line."""
 _MIN_LENGTH: Final = 40.0
 """Minimum length of a segment [px]."""
 _MIN_FILL: Final = 0.5
 """Minimum share of a segment that is paint [1]."""
-_BENDS: Final = (0.0, -0.03, -0.06, -0.09, -0.12, -0.15, -0.18, -0.22, -0.26)
-"""Displacements of the left and right rim to try for a lens that is not known [1]: from a long lens
-to an action camera."""
-_BEND_GAIN: Final = 0.9
-"""Length of straight paint, of the maximum, that suffices for no displacement [1]."""
-_BEND_DOUBT: Final = 0.6
-"""Length of straight paint, of the maximum, from which no displacement is tried too [1]."""
-_OTHER_BENDS: Final = (1.0, 0.8, 0.65)
-"""Displacements to offer for a bent image, of the one that makes the most paint straight [1]: a
-single long line prefers one that is too large."""
-_COMPARED_SEGMENTS: Final = 8
-"""Segments whose lengths are compared [1]."""
-_MIN_STRAIGHT_FOCAL: Final = 0.35
-"""Minimum focal length of the straight copy, of the image's [1]: rims of very wide lenses are
-cut."""
-_MAX_SEGMENTS: Final = 24
-"""Maximum segments [1]: a view shows up to twelve markings, some of them in pieces."""
 ORIENTATIONS: Final = 6
 """Orientations of the maps of distances [1]: 30 degrees apart."""
 
@@ -101,11 +49,11 @@ class PaintMap:
     """
 
     size: tuple[int, int]
-    area: NDArray[np.bool_]
+    area: Flags
     points: Floats
     origins: Floats
     segments: Floats
-    distances: NDArray[np.float32]
+    distances: Singles
     nearest: NDArray[np.int32]
     lens: Camera
     focal: float
@@ -125,6 +73,7 @@ def find_paint(
     Raises:
         InputError: the image has no color or shows no grass.
     """
+    widths = (1280, 1920)  # far lines of a wide view stay one pixel wide
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise InputError(
             where,
@@ -132,7 +81,7 @@ def find_paint(
             found=f"{picture.dtype} of shape {picture.shape}",
             todo="Give a color image: the pitch is found by its color.",
         )
-    width = int(np.clip(picture.shape[1], _WIDTHS[0], _WIDTHS[1]))
+    width = int(np.clip(picture.shape[1], widths[0], widths[1]))
     scale = width / picture.shape[1]
     size = (width, max(1, round(picture.shape[0] * scale)))
     small = np.asarray(
@@ -161,38 +110,36 @@ class Ridges:
     normals: Floats
 
 
-def thin_ridges(strength: NDArray[np.float32], normal: Floats) -> Ridges:
+def thin_ridges(strength: Singles, normal: Floats) -> Ridges:
     """Return the ridges of an image that are no noise.
 
-    Args:
-        strength: (height, width) contrast of ridges one pixel wide, 0 elsewhere.
-        normal: (height, width) angle of the ridge's normal in [0, pi) [rad].
+    The strength (height, width) is the contrast of ridges one pixel wide, 0 elsewhere; normals
+    (height, width) are angles in [0, pi) [rad].
     """
+    contrast = (4.0, 8.0)  # of CIE L: faded paint has 10 to 20, thin far lines and fog 4 to 8
     ridges = strength[strength > 0.0]
     noise = float(np.median(ridges)) if len(ridges) else 0.0
-    thin = (strength > np.clip(_ABOVE_NOISE * noise, _CONTRAST[0], _CONTRAST[1])).astype(np.uint8)
+    # Nearly all ridges are noise of the grass, of 0.5 to 4.
+    thin = (strength > np.clip(6.0 * noise, contrast[0], contrast[1])).astype(np.uint8)
     joined = cv2.dilate(thin, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-    large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= _MIN_EXTENT
+    # Shorter ones are noise of the grass.
+    large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= 20
     large[0] = False
     thin &= large[labels].astype(np.uint8)
-    around, share = _CLUTTER
+    # Trees, nets, letters and people have more ridges than the crossing of two lines.
+    around, share = (41, 0.12)
     crowded = cv2.boxFilter(thin, cv2.CV_32F, (around, around)) > share
     y, x = np.nonzero((thin > 0) & ~crowded)
     return Ridges(np.stack([x, y], axis=-1).astype(np.float64), normal[y, x])
 
 
 def guess_lens(bend: float, image_size: tuple[int, int]) -> Camera:
-    """Return a lens with a focal length of half the image's width.
+    """Return a lens with a focal length of half the width of an image of a width and height [px].
 
-    Args:
-        bend: lambda of the division model, r_straight = r / (1 + lambda r^2), with radii in halves
-            of the width [1].
-        image_size: width, height [px].
-
-    Note:
-        Fitzgibbon 2001, "Simultaneous linear estimation of multiple view geometry and lens
-        distortion".
+    The bend is lambda of the division model, r_straight = r / (1 + lambda r^2), with radii in
+    halves of the width [1] (Fitzgibbon 2001, "Simultaneous linear estimation of multiple view
+    geometry and lens distortion").
     """
     half = 0.5 * image_size[0]
     radius = np.linspace(0.05, 1.1 * np.hypot(image_size[0], image_size[1]) / image_size[0], 40)
@@ -208,16 +155,10 @@ def guess_lens(bend: float, image_size: tuple[int, int]) -> Camera:
     )
 
 
-def straighten_paint(
-    ridges: Ridges, area: NDArray[np.bool_], lens: Camera, scale: float
-) -> PaintMap:
+def straighten_paint(ridges: Ridges, area: Flags, lens: Camera, scale: float) -> PaintMap:
     """Return the paint of an image in a copy without its distortion.
 
-    Args:
-        ridges: of the reduced image.
-        area: (height, width) whether the pixel belongs to the pitch, in the reduced image.
-        lens: of the image.
-        scale: of the reduced image to the image [1].
+    The ridges and the area (height, width) are of a reduced image, at a scale [1] of the image.
     """
     height, width = area.shape
     flat, origins, focal = _flatten(ridges, lens, scale, (width, height))
@@ -228,7 +169,8 @@ def straighten_paint(
     maps = [bent[:, axis].reshape(height, width).astype(np.float32) for axis in (0, 1)]
     inside = cv2.remap(area.astype(np.uint8), maps[0], maps[1], cv2.INTER_NEAREST) > 0
     distances, nearest = _map_distances(flat, (width, height))
-    segments = _find_segments(flat, float(np.hypot(width, height)), _MAX_SEGMENTS)
+    # A view shows up to twelve markings, some of them in pieces.
+    segments = _find_segments(flat, float(np.hypot(width, height)), 24)
     return PaintMap(
         (width, height),
         np.asarray(inside),
@@ -245,14 +187,7 @@ def straighten_paint(
 def _flatten(
     ridges: Ridges, lens: Camera, scale: float, size: tuple[int, int]
 ) -> tuple[Ridges, Floats, float]:
-    """Return ridges in the straight copy, their pixels (m, 2) in the image, its focal length.
-
-    Args:
-        ridges: of the reduced image.
-        lens: of the image.
-        scale: of the reduced image to the image [1].
-        size: width, height of the reduced image and of the straight copy [px].
-    """
+    """Return ridges in the straight copy, their pixels (m, 2) in the image, its focal length."""
     width, height = size
     middle = 0.5 * np.array([width - 1, height - 1])
     origins = (ridges.points + 0.5) / scale - 0.5
@@ -260,7 +195,8 @@ def _flatten(
     reach = float(np.abs(lens.normalize(rim)[:, 0]).max())
     reduced = float(lens.focal[0]) * scale
     focal = 0.5 * width / reach if np.isfinite(reach) else 0.0
-    focal = float(np.clip(focal, _MIN_STRAIGHT_FOCAL * reduced, reduced))
+    # Rims of very wide lenses are cut.
+    focal = float(np.clip(focal, 0.35 * reduced, reduced))
     # A second place tells how the direction of a ridge turns.
     along = np.stack([-np.sin(ridges.normals), np.cos(ridges.normals)], axis=-1)
     flat, stepped = (
@@ -275,24 +211,26 @@ def _flatten(
 
 def _find_lenses(ridges: Ridges, image_size: tuple[int, int], scale: float) -> tuple[Camera, ...]:
     """Return lenses that make the most paint straight; one without distortion if it does."""
+    # Displacements of the left and right rim: from a long lens to an action camera.
+    bends = (0.0, -0.03, -0.06, -0.09, -0.12, -0.15, -0.18, -0.22, -0.26)
     size = (round(image_size[0] * scale), max(1, round(image_size[1] * scale)))
     straight = []
-    for bend in _BENDS:
+    for bend in bends:
         flat = _flatten(ridges, guess_lens(bend, image_size), scale, size)[0]
-        segments = _find_segments(flat, float(np.hypot(size[0], size[1])), _COMPARED_SEGMENTS)
+        segments = _find_segments(flat, float(np.hypot(size[0], size[1])), 8)
         straight.append(sum(count for count, _ in segments))
     straightest = guess_lens(0.0, image_size)
-    if straight[0] >= _BEND_GAIN * max(straight):
+    # No bend is likely if it makes nearly as much paint straight as the best one.
+    if straight[0] >= 0.9 * max(straight):
         return (straightest,)
-    best = _BENDS[int(np.argmax(straight))]
-    bent = tuple(guess_lens(share * best, image_size) for share in _OTHER_BENDS)
+    best = bends[int(np.argmax(straight))]
+    # A single long line prefers a bend that is too large.
+    bent = tuple(guess_lens(share * best, image_size) for share in (1.0, 0.8, 0.65))
     # A lens that bends a circle straight gains paint too.
-    return (straightest, *bent) if straight[0] >= _BEND_DOUBT * max(straight) else bent
+    return (straightest, *bent) if straight[0] >= 0.6 * max(straight) else bent
 
 
-def _map_distances(
-    ridges: Ridges, size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _map_distances(ridges: Ridges, size: tuple[int, int]) -> tuple[Singles, NDArray[np.int32]]:
     """Return the distances and the nearest points of `PaintMap`."""
     width, height = size
     distances = np.full((ORIENTATIONS, height, width), np.inf, np.float32)
@@ -314,18 +252,15 @@ def _map_distances(
     return distances, nearest
 
 
-def _find_grass(picture: Image, where: str) -> NDArray[np.bool_]:
-    """Return the mask (height, width) of pixels with the hue of the grass.
-
-    Raises:
-        InputError: there is no grass.
-    """
+def _find_grass(picture: Image, where: str) -> Flags:
+    """Return the mask (height, width) of pixels with the hue of the grass."""
+    hues = (22, 95)  # yellow-green of dry grass to blue-green of flood light
     hue, saturation, value = np.moveaxis(cv2.cvtColor(picture, cv2.COLOR_RGB2HSV), -1, 0)
-    green = (hue > _GREEN[0]) & (hue < _GREEN[1])
-    green &= (saturation > _MIN_SATURATION) & (value > _MIN_VALUE)
+    green = (hue > hues[0]) & (hue < hues[1])
+    green &= (saturation > 25) & (value > 25)
     lower = green.copy()
     lower[: len(lower) // 4] = False
-    if np.count_nonzero(lower) < _MIN_GRASS * lower.size:
+    if np.count_nonzero(lower) < 0.02 * lower.size:
         raise InputError(
             where,
             expected="grass in the lower three quarters of the image",
@@ -334,17 +269,19 @@ def _find_grass(picture: Image, where: str) -> NDArray[np.bool_]:
         )
     counts = np.bincount(hue[lower], minlength=180).astype(np.float64)
     counts = np.convolve(counts, np.ones(7), mode="same")
-    rare = np.flatnonzero(counts < _MIN_HUE_SHARE * counts.max())
+    # Mowing stripes and shadows differ by up to 25 hues.
+    rare = np.flatnonzero(counts < 0.1 * counts.max())
     peak = int(counts.argmax())
-    first = max(_GREEN[0], int(rare[rare < peak].max(initial=-1)) + 1)
-    last = min(_GREEN[1], int(rare[rare > peak].min(initial=180)) - 1)
+    first = max(hues[0], int(rare[rare < peak].max(initial=-1)) + 1)
+    last = min(hues[1], int(rare[rare > peak].min(initial=180)) - 1)
     return np.asarray(green & (hue >= first) & (hue <= last))
 
 
-def _fill_area(grass: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _fill_area(grass: Flags) -> Flags:
     """Return the largest area (height, width) of grass, without the holes of people and paint."""
+    gap = 31  # people and paint in the grass [px]
     mask = cv2.morphologyEx(grass.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSING, _CLOSING))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (gap, gap))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     if len(stats) < 2:
@@ -359,23 +296,20 @@ def _fill_area(grass: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(area | inside[labels])
 
 
-def _find_ridges(
-    picture: Image, grass: NDArray[np.bool_], area: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], Floats]:
+def _find_ridges(picture: Image, grass: Flags, area: Flags) -> tuple[Singles, Floats]:
     """Return contrasts (height, width) of ridges one pixel wide, and angles of normals [rad]."""
-    lightness = _smooth_lightness(picture)
+    directions = 12  # 15 degrees apart
+    lightness = smooth_lightness(picture)
     green = np.asarray(cv2.GaussianBlur(grass.astype(np.float32), (0, 0), 1.5), dtype=np.float32)
     best = np.zeros(lightness.shape, np.float32)
     angle = np.zeros(lightness.shape)
-    for theta in np.arange(_DIRECTIONS) * (np.pi / _DIRECTIONS):
+    for theta in np.arange(directions) * (np.pi / directions):
         normal = np.array([np.cos(theta), np.sin(theta)])
         along = np.array([-normal[1], normal[0]])
-        for half in _HALF_WIDTHS:
+        for half in (3.0, 5.0, 8.0):
             left, right = (_shift(lightness, way * half * normal) for way in (1.0, -1.0))
             one, other = (_shift(green, way * (half + 1.0) * normal) for way in (1.0, -1.0))
-            contrast: NDArray[np.float32] = np.asarray(
-                lightness - np.maximum(left, right), np.float32
-            )
+            contrast: Singles = np.asarray(lightness - np.maximum(left, right), np.float32)
             contrast[np.minimum(one, other) < 0.5] = 0.0
             contrast += _shift(contrast, 3.0 * along) + _shift(contrast, -3.0 * along)
             contrast /= 3.0
@@ -396,13 +330,13 @@ def _find_ridges(
     return np.where(highest, best, np.float32(0.0)), angle
 
 
-def _smooth_lightness(picture: Image) -> NDArray[np.float32]:
+def smooth_lightness(picture: Image) -> Singles:
     """Return the blurred CIE L (height, width) of an RGB image, in 0 to 255."""
     lightness = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[..., 0], dtype=np.float32)
     return np.asarray(cv2.GaussianBlur(lightness, (0, 0), 0.8), dtype=np.float32)
 
 
-def _shift(values: NDArray[np.float32], by: Floats) -> NDArray[np.float32]:
+def _shift(values: Singles, by: Floats) -> Singles:
     """Return the values (height, width) at a displacement (2,) of every pixel [px]."""
     height, width = values.shape
     matrix = np.array([[1.0, 0.0, by[0]], [0.0, 1.0, by[1]]], np.float32)
@@ -419,24 +353,20 @@ def _angle_between(angles: Floats, other: float) -> Floats:
 
 
 def _find_segments(ridges: Ridges, diagonal: float, most: int) -> list[tuple[int, Floats]]:
-    """Return pixels of paint and ends (2, 2) [px] of segments, the one with the most paint first.
-
-    Args:
-        ridges: pixels and normals.
-        diagonal: of the image [px].
-        most: maximum segments [1].
-    """
+    """Return pixels of paint and ends (2, 2) [px] of segments, those with the most paint first."""
+    vote_spread = 24  # 12 degrees
+    count = 360
     points, angles = ridges.points, ridges.normals
-    thetas, columns = np.arange(_ANGLES) * (np.pi / _ANGLES), int(diagonal) + 2
+    thetas, columns = np.arange(count) * (np.pi / count), int(diagonal) + 2
     segments: list[tuple[int, Floats]] = []
     for _ in range(3 * most):
         if len(points) < _MIN_LENGTH or len(segments) >= most:
             break
-        own = np.round(angles / np.pi * _ANGLES).astype(np.int64)[:, None]
-        index = (own + np.arange(-_VOTE_SPREAD, _VOTE_SPREAD + 1)) % _ANGLES
+        own = np.round(angles / np.pi * count).astype(np.int64)[:, None]
+        index = (own + np.arange(-vote_spread, vote_spread + 1)) % count
         offset = points[:, :1] * np.cos(thetas[index]) + points[:, 1:] * np.sin(thetas[index])
         bins = index * columns + (0.5 * (offset + diagonal)).astype(np.int64)
-        votes = np.bincount(bins.ravel(), minlength=_ANGLES * columns).reshape(_ANGLES, columns)
+        votes = np.bincount(bins.ravel(), minlength=count * columns).reshape(count, columns)
         votes = votes + np.roll(votes, 1, axis=1)
         row, column = np.unravel_index(int(votes.argmax()), votes.shape)
         if votes[row, column] < _MIN_LENGTH * _MIN_FILL:
@@ -457,7 +387,7 @@ def _find_segments(ridges: Ridges, diagonal: float, most: int) -> list[tuple[int
 
 def _fit_line(
     points: Floats, angles: Floats, across: Floats, offset: float
-) -> tuple[NDArray[np.bool_], Floats, float]:
+) -> tuple[Flags, Floats, float]:
     """Return the mask of a line's pixels, its normal (2,) and its offset [px]."""
     near = np.zeros(len(points), np.bool_)
     for tolerance in (
@@ -483,7 +413,8 @@ def _split(points: Floats, across: Floats, offset: float) -> list[tuple[int, Flo
     places = np.sort(points @ along)
     if not len(places):
         return []
-    gaps = np.flatnonzero(np.diff(places) > _MAX_GAP)
+    # A player in front of the line.
+    gaps = np.flatnonzero(np.diff(places) > 60.0)
     starts, stops = np.append(0, gaps + 1), np.append(gaps, len(places) - 1)
     segments = []
     for start, stop in zip(starts, stops, strict=True):
@@ -492,109 +423,3 @@ def _split(points: Floats, across: Floats, offset: float) -> list[tuple[int, Flo
         if length > _MIN_LENGTH and count > _MIN_FILL * length:
             segments.append((count, across * offset + np.outer(places[[start, stop]], along)))
     return segments
-
-
-_TRACE_REACH: Final = 0.004
-"""Largest distance of thin paint from its projection, in image widths [1]."""
-_TRACE_SPACING: Final = 8.0
-"""Distance of neighboring cross sections [px]: errors of paint are correlated over as much."""
-_TRACE_STEP: Final = 0.5
-"""Step along a cross section [px]."""
-_TRACE_CONTRAST: Final = 6.0
-"""Minimum brightness of thin paint above both sides [levels of 255], as of painted lines."""
-_TRACE_TOLERANCE: Final = 1.0
-"""Largest distance of a ridge from the curve of its marking [px]."""
-_TRACE_SHARE: Final = 0.4
-"""Minimum share of the cross sections with the ridge on the curve [1], as of painted lines."""
-_TRACE_MIN: Final = 15
-"""Minimum number of such cross sections [1]: fewer lie on a curve by chance."""
-_TRACE_RIVAL: Final = 0.75
-"""Maximum number of cross sections of any other curve, of those of the best one [1]."""
-_TRACE_TRIALS: Final = 400
-"""Curves through three random ridges to try [1]."""
-
-
-def trace_marking(picture: Image, pixels: Floats) -> Floats:
-    """Return pixels (n, 2) on thin paint along a projected marking; none if there is no clear one.
-
-    The paint of a far line is thinner than a pixel and a few pixels away from its projection, among
-    letters, boards and people. The ridge that follows one smooth curve is the paint.
-
-    Args:
-        picture: (height, width, 3) RGB.
-        pixels: (m, 2) projected points along the marking in order [px]; NaN where not visible.
-    """
-    height, width = picture.shape[:2]
-    inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
-    pixels = pixels[inside]
-    if len(pixels) < 2:
-        return np.zeros((0, 2))
-    lengths = np.append(0.0, np.linalg.norm(np.diff(pixels, axis=0), axis=1).cumsum())
-    places = np.arange(0.0, lengths[-1], _TRACE_SPACING)
-    if len(places) < _TRACE_MIN:
-        return np.zeros((0, 2))
-    at = np.stack([np.interp(places, lengths, pixels[:, axis]) for axis in (0, 1)], axis=1)
-    along = np.gradient(at, axis=0)
-    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    row, ridge = _find_section_ridges(picture, at, normals)
-    if len(np.unique(row)) < _TRACE_MIN:
-        return np.zeros((0, 2))
-    share = row / max(1, len(places) - 1)
-    on = _follow_curve(row, share, ridge)
-    if len(np.unique(row[on])) < max(_TRACE_MIN, _TRACE_SHARE * len(places)):
-        return np.zeros((0, 2))
-    others = ~np.isin(row, row[on]) | (np.abs(ridge - _curve(share[on], ridge[on], share)) > 3.0)
-    rival = _follow_curve(row[others], share[others], ridge[others])
-    if len(np.unique(row[others][rival])) > _TRACE_RIVAL * len(np.unique(row[on])):
-        return np.zeros((0, 2))
-    return np.asarray(at[row[on]] + ridge[on, None] * normals[row[on]])
-
-
-def _find_section_ridges(picture: Image, at: Floats, normals: Floats) -> tuple[Integers, Floats]:
-    """Return the cross sections (k,) of ridges, and the ridges' offsets (k,) in them [px].
-
-    Args:
-        picture: (height, width, 3) RGB.
-        at: (n, 2) middles of the cross sections [px].
-        normals: (n, 2) their directions.
-    """
-    reach = _TRACE_REACH * picture.shape[1]
-    offsets = np.arange(-reach, reach + _TRACE_STEP, _TRACE_STEP)
-    pixels = (at[:, None] + offsets[:, None] * normals[:, None]).astype(np.float32)
-    profiles = cv2.remap(
-        _smooth_lightness(picture), pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR
-    )
-    side = round(2.0 / _TRACE_STEP)
-    flanks = np.maximum(profiles[:, : -2 * side], profiles[:, 2 * side :])
-    contrast = profiles[:, side:-side] - flanks
-    peak = contrast >= _TRACE_CONTRAST
-    peak[:, 1:] &= contrast[:, 1:] >= contrast[:, :-1]
-    peak[:, :-1] &= contrast[:, :-1] > contrast[:, 1:]
-    row, column = np.nonzero(peak)
-    return row, offsets[side:-side][column]
-
-
-def _follow_curve(row: Integers, share: Floats, ridge: Floats) -> NDArray[np.bool_]:
-    """Return which ridges (n,) lie on the parabola that passes most cross sections' ridges."""
-    best = np.zeros(len(row), np.bool_)
-    if len(np.unique(row)) < 3:
-        return best
-    rng = np.random.default_rng(0)
-    for _ in range(_TRACE_TRIALS):
-        chosen = rng.choice(len(row), 3, replace=False)
-        if np.ptp(share[chosen]) < 0.3 or len(np.unique(row[chosen])) < 3:
-            continue
-        on = np.abs(ridge - _curve(share[chosen], ridge[chosen], share)) < _TRACE_TOLERANCE
-        if len(np.unique(row[on])) > len(np.unique(row[best])):
-            best = on
-    for _ in range(3 if best.any() else 0):
-        best = np.abs(ridge - _curve(share[best], ridge[best], share)) < _TRACE_TOLERANCE
-    return best
-
-
-def _curve(share: Floats, ridge: Floats, at: Floats) -> Floats:
-    """Return the parabola through given places, at other places."""
-    powers = np.arange(3)
-    fitted = np.linalg.lstsq(share[:, None] ** powers, ridge, rcond=None)[0]
-    return np.asarray(at[:, None] ** powers @ fitted)

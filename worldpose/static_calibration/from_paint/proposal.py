@@ -10,14 +10,13 @@ The pitch looks the same after half a turn. The side on which the camera stands 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_contracts.arrays import Floats, Image
+from data_contracts.arrays import Image
 from data_contracts.cameras import LensCalibration
 from data_contracts.match import Side
 from data_contracts.static_calibration import ClickedMarkings, DrawnMarking
@@ -26,69 +25,39 @@ from worldpose.geometry.cameras import Camera
 from worldpose.geometry.rigid import Rigid
 from worldpose.pitch.template import PitchTemplate
 from worldpose.static_calibration.calibration import calibrate_camera
-from worldpose.static_calibration.camera_candidates import (
+from worldpose.static_calibration.from_paint.candidates import (
     INDEPENDENT,
     Candidates,
     SeenMarkings,
     explained_share,
-    join_candidates,
-    name_triples,
     project_markings,
-    refine_candidates,
-    score_with_prior,
     stand_on,
-    thin_out,
 )
-from worldpose.static_calibration.circle_candidates import name_circles
+from worldpose.static_calibration.from_paint.paint import PaintMap, find_paint
+from worldpose.static_calibration.from_paint.ranking import (
+    FINE,
+    MIN_MARGIN,
+    ON_PAINT,
+    rank_under_lenses,
+    runner_up,
+    share_on_paint,
+)
+from worldpose.static_calibration.from_paint.thin_paint import trace_marking
 from worldpose.static_calibration.ground_error import points_in_view
 from worldpose.static_calibration.line_samples import LineSamples, sample_markings
-from worldpose.static_calibration.paint_segments import PaintMap, find_paint, trace_marking
 from worldpose.static_calibration.parameters import drop_k3
 from worldpose.static_calibration.report import StaticCalibration
 from worldpose.static_calibration.settings import CameraPrior, StaticCalibrationSettings
 from worldpose.static_calibration.sides import turn_camera, turn_name
 
-_FOCALS: Final = np.geomspace(0.45, 5.0, 13)  # in image widths
-_ROLLS: Final = ((0.0,), (-0.14, -0.07, 0.07, 0.14))
-"""Rolls to try, and more while nothing is clear [rad]: cameras on masts hang 4 to 8 degrees off."""
 PROPOSED: Final = "markings proposed from the image"
 """How the first decision of a camera without clicks begins."""
-MIN_MARGIN: Final = 25.0
-"""Minimum margin without a click [1]; below, more rolls and lenses are tried."""
 MIN_FOUND: Final = 0.6
 """Minimum share of its markings on paint [1]."""
 MIN_EXPLAINED: Final = 0.25
 """Minimum share of the straight paint on its markings [1]: a small part of the pitch may fit any
 two lines."""
-_CLEAR_SHARES: Final = (0.75, 0.6)
-"""Both shares; a clear camera that reaches neither of these does not end the search for rolls, and
-one that does not reach the first does not end that for lenses [1]."""
-_MAX_DISPLACEMENT: Final = 0.01
-"""Maximum median displacement of markings by the calibration, in image widths [1]."""
 _TO_CLICK: Final = "Click four or more named points of this camera, such as corners of areas."
-_COARSE: Final = (6.0, 8.0)
-_MEDIUM: Final = (2.5, 6.0)
-_FINE: Final = (1.0, 2.0)
-"""Spacing of samples [m], and standard deviation of their distance from paint [px]: for all
-candidates, for good ones, and for refined ones."""
-_MAX_SCORED: Final = 8000
-"""Candidates to judge on closer samples [1]."""
-_REFINED: Final = 60
-"""Candidates to refine [1]."""
-_RADII: Final = (25.0, 12.0, 6.0, 5.0)
-"""Distances within which paint attracts a marking, one stage after another [px]."""
-_POLISHED: Final = (10, (15.0, 8.0, 5.0, 5.0))
-"""Best different candidates to refine once more [1], with k1 free from the start, and distances of
-the stages [px]."""
-_SAME_CAMERA: Final = 8.0
-"""Median displacement of the markings below which two cameras are the same proposal [px]."""
-_MAX_DRAWN: Final = 40
-"""Maximum pixels to draw along a marking [1]."""
-_MIN_DRAWN_SHARE: Final = 0.4
-"""Minimum share on paint of a marking that the calibration uses [1]: thin far lines are found in
-pieces."""
-_ON_PAINT: Final = 4.0
-"""Maximum distance of a marking from its paint [px]."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +105,6 @@ class Proposal:
 
     def require_clear(self, where: str, pitch: PitchTemplate) -> None:
         """Refuse a proposal that may not be used without a click.
-
-        Args:
-            where: file or camera, for messages.
-            pitch: the template, whose points the message names.
 
         Raises:
             InputError: the image shows too little, or other cameras explain it nearly as well; the
@@ -236,7 +201,7 @@ def propose_camera(
         search over names is exhaustive.
     """
     height, width = picture.shape[:2]
-    given = None if lens is None else _lens_camera(lens, (width, height))
+    given = None if lens is None else Camera.from_lens(lens, (width, height))
     paints = find_paint(picture, given, where)
     found = propose_from_paint(paints, pitch, side=side, prior=prior, lens=given)
     if found is None:
@@ -259,18 +224,14 @@ def propose_from_paint(
 ) -> Proposal | None:
     """Return the camera that explains the paint of an image best, or None.
 
-    Args:
-        paints: paint under every lens that the image may have, the likely one first.
-        pitch: the stadium's template.
-        side: where the camera stands.
-        prior: heights, distances, focal lengths; the defaults if None.
-        lens: the lens if it is known.
+    The paint is that under every lens that the image may have, the likely one first; `lens` is the
+    known one. The camera stands on a side of the pitch.
     """
-    found = _rank_under_lenses(paints, pitch, prior or CameraPrior(), lens)
+    found = rank_under_lenses(paints, pitch, prior or CameraPrior(), lens)
     if found is None:
         return None
     paint, ranked, scores = found
-    samples, best = sample_markings(pitch, _FINE[0]), stand_on(ranked[:1], side)
+    samples, best = sample_markings(pitch, FINE[0]), stand_on(ranked[:1], side)
     seen = project_markings(paint, samples, best)
     markings, drawn = _measure_support(paint, samples, seen)
     return Proposal(
@@ -278,8 +239,8 @@ def propose_from_paint(
         drawn,
         markings,
         float(scores[0]),
-        float(scores[0]) - _runner_up(scores),
-        _share_on_paint(seen),
+        float(scores[0]) - runner_up(scores),
+        share_on_paint(seen),
         explained_share(paint, seen),
     )
 
@@ -324,15 +285,7 @@ def calibrate_proposal(
     where: str = "image",
     lens: LensCalibration | None = None,
 ) -> StaticCalibration:
-    """Return the camera of a clear proposal, its covariance and its report.
-
-    Args:
-        pitch: the stadium's template.
-        proposal: found in the image.
-        picture: (height, width, 3) RGB.
-        settings: noise, prior and thresholds; the defaults if None.
-        where: file or camera, for messages.
-        lens: a lens that was calibrated before; None = not known.
+    """Return the camera of a clear proposal in an RGB image, its covariance and its report.
 
     Raises:
         InputError: the proposal is not clear, or the calibration disagrees with it.
@@ -370,12 +323,12 @@ def calibrate_proposal(
         )
     surfaced = pitch if lines is None else pitch.with_surface(lines.estimate.surface)
     pixels, calibrated_pixels = (
-        camera.project(ground.sample_lines(_FINE[0]).points_world)
+        camera.project(ground.sample_lines(FINE[0]).points_world)
         for camera, ground in ((proposal.camera, pitch), (calibration.estimate.camera, surfaced))
     )
     inside = ((pixels >= 0.0) & (pixels <= [width - 1.0, height - 1.0])).all(axis=1)
     moved = float(np.median(np.linalg.norm(pixels - calibrated_pixels, axis=1)[inside]))
-    if not moved < _MAX_DISPLACEMENT * width:
+    if not moved < 0.01 * width:
         raise InputError(
             where,
             expected="the calibration close to the proposal of the image",
@@ -415,141 +368,6 @@ def _trace_thin_markings(
     return tuple(found)
 
 
-def _rank_under_lenses(
-    paints: Iterable[PaintMap], pitch: PitchTemplate, prior: CameraPrior, lens: Camera | None
-) -> tuple[PaintMap, Candidates, Floats] | None:
-    """Return the paint under the lens that explains it best, its cameras and their scores."""
-    best: tuple[PaintMap, Candidates, Floats] | None = None
-    samples = sample_markings(pitch, _FINE[0])
-    for paint in paints:
-        focals = _FOCALS if lens is None else np.array([paint.focal / paint.size[0]])
-        ranked, scores = rank_cameras(paint, pitch, prior, focals)
-        if len(ranked) and (best is None or scores[0] > best[2][0]):
-            best = (paint, ranked, scores)
-        # Under a wrong lens a camera may be clear though a third of its markings misses the paint.
-        if best is not None:
-            found, _ = _shares_if_clear(best[0], samples, best[1], best[2])
-            if found >= _CLEAR_SHARES[0]:
-                break
-    return best
-
-
-def _shares_if_clear(
-    paint: PaintMap, samples: LineSamples, ranked: Candidates, scores: Floats
-) -> tuple[float, float]:
-    """Return the first camera's shares of markings on paint, and of paint on markings [1].
-
-    Both are 0 if another camera explains the paint nearly as well.
-
-    Args:
-        paint: paint of the image.
-        samples: of the markings.
-        ranked: different cameras, the best first.
-        scores: of these (k,).
-    """
-    if not len(scores) or scores[0] - _runner_up(scores) < MIN_MARGIN:
-        return 0.0, 0.0
-    seen = project_markings(paint, samples, ranked[:1])
-    return _share_on_paint(seen), explained_share(paint, seen)
-
-
-def _share_on_paint(seen: SeenMarkings) -> float:
-    """Return the share of the first camera's markings that lies on paint [1]."""
-    lengths, near = seen.lengths[0], seen.distances[0] < _ON_PAINT
-    return float((lengths * near).sum() / max(lengths.sum(), 1e-9))
-
-
-def _runner_up(scores: Floats) -> float:
-    """Return the score of the best other camera, or that of none [1]."""
-    return max(0.0, float(scores[1])) if len(scores) > 1 else 0.0
-
-
-def rank_cameras(
-    paint: PaintMap, pitch: PitchTemplate, prior: CameraPrior, focals: Floats = _FOCALS
-) -> tuple[Candidates, Floats]:
-    """Return different cameras, the best first, all on the near side, and their scores (k,).
-
-    Args:
-        paint: paint of the image.
-        pitch: the template.
-        prior: heights, distances, focal lengths.
-        focals: focal lengths to try, in image widths [1]; a single one is kept.
-    """
-    best, scores = _rank_rolled(paint, pitch, prior, focals, _ROLLS[0])
-    samples = sample_markings(pitch, _FINE[0])
-    shares = _shares_if_clear(paint, samples, best, scores)
-    if np.greater_equal(shares, _CLEAR_SHARES).any():
-        return best, scores
-    rolled, others = _rank_rolled(paint, pitch, prior, focals, _ROLLS[1])
-    return _rank(paint, samples, join_candidates(best, rolled), np.append(scores, others))
-
-
-def _rank_rolled(
-    paint: PaintMap,
-    pitch: PitchTemplate,
-    prior: CameraPrior,
-    focals: Floats,
-    rolls: Sequence[float],
-) -> tuple[Candidates, Floats]:
-    """Return different cameras near some rolls, the best first, and their scores (k,)."""
-    found = join_candidates(*(name_triples(paint, pitch, focals, roll) for roll in rolls))
-    circles = join_candidates(*(name_circles(paint, pitch, focals, roll) for roll in rolls))
-    if not len(found) + len(circles):
-        return found, np.zeros(0)
-    if len(found) > _MAX_SCORED:
-        found = _keep_best(paint, sample_markings(pitch, _COARSE[0]), found, prior, _COARSE[1])
-    samples = sample_markings(pitch, _MEDIUM[0])
-    # The vote for circles is coarse: bins of 8 to 15 %.
-    near = refine_candidates(paint, samples, circles, _RADII[:1], (len(focals) > 1, False))
-    # Apart: circles are refined already, and would crowd out better ones of three lines.
-    found, near = (_keep_best(paint, samples, each, prior, _MEDIUM[1]) for each in (found, near))
-    found, near = (thin_out(each[: 10 * _REFINED], _REFINED) for each in (found, near))
-    found = join_candidates(found, near)
-    samples = sample_markings(pitch, _FINE[0])
-    for count, radii, bends in ((len(found), _RADII, False), (*_POLISHED, True)):
-        free = (len(focals) > 1, bends and len(focals) > 1)
-        found = refine_candidates(paint, samples, found[:count], radii, free)
-        scores = score_with_prior(paint, samples, found, prior, _FINE[1])
-        found, scores = _rank(paint, samples, found, scores)
-    return found, scores
-
-
-def _keep_best(
-    paint: PaintMap, samples: LineSamples, found: Candidates, prior: CameraPrior, spread: float
-) -> Candidates:
-    """Return the good candidates, the best first."""
-    scores = score_with_prior(paint, samples, found, prior, spread)
-    return found[np.argsort(-scores, kind="stable")[:_MAX_SCORED]]
-
-
-def _rank(
-    paint: PaintMap, samples: LineSamples, found: Candidates, scores: Floats
-) -> tuple[Candidates, Floats]:
-    """Return different cameras on the near side, the best first, and their scores (k,)."""
-    order = np.argsort(-scores, kind="stable")
-    # Behind a goal refinement moves cameras across the long axis: half a turn makes them equal.
-    found, scores = stand_on(found[order], "near"), scores[order]
-    different = _distinct(paint, samples, found)
-    return found[different], scores[different]
-
-
-def _distinct(paint: PaintMap, samples: LineSamples, candidates: Candidates) -> NDArray[np.int64]:
-    """Return indices of the candidates whose markings lie elsewhere than those of all before."""
-    seen = project_markings(paint, samples, candidates)
-    visible = seen.lengths > 0.0
-    kept: list[int] = []
-    for index in range(len(candidates)):
-        for before in kept:
-            either = visible[index] & visible[before]
-            moved = np.linalg.norm(seen.pixels[index] - seen.pixels[before], axis=-1)[either]
-            shared = np.count_nonzero(either) > 0.8 * np.count_nonzero(visible[before])
-            if shared and len(moved) and np.median(moved) < _SAME_CAMERA:
-                break
-        else:
-            kept.append(index)
-    return np.array(kept, dtype=np.int64)
-
-
 def _measure_support(
     paint: PaintMap, samples: LineSamples, seen: SeenMarkings
 ) -> tuple[tuple[MarkingSupport, ...], ClickedMarkings]:
@@ -558,30 +376,21 @@ def _measure_support(
     for index, name in enumerate(samples.names):
         mine = (samples.marking == index) & (seen.lengths[0] > 0.0)
         length = float(seen.lengths[0, mine].sum())
-        if length < _ON_PAINT:
+        if length < ON_PAINT:
             continue
-        on = mine & (seen.distances[0] < _ON_PAINT)
+        on = mine & (seen.distances[0] < ON_PAINT)
         found = float(seen.lengths[0, on].sum()) / length
         support.append(MarkingSupport(name, length, found))
-        if found * length < INDEPENDENT * paint.size[0] or found < _MIN_DRAWN_SHARE:
+        # Thin far lines are found in pieces.
+        if found * length < INDEPENDENT * paint.size[0] or found < 0.4:
             continue
         nearest, place = np.unique(seen.nearest[0, on], return_index=True)
-        chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), _MAX_DRAWN)).astype(np.int64)
+        chosen = np.linspace(0, len(nearest) - 1, min(len(nearest), 40)).astype(np.int64)
         chosen = chosen[np.argsort(place[chosen])]  # in order along the marking
         pixels = paint.origins[nearest[chosen]]
         drawn.append(DrawnMarking(name=name, xy=tuple((x, y) for x, y in pixels.tolist())))
     support.sort(key=lambda each: -each.visible_px)
     return tuple(support), ClickedMarkings(drawn=tuple(drawn))
-
-
-def _lens_camera(lens: LensCalibration, size: tuple[int, int]) -> Camera:
-    return Camera(
-        focal=np.array([lens.focal_px, lens.focal_px]),
-        principal_point=np.array(lens.principal_point_px),
-        distortion=np.array(lens.distortion),
-        cam_from_world=Rigid(np.eye(3), np.zeros(3)),
-        image_size=np.array(size),
-    )
 
 
 def _to_camera(candidates: Candidates, paint: PaintMap) -> Camera:

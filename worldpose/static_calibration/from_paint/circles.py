@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from data_contracts.arrays import Floats
 from worldpose.pitch.template import PitchTemplate
-from worldpose.static_calibration.camera_candidates import (
+from worldpose.static_calibration.from_paint.candidates import (
     SEGMENTS,
     TILTS,
     Candidates,
@@ -25,23 +25,7 @@ from worldpose.static_calibration.camera_candidates import (
     straight_lines,
     turn_about_axis,
 )
-from worldpose.static_calibration.paint_segments import PaintMap
-
-_MIN_ARC: Final = 0.01
-"""Minimum share of the paint on a circle [1]."""
-_MIN_RADIUS: Final = 3.0
-"""Minimum radius of such a circle [m]: corner arcs are too small."""
-_ARC_BINS: Final = (0.08, 0.15, 160)
-"""Bins of the vote for circles: radius in its logarithm [1], place of the centre along the line in
-radii [1], and their number."""
-_RADIUS_RANGE: Final = (0.1, 5.0)
-"""Radii of circles to vote for, in heights of the camera [1]."""
-_ARC_POINTS: Final = 1200
-"""Pixels of paint that vote for circles, at least [1]."""
-_ARC_REACH: Final = 14.0
-"""Reach of the neighbors that give the direction of a pixel's paint [px]."""
-_MAX_CANDIDATES: Final = 400
-"""Maximum candidates from circles, those with the most paint [1]."""
+from worldpose.static_calibration.from_paint.paint import PaintMap
 
 
 class _PaintedArc(NamedTuple):
@@ -76,7 +60,7 @@ def _painted_arcs(pitch: PitchTemplate) -> list[_PaintedArc]:
     for name, arc in pitch.arcs.items():
         x, y = pitch.points[arc.center][:2].tolist()
         # A surveyed centre mark lies millimetres off the middle.
-        if x > arc.radius or arc.radius < _MIN_RADIUS:
+        if x > arc.radius or arc.radius < 3.0:
             continue
         places = pitch.marking_points(name, 0.25)[:, 0]
         for line in y_lines.tolist():
@@ -115,10 +99,11 @@ def name_circles(paint: PaintMap, pitch: PitchTemplate, focals: Floats, roll: fl
                 x, y = (across_place, along_place) if arc.axis else (along_place, across_place)
                 axes = (turn * across, turn * seen.along)
                 axes = axes if arc.axis else (turn * seen.along, -turn * across)
-                fits = (count >= _MIN_ARC) & are_plausible(pitch, height, x, y)
+                # Minimum share of the paint on a circle.
+                fits = (count >= 0.01) & are_plausible(pitch, height, x, y)
                 rows.append(np.column_stack([seen.focals, seen.tilts, height, *axes, x, y])[fits])
                 counts.append(count[fits])
-    best = np.argsort(-np.concatenate(counts), kind="stable")[:_MAX_CANDIDATES]
+    best = np.argsort(-np.concatenate(counts), kind="stable")[:400]
     level = level_cameras(np.concatenate(rows)[best])
     return replace(level, rotations=turn_about_axis(roll) @ level.rotations)
 
@@ -182,10 +167,10 @@ def _to_ground(pixels: Floats, focal: Floats, tilt: Floats) -> Floats:
 
 def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
     """Return some pixels of paint (m, 2), and unit vectors (m, 2) along it."""
-    points = paint[:: max(1, len(paint) // _ARC_POINTS)]
+    points = paint[:: max(1, len(paint) // 1200)]
     if not len(points):
         return points, points
-    distance, index = cKDTree(paint).query(points, k=16, distance_upper_bound=_ARC_REACH)
+    distance, index = cKDTree(paint).query(points, k=16, distance_upper_bound=14.0)
     near = np.isfinite(distance)
     count = near.sum(axis=1)
     around = np.where(near[..., None], paint[np.minimum(index, len(paint) - 1)], 0.0)
@@ -199,36 +184,33 @@ def _paint_directions(paint: Floats) -> tuple[Floats, Floats]:
 def _vote_circle(seen: _Paint, arc: _PaintedArc, sign: float) -> tuple[Floats, Floats, Floats]:
     """Return radius, centre along the segment and share of votes (g,) of the best circle.
 
-    Args:
-        seen: paint.
-        arc: the circle and its marking.
-        sign: side of the paint, 0 = both.
+    The sign is the side of the paint, 0 = both.
     """
+    reach = (0.1, 5.0)  # radii to vote for, in heights of the camera
+    bins = (0.08, 0.15, 160)  # log radius, center along the line in radii, number of these
     across, along, normal_across, normal_along = np.moveaxis(
         np.concatenate([seen.places, seen.normals], axis=-1), -1, 0
     )
-    rows = int(np.log(_RADIUS_RANGE[1] / _RADIUS_RANGE[0]) / _ARC_BINS[0]) + 1
-    cells = rows * _ARC_BINS[2]
+    rows = int(np.log(reach[1] / reach[0]) / bins[0]) + 1
+    cells = rows * bins[2]
     counts = np.zeros(len(across) * cells, np.int64)
     for way in arc.ways:
         steep = arc.depth + way * np.abs(normal_across)
         with np.errstate(divide="ignore", invalid="ignore"):
             radius = np.abs(across) / steep
-            used = (steep > 0.2) & (radius > _RADIUS_RANGE[0]) & (radius < _RADIUS_RANGE[1])
+            used = (steep > 0.2) & (radius > reach[0]) & (radius < reach[1])
             if sign:
                 used &= across * sign > 0.0
         g, m = np.nonzero(used)
         found = radius[g, m]
         toward = way * np.sign(across[g, m]) * np.sign(normal_across[g, m])
-        column = (along[g, m] / found - toward * normal_along[g, m]) / _ARC_BINS[
-            1
-        ] + 0.5 * _ARC_BINS[2]
-        row = np.log(found / _RADIUS_RANGE[0]) / _ARC_BINS[0]
-        kept = (column >= 0.0) & (column < _ARC_BINS[2])
-        cell = row[kept].astype(np.int64) * _ARC_BINS[2] + column[kept].astype(np.int64)
+        column = (along[g, m] / found - toward * normal_along[g, m]) / bins[1] + 0.5 * bins[2]
+        row = np.log(found / reach[0]) / bins[0]
+        kept = (column >= 0.0) & (column < bins[2])
+        cell = row[kept].astype(np.int64) * bins[2] + column[kept].astype(np.int64)
         counts += np.bincount(g[kept] * cells + cell, minlength=len(counts))
     votes = counts.reshape(-1, cells)
     best = votes.argmax(axis=1)
-    size = _RADIUS_RANGE[0] * np.exp((best // _ARC_BINS[2] + 0.5) * _ARC_BINS[0])
-    place = (best % _ARC_BINS[2] + 0.5 - 0.5 * _ARC_BINS[2]) * _ARC_BINS[1] * size
+    size = reach[0] * np.exp((best // bins[2] + 0.5) * bins[0])
+    place = (best % bins[2] + 0.5 - 0.5 * bins[2]) * bins[1] * size
     return size, place, votes.max(axis=1) / max(1, across.shape[1])

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,44 +20,21 @@ from numpy.typing import NDArray
 
 from data_contracts.arrays import Flags, Floats
 from data_contracts.match import Side
+from worldpose.geometry.rows import Index, take_rows
 from worldpose.pitch.template import PitchTemplate
+from worldpose.static_calibration.from_paint.paint import ORIENTATIONS, PaintMap
 from worldpose.static_calibration.line_samples import LineSamples
-from worldpose.static_calibration.paint_segments import ORIENTATIONS, PaintMap
 from worldpose.static_calibration.settings import CameraPrior
 
 TILTS: Final = np.radians(np.geomspace(3.0, 45.0, 16))
 """Tilts below the horizon to try [rad]."""
-_MAX_ANGLE: Final = np.radians(5.0)
-"""Deviation of two segments from a right angle, or from parallels, on the pitch [rad]."""
 SEGMENTS: Final = 12
 """Maximum segments to name, those with the most paint [1]."""
-_OVERSHOOT: Final = (0.15, 1.5)
-"""Reach of a segment beyond its marking: share of its length [1], and [m]."""
 _HEIGHTS: Final = (1.8, 80.0)
 """Heights of cameras above the pitch [m]."""
-_MAX_DISTANCE: Final = 200.0
-"""Distance of a camera from the centre spot in plan [m]."""
-_PITCH_MARGIN: Final = 1.0
-"""Distance of a camera from the outer lines inside of the pitch [m]."""
-_HIT_RATE: Final = 0.7
-"""Probability that a visible marking is found at one place [1]: players, shadows and wear hide
-the rest."""
-_CHANCE_RATE: Final = 0.05
-"""Probability that paint is near a place without a marking [1]."""
 INDEPENDENT: Final = 1.0 / 32.0
 """Length of a marking that counts as one observation, in image widths [1]: what hides paint has
 this size."""
-_NEAR_SAMPLE: Final = 12.0
-"""Maximum distance of explained paint from a sample of a marking [px]; samples are up to tens of
-pixels apart."""
-_ITERATIONS: Final = 4
-"""Steps of each stage [1]."""
-_ROLL_STD: Final = 0.015
-"""Standard deviation of the roll while candidates are refined [rad]."""
-_CORNER_STD: Final = (0.005, 0.02)
-"""Standard deviation of the displacement of the image corner by k1 while candidates are refined,
-relative to the corner's distance from the middle [1], in images that look straight and in others:
-less than of an unknown lens, so that a wrong name does not bend the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,39 +56,23 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.focals)
 
-    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Candidates:
-        return Candidates(
-            self.rotations[index], self.centers[index], self.focals[index], self.radial[index]
-        )
+    def __getitem__(self, index: Index) -> Candidates:
+        return take_rows(self, index)
 
 
-@dataclass(frozen=True, eq=False)
-class SeenMarkings:
-    """Samples of markings in the images of candidates.
-
-    Attributes:
-        pixels: (k, n, 2) [px] from the middle of the image.
-        normals: (k, n) angles across the projected markings [rad].
-        lengths: (k, n) length of marking per sample [px]; 0 outside of the image.
-        distances: (k, n) to paint of this direction [px]; infinite outside of the pitch's area.
-        nearest: (k, n) this paint's index in `PaintMap.points`.
-    """
+class SeenMarkings(NamedTuple):
+    """Samples of markings in the images of candidates."""
 
     pixels: Floats
+    """(k, n, 2) [px] from the middle of the image."""
     normals: Floats
+    """(k, n) angles across the projected markings [rad]."""
     lengths: Floats
+    """(k, n) length of marking per sample [px]; 0 outside of the image."""
     distances: Floats
+    """(k, n) to paint of this direction [px]; infinite outside of the pitch's area."""
     nearest: NDArray[np.int32]
-
-
-def join_candidates(*parts: Candidates) -> Candidates:
-    """Return all candidates in one record."""
-    return Candidates(
-        np.concatenate([part.rotations for part in parts]),
-        np.concatenate([part.centers for part in parts]),
-        np.concatenate([part.focals for part in parts]),
-        np.concatenate([part.radial for part in parts]),
-    )
+    """(k, n) this paint's index in `PaintMap.points`."""
 
 
 def thin_out(candidates: Candidates, most: int) -> Candidates:
@@ -204,12 +165,7 @@ def _locate_cameras(
 ) -> Iterator[Floats]:
     """Yield rows of `level_cameras` for triples with a and b on two lines, c on one line each time.
 
-    Args:
-        pitch: the template.
-        triples: k triples of segments.
-        axis: along which the two lines run: 0 = x, 1 = y.
-        pair: the two lines, see `straight_lines`.
-        crossing: (n, 3) lines along the other axis.
+    The two lines run along `axis`, 0 = x, 1 = y, and the others (n, 3) across it.
     """
     # The normal of a line along x points to y; that of a line along y, to -x.
     sign = 1.0 if axis == 0 else -1.0
@@ -239,8 +195,8 @@ def _locate_cameras(
 
 def are_plausible(pitch: PitchTemplate, height: Floats, x: Floats, y: Floats) -> Flags:
     """Return whether cameras (k,) at these heights and places [m] are outside of the pitch."""
-    half = 0.5 * np.array([pitch.length, pitch.width]) - _PITCH_MARGIN
-    fits = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1]) & (np.hypot(x, y) < _MAX_DISTANCE)
+    half = 0.5 * np.array([pitch.length, pitch.width]) - 1.0
+    fits = (height > _HEIGHTS[0]) & (height < _HEIGHTS[1]) & (np.hypot(x, y) < 200.0)
     return np.asarray(fits & ((np.abs(x) > half[0]) | (np.abs(y) > half[1])))
 
 
@@ -250,18 +206,18 @@ def turn_about_axis(roll: float) -> Floats:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _lies_on_line(ends: Floats, line: Floats) -> NDArray[np.bool_]:
+def _lies_on_line(ends: Floats, line: Floats) -> Flags:
     """Return whether segments with ends (k, 2) lie on a marking from line[0] to line[1]."""
-    beyond = _OVERSHOOT[0] * (ends[:, 1] - ends[:, 0]) + _OVERSHOOT[1]
+    overshoot = (0.15, 1.5)  # reach beyond the marking: share of the length, and [m]
+    beyond = overshoot[0] * (ends[:, 1] - ends[:, 0]) + overshoot[1]
     return np.asarray((ends[:, 0] > line[0] - beyond) & (ends[:, 1] < line[1] + beyond))
 
 
 def level_cameras(rows: Floats) -> Candidates:
     """Return cameras on the near side of rows (k, 9).
 
-    Args:
-        rows: focal length, tilt, height, right and forward component of the pitch's x and y axis,
-            x, y.
+    A row is the focal length, tilt, height, right and forward component of the pitch's x and y
+    axis, x, y.
     """
     turn = np.where(rows[:, 8:] > 0.0, -1.0, 1.0)
     focals, tilts, up = rows[:, :3].T
@@ -279,6 +235,7 @@ def level_cameras(rows: Floats) -> Candidates:
 
 def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_Triples]:
     """Yield triples at all focal lengths and tilts, one segment's direction after another's."""
+    max_angle = np.radians(5.0)  # from a right angle, or from parallels, on the pitch
     width, height = paint.size
     middle = 0.5 * np.array([width - 1, height - 1])
     ends = (paint.segments[:SEGMENTS] - middle) @ turn_about_axis(roll)[:2, :2]
@@ -291,7 +248,7 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
     with np.errstate(divide="ignore", invalid="ignore"):
         right = ends[None, ..., 0] / depth
         forward = (away * cosine - ends[None, ..., 1] * sine) / depth
-    below: NDArray[np.bool_] = np.asarray((depth > 1e-3 * away).all(axis=-1))
+    below: Flags = np.asarray((depth > 1e-3 * away).all(axis=-1))
     ground = np.stack([right, forward], axis=-1)  # (g, n, 2 ends, 2)
     step = ground[:, :, 1] - ground[:, :, 0]
     angle = np.arctan2(step[..., 1], step[..., 0])
@@ -299,8 +256,8 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
     for reference in range(count):
         turned = angle - angle[:, reference : reference + 1]
         usable = below & below[:, reference : reference + 1]
-        parallel = usable & (np.abs((turned + 0.5 * np.pi) % np.pi - 0.5 * np.pi) < _MAX_ANGLE)
-        square = usable & (np.abs(turned % np.pi - 0.5 * np.pi) < _MAX_ANGLE)
+        parallel = usable & (np.abs((turned + 0.5 * np.pi) % np.pi - 0.5 * np.pi) < max_angle)
+        square = usable & (np.abs(turned % np.pi - 0.5 * np.pi) < max_angle)
         parallel[:, reference] = False
         # The reference is a, or it is c.
         g, b, c = np.nonzero(parallel[:, :, None] & square[:, None, :])
@@ -326,7 +283,7 @@ def _ground_triples(paint: PaintMap, focals: Floats, roll: float) -> Iterator[_T
         )
 
 
-def _project(candidates: Candidates, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _project(candidates: Candidates, points: Floats) -> tuple[Floats, Flags]:
     """Return pixels (k, n, 2) from the middle of the image, and whether they exist."""
     local = np.einsum("kij,knj->kni", candidates.rotations, points - candidates.centers[:, None])
     depth = local[..., 2]
@@ -348,7 +305,11 @@ def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidat
     ahead, ahead_front = _project(candidates, places + step * samples.along_world)
     way = ahead - pixels
     normals = np.arctan2(way[..., 1], way[..., 0]) + 0.5 * np.pi
-    spacing = _sample_spacing(samples)
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    inner = np.diff(samples.marking) == 0
+    spacing = np.zeros(len(samples.marking))  # the length of marking that a sample stands for [m]
+    spacing[:-1] += 0.5 * steps * inner
+    spacing[1:] += 0.5 * steps * inner
     image = pixels + 0.5 * np.array([width - 1, height - 1])
     inside = front & ahead_front & (image > 1.0).all(-1) & (image < [width - 2, height - 2]).all(-1)
     lengths = np.where(inside, np.hypot(way[..., 0], way[..., 1]) / step * spacing, 0.0)
@@ -362,30 +323,18 @@ def project_markings(paint: PaintMap, samples: LineSamples, candidates: Candidat
     return SeenMarkings(pixels, normals, lengths, distances, paint.nearest[index])
 
 
-def _sample_spacing(samples: LineSamples) -> Floats:
-    """Return the length of marking (n,) that each sample stands for [m]."""
-    steps = np.linalg.norm(np.diff(samples.points_world, axis=0), axis=-1)
-    inner = np.diff(samples.marking) == 0
-    spacing = np.zeros(len(samples.marking))
-    spacing[:-1] += 0.5 * steps * inner
-    spacing[1:] += 0.5 * steps * inner
-    return spacing
-
-
 def score_candidates(
     paint: PaintMap, samples: LineSamples, candidates: Candidates, spread: float
 ) -> Floats:
     """Return log probability ratios (k,) of the paint, with each camera against without.
 
-    Args:
-        paint: of the image.
-        samples: of the markings.
-        candidates: (k,) cameras.
-        spread: standard deviation of a marking's distance from its paint [px].
+    The spread is the standard deviation of a marking's distance from its paint [px].
     """
+    chance_rate = 0.05  # of paint near a place without a marking
+    hit_rate = 0.7  # players, shadows and wear hide the rest
     gain, loss = (
-        np.log(_HIT_RATE / _CHANCE_RATE),
-        np.log((1.0 - _HIT_RATE) / (1.0 - _CHANCE_RATE)),
+        np.log(hit_rate / chance_rate),
+        np.log((1.0 - hit_rate) / (1.0 - chance_rate)),
     )
     scores = np.zeros(len(candidates))
     for first in range(0, len(candidates), 1000):
@@ -400,28 +349,15 @@ def score_candidates(
 def score_with_prior(
     paint: PaintMap, samples: LineSamples, found: Candidates, prior: CameraPrior, spread: float
 ) -> Floats:
-    """Return the scores (k,) of candidates with the densities of heights, distances and focals.
-
-    Args:
-        paint: of the image.
-        samples: of the markings.
-        found: (k,) cameras.
-        prior: heights, distances, focal lengths.
-        spread: standard deviation of a marking's distance from its paint [px].
-    """
-    scores = score_candidates(paint, samples, found, spread)
-    return scores + _log_prior(found, prior, paint.size)
-
-
-def _log_prior(candidates: Candidates, prior: CameraPrior, size: tuple[int, int]) -> Floats:
-    """Return log densities (k,) of heights, distances and focal lengths, up to a constant."""
+    """Return `score_candidates` with the densities of heights, distances and focal lengths."""
     deviations = (
-        np.log(candidates.centers[:, 2] / prior.height_m) / prior.log_height_std,
-        np.log(np.linalg.norm(candidates.centers[:, :2], axis=1) / prior.distance_m)
+        np.log(found.centers[:, 2] / prior.height_m) / prior.log_height_std,
+        np.log(np.linalg.norm(found.centers[:, :2], axis=1) / prior.distance_m)
         / prior.log_distance_std,
-        np.log(candidates.focals / (size[0] * prior.focal)) / prior.log_focal_std,
+        np.log(found.focals / (paint.size[0] * prior.focal)) / prior.log_focal_std,
     )
-    return np.asarray(-0.5 * np.square(deviations).sum(axis=0))
+    scores = score_candidates(paint, samples, found, spread)
+    return np.asarray(scores - 0.5 * np.square(deviations).sum(axis=0))
 
 
 def refine_candidates(
@@ -433,18 +369,12 @@ def refine_candidates(
 ) -> Candidates:
     """Return candidates moved so that their markings lie on the nearest paint of their direction.
 
-    Gauss-Newton steps with Cauchy weights. The paint's distance across the marking is the residual.
-
-    Args:
-        paint: of the image.
-        samples: of the markings.
-        candidates: starts.
-        radii: distances within which paint attracts a marking, one stage after another [px].
-        free: whether focal length and k1 are solved for.
+    Gauss-Newton steps with Cauchy weights. The paint's distance across the marking is the residual;
+    paint attracts within radii [px], one stage after another. Focal length and k1 may be free.
     """
     rolls = candidates.rotations[:, 0, 2]
     for radius in radii:
-        for _ in range(_ITERATIONS):
+        for _ in range(4):
             step, usable = _step(paint, samples, candidates, rolls, radius, free)
             candidates, rolls = _move(candidates, step)[usable], rolls[usable]
             if not len(candidates):
@@ -459,8 +389,9 @@ def _step(
     rolls: Floats,
     radius: float,
     free: tuple[bool, bool],
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Flags]:
     """Return steps (k, 8): rotation, center, log focal length, k1; and whether they exist."""
+    roll_std = 0.015
     seen = project_markings(paint, samples, candidates)
     width, height = paint.size
     middle = 0.5 * np.array([width - 1, height - 1])
@@ -502,7 +433,9 @@ def _step(
     system = np.einsum("kni,knj->kij", weighted, rows)
     right = np.einsum("kni,kn->ki", weighted, residual)
     corner = (0.5 * np.hypot(width, height) / candidates.focals) ** 2
-    corner_std = _CORNER_STD[int(bool(paint.lens.distortion.any()))]
+    # Displacement of the image corner by k1, in images that look straight and in others: less than
+    # of an unknown lens, so that a wrong name does not bend the image.
+    corner_std = (0.005, 0.02)[int(bool(paint.lens.distortion.any()))]
     radial_info = (corner / corner_std) ** 2 if free[1] else np.full(len(candidates), 1e12)
     damping = np.tile([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 4.0 if free[0] else 1e12, 0.0], (len(x), 1))
     damping[:, 7] = radial_info
@@ -512,8 +445,8 @@ def _step(
     # The roll is the height of the camera's right axis; it turns by the rotation step.
     roll, by_roll = candidates.rotations[:, 0, 2] - rolls, np.zeros((len(x), 8))
     by_roll[:, 1], by_roll[:, 2] = candidates.rotations[:, 2, 2], -candidates.rotations[:, 1, 2]
-    system += by_roll[:, :, None] * by_roll[:, None, :] / _ROLL_STD**2
-    right -= by_roll * roll[:, None] / _ROLL_STD**2
+    system += by_roll[:, :, None] * by_roll[:, None, :] / roll_std**2
+    right -= by_roll * roll[:, None] / roll_std**2
     step = np.linalg.solve(system, right[..., None])[..., 0]
     usable = (np.count_nonzero(used, axis=1) >= 12) & np.isfinite(step).all(axis=1)
     usable &= candidates.centers[:, 2] + step[:, 5] > 1.0
@@ -532,12 +465,7 @@ def _move(candidates: Candidates, step: Floats) -> Candidates:
 
 
 def explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
-    """Return the share of the segments' length that lies on a projected marking [1].
-
-    Args:
-        paint: paint of the image.
-        seen: the markings in view of one candidate.
-    """
+    """Return the share of the segments' length on a marking of the first candidate [1]."""
     width, height = paint.size
     canvas = np.ones((height, width), np.uint8)
     image = seen.pixels[0][seen.lengths[0] > 0.0] + 0.5 * np.array([width - 1, height - 1])
@@ -549,6 +477,7 @@ def explained_share(paint: PaintMap, seen: SeenMarkings) -> float:
         count = max(2, int(np.linalg.norm(end - start)))
         x, y = np.linspace(start, end, count).T
         row, column = np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
-        on += float((away[row.astype(int), column.astype(int)] < _NEAR_SAMPLE).sum())
+        # Samples are up to tens of pixels apart.
+        on += float((away[row.astype(int), column.astype(int)] < 12.0).sum())
         total += count
     return on / max(total, 1.0)
