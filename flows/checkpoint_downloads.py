@@ -11,19 +11,14 @@ import hashlib
 import os
 import re
 import shutil
-import ssl
-import urllib.request
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from http.client import HTTPException, HTTPMessage, HTTPResponse
 from pathlib import Path
-from typing import IO, Final
-from urllib.error import HTTPError
+from typing import Final
 from urllib.parse import quote, urlsplit
 
-import certifi
+import httpx
 
 from data_contracts.checkpoint import Checkpoint, CheckpointCatalog, CheckpointFile
 from worldpose.detection.models import PULLED_FILES, PULLED_RECORD, read_pulled
@@ -38,124 +33,10 @@ MAX_ARCHIVE_BYTES: Final = 1 << 33
 """Largest zip archive [byte]; only the size of the file in it is pinned."""
 HUB: Final = re.compile(r"hf://([\w.-]+/[\w.-]+)@([0-9a-f]{40})/([\w./-]+)")
 """Address of a file on the Hugging Face hub: repository, whole commit id, path."""
+SHIPPED: Final = Path(__file__).with_name("checkpoints.yaml")
+"""The checkpoints that worldpose names."""
 Progress = Callable[[str, int, int], None]
 """Called with the name of a file, and the bytes that are there and that it has."""
-
-_OPENMMLAB: Final = "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk"
-_YOLOX: Final = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
-_RTDETR: Final = "hf://PekingU/rtdetr_v2_r18vd@5650961749fa93567c0d46fc7f43ea4f9e914107"
-
-
-def _onnx(name: str, task: str, kind: str, about: str, file: dict[str, object]) -> Checkpoint:
-    """Return a checkpoint of one ONNX file under Apache-2.0."""
-    return Checkpoint.model_validate(
-        {
-            "name": name,
-            "about": about,
-            "task": task,
-            "kind": kind,
-            "licence": "Apache-2.0",
-            "files": ({"name": "model.onnx", **file},),
-        }
-    )
-
-
-CATALOG: Final = {
-    each.name: each
-    for each in (
-        _onnx(
-            "yolox-nano",
-            "detector",
-            "onnx-yolox",
-            "YOLOX-nano, COCO, 416 x 416: small and quick",
-            {
-                "url": f"{_YOLOX}/yolox_nano.onnx",
-                "sha256": "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d",
-                "size": 3_659_407,
-            },
-        ),
-        _onnx(
-            "yolox-tiny",
-            "detector",
-            "onnx-yolox",
-            "YOLOX-tiny, COCO, 416 x 416",
-            {
-                "url": f"{_YOLOX}/yolox_tiny.onnx",
-                "sha256": "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7",
-                "size": 20_219_662,
-            },
-        ),
-        _onnx(
-            "yolox-s",
-            "detector",
-            "onnx-yolox",
-            "YOLOX-s, COCO, 640 x 640, of the OpenCV model zoo",
-            {
-                "url": "https://media.githubusercontent.com/media/opencv/opencv_zoo/"
-                "966be4cb6eefc2a4f586ed0581bf4bbaa2533070/models/object_detection_yolox/"
-                "object_detection_yolox_2022nov.onnx",
-                "sha256": "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063",
-                "size": 35_858_002,
-            },
-        ),
-        Checkpoint.model_validate(
-            {
-                "name": "rtdetr-v2-r18",
-                "about": "RT-DETRv2 with a ResNet-18, COCO, 640 x 640, for transformers",
-                "task": "detector",
-                "kind": "transformers",
-                "licence": "Apache-2.0",
-                "files": (
-                    {
-                        "name": "model.safetensors",
-                        "url": f"{_RTDETR}/model.safetensors",
-                        "sha256": "d18309d0d7ea57048138885c4c6ecfcb"
-                        "1e24506fc6153b94ad484f8ab62c7115",
-                        "size": 80_904_640,
-                    },
-                    {
-                        "name": "config.json",
-                        "url": f"{_RTDETR}/config.json",
-                        "sha256": "ed051ec77cb41c5d9d5e3af21a979b1e"
-                        "890599dfd68434d7636ff82ded4c1527",
-                    },
-                    {
-                        "name": "preprocessor_config.json",
-                        "url": f"{_RTDETR}/preprocessor_config.json",
-                        "sha256": "cd38cd59999e7a95d68e487fbe5132df"
-                        "3d4e5c32a0836add57e6126ba0c4eaf1",
-                    },
-                ),
-            }
-        ),
-        _onnx(
-            "rtmpose-m",
-            "pose",
-            "onnx",
-            "RTMPose-m, seven body data sets, 256 x 192",
-            {
-                "url": f"{_OPENMMLAB}/"
-                "rtmpose-m_simcc-body7_pt-body7_420e-256x192-e48f03d0_20230504.zip",
-                "member": "end2end.onnx",
-                "sha256": "5c0a4bf67953e6d2ac43ce15e77dc9d5d354ae18430a47d2c5963a7bc5683e3c",
-                "size": 54_330_655,
-            },
-        ),
-        _onnx(
-            "rtmpose-s",
-            "pose",
-            "onnx",
-            "RTMPose-s, seven body data sets, 256 x 192",
-            {
-                "url": f"{_OPENMMLAB}/"
-                "rtmpose-s_simcc-body7_pt-body7_420e-256x192-acd4a1ef_20230504.zip",
-                "member": "end2end.onnx",
-                "sha256": "9aeb635b83f86aea45cf45d85798f7eba1a162de8e0d721c44e54fe5eebaf47d",
-            },
-        ),
-    )
-}
-"""The checkpoints that worldpose names, by name."""
 
 
 def read_catalog(file: Path | None) -> dict[str, Checkpoint]:
@@ -164,18 +45,17 @@ def read_catalog(file: Path | None) -> dict[str, Checkpoint]:
     Raises:
         InputError: the file is no catalog, or names a checkpoint twice or as a shipped one.
     """
-    found = dict(CATALOG)
-    if file is None:
-        return found
-    for each in validate_record(CheckpointCatalog, read_yaml(file), str(file)).models:
-        if each.name in found:
-            raise InputError(
-                f"{file}: models",
-                expected="names of their own",
-                found=f"{each.name!r} again",
-                todo="Give the checkpoint another name.",
-            )
-        found[each.name] = each
+    found: dict[str, Checkpoint] = {}
+    for each in (SHIPPED, file) if file is not None else (SHIPPED,):
+        for checkpoint in validate_record(CheckpointCatalog, read_yaml(each), str(each)).models:
+            if checkpoint.name in found:
+                raise InputError(
+                    f"{each}: models",
+                    expected="names of their own",
+                    found=f"{checkpoint.name!r} again",
+                    todo="Give the checkpoint another name.",
+                )
+            found[checkpoint.name] = checkpoint
     return found
 
 
@@ -195,9 +75,10 @@ def pull(checkpoint: Checkpoint, folder: Path, progress: Progress) -> Path:
     draft = folder / f".{checkpoint.name}.partial"
     files = draft / PULLED_FILES
     files.mkdir(parents=True, exist_ok=True)
-    with _only_process(draft, checkpoint.name):
+    with _only_process(draft / LOCK, checkpoint.name):
         for file in checkpoint.files:
-            _fetch_file(checkpoint.name, file, files / file.name, draft, progress)
+            if _digest(files / file.name) != file.sha256:
+                _fetch_file(checkpoint.name, file, files / file.name, draft, progress)
         with whole_file(draft / PULLED_RECORD) as record:
             record.write_text(checkpoint.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (draft / LOCK).unlink()
@@ -211,8 +92,8 @@ LOCK: Final = "lock"
 
 
 @contextmanager
-def _only_process(draft: Path, name: str) -> Iterator[None]:
-    with (draft / LOCK).open("w") as lock:
+def _only_process(file: Path, name: str) -> Iterator[None]:
+    with file.open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -242,40 +123,38 @@ def _digest(path: Path) -> str:
 def _fetch_file(
     name: str, file: CheckpointFile, path: Path, draft: Path, progress: Progress
 ) -> None:
-    """Bring one file of a checkpoint to its path, unless it is there."""
-    if _digest(path) == file.sha256:
-        return
+    """Bring one file of a checkpoint to its path.
+
+    Raises:
+        InputError: it has another digest.
+        WorldposeError: the download failed.
+    """
     url = resolve_address(file.url)
     part = draft / f"{file.name}.part"
     most = MAX_ARCHIVE_BYTES if file.member else file.size
     try:
-        if file.member is None:
-            _refuse_other_file(name, file, url)
         _download(url, part, most, lambda done, total: progress(file.name, done, total))
-        if file.member is not None:
-            _extract(name, file, part, path)
-            part.unlink()
-        else:
-            part.replace(path)
-    except (OSError, HTTPException) as error:
+    except (OSError, httpx.HTTPError, UsageError) as error:
+        said = getattr(error, "strerror", None) or error
         raise WorldposeError(
-            f"{name}: downloading {url} failed: {type(error).__name__}: {error}. Run the command "
+            f"{name}: downloading {url} failed: {type(error).__name__}: {said}. Run the command "
             "again: it resumes where it stopped."
         ) from error
+    if file.member is None:
+        part.replace(path)
+    else:
+        _extract(name, file, part, path)
+        part.unlink()
     found = _digest(path)
     if found != file.sha256:
         path.unlink()
-        raise _other_digest(name, file, found)
-
-
-def _other_digest(name: str, file: CheckpointFile, found: str) -> InputError:
-    return InputError(
-        f"{name}: {file.name} of {file.url}",
-        expected=f"SHA-256 {file.sha256}",
-        found=found,
-        todo="The file was removed. It is not the one that was pinned: do not use it, or correct "
-        "the digest in your catalog.",
-    )
+        raise InputError(
+            f"{name}: {file.name} of {file.url}",
+            expected=f"SHA-256 {file.sha256}",
+            found=found,
+            todo="The file was removed. It is not the one that was pinned: do not use it, or "
+            "correct the digest in your catalog.",
+        )
 
 
 def resolve_address(url: str) -> str:
@@ -285,144 +164,64 @@ def resolve_address(url: str) -> str:
         UsageError: the address is neither https, http of this machine, nor hf: with a whole commit
             id.
     """
-    if url.startswith("hf:"):
-        found = HUB.fullmatch(url)
-        if found is None:
-            raise _bad_address(url)
+    found = HUB.fullmatch(url)
+    if found is not None:
         hub = os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
         repository, revision, path = found.groups()
         url = f"{hub}/{repository}/resolve/{revision}/{quote(path)}"
-    if not _is_allowed(url):
-        raise _bad_address(url)
+    _require_safe(url)
     return url
 
 
-def _is_allowed(url: str) -> bool:
-    """Return whether an address is https, or http of this machine."""
+def _require_safe(url: str) -> None:
+    """Raise UsageError unless an address is https, or http of this machine."""
     try:
         parts = urlsplit(url)
         host = parts.hostname
     except ValueError:
-        return False
-    local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1")
-    return bool(host) and (parts.scheme == "https" or local)
-
-
-def _bad_address(url: str) -> UsageError:
-    return UsageError(
-        "address of a checkpoint",
-        expected="https://HOST/PATH, or hf://OWNER/REPOSITORY@COMMIT/FILE with a commit id of 40 "
-        "characters",
-        found=repr(url),
-        todo="Correct url in the catalog.",
-    )
-
-
-class _SafeRedirects(urllib.request.HTTPRedirectHandler):
-    """Follows redirects to addresses that are allowed, or none of them."""
-
-    def __init__(self, *, follow: bool = True) -> None:
-        self._follow = follow
-
-    def redirect_request(
-        self,
-        req: urllib.request.Request,
-        fp: IO[bytes],
-        code: int,
-        msg: str,
-        headers: HTTPMessage,
-        newurl: str,
-    ) -> urllib.request.Request | None:
-        """Return the next request; None makes the redirect an HTTPError."""
-        if not self._follow or not _is_allowed(newurl):
-            return None
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
-
-
-@contextmanager
-def _open(request: urllib.request.Request, *, follow: bool = True) -> Iterator[HTTPResponse]:
-    request.add_header("User-Agent", "worldpose")
-    certificates = ssl.create_default_context(cafile=certifi.where())
-    opener = urllib.request.build_opener(
-        _SafeRedirects(follow=follow), urllib.request.HTTPSHandler(context=certificates)
-    )
-    with opener.open(request, timeout=ANSWER_SECONDS) as answer:
-        yield answer
-
-
-def _refuse_other_file(name: str, file: CheckpointFile, url: str) -> None:
-    """Raise InputError before the download if the hub names another digest for a large file."""
-    if not file.url.startswith("hf:"):
-        return
-    try:
-        with _open(urllib.request.Request(url, method="HEAD"), follow=False) as answer:
-            linked = answer.headers.get("X-Linked-Etag")
-    except HTTPError as error:
-        if not 300 <= error.code < 400:
-            raise
-        linked = error.headers.get("X-Linked-Etag")
-        error.close()
-    linked = (linked or "").removeprefix("W/").strip('"')
-    if re.fullmatch(r"[0-9a-f]{64}", linked) and linked != file.sha256:
-        raise _other_digest(name, file, linked)
-
-
-@dataclass(frozen=True)
-class _Range:
-    """The part of a file that a response holds: its first byte, and the file's size if known."""
-
-    start: int
-    total: int
+        parts, host = urlsplit(""), None
+    is_local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1")
+    if not host or not (parts.scheme == "https" or is_local):
+        raise UsageError(
+            "address of a checkpoint",
+            expected="https://HOST/PATH, or hf://OWNER/REPOSITORY@COMMIT/FILE with a commit id of "
+            "40 characters",
+            found=repr(url),
+            todo="Correct url in the catalog.",
+        )
 
 
 def _download(url: str, part: Path, most: int | None, progress: Callable[[int, int], None]) -> None:
-    """Download into `part`, going on where it ends.
+    """Download into `part`, going on where it ends; redirects may lead to safe addresses alone.
 
     Raises:
-        OSError, HTTPException: the download failed, or is longer than `most` bytes.
+        OSError, httpx.HTTPError, UsageError: the download failed, or is longer than `most` bytes.
     """
     there = part.stat().st_size if part.exists() else 0
-    if most is not None and there > most:
-        part.unlink()
-        there = 0
-    request = urllib.request.Request(url)
+    headers = {"User-Agent": "worldpose", "Accept-Encoding": "identity"}
     if there:
-        request.add_header("Range", f"bytes={there}-")
-    try:
-        with _open(request) as answer:
-            given = _range_of(answer)
-            mode = "ab" if given.start == there and there else "wb"
-            if mode == "wb" and given.start:
-                raise OSError(f"the server sent bytes from {given.start} on, not all")
-            done = there if mode == "ab" else 0
-            with part.open(mode) as file:
-                while chunk := answer.read(CHUNK_BYTES):
-                    done += len(chunk)
-                    if most is not None and done > most:
-                        break
-                    file.write(chunk)
-                    progress(done, given.total)
-    except HTTPError as error:
-        if error.code != 416:
-            raise
-        error.close()  # nothing lies behind the end: the file is there as a whole
-        return
+        headers["Range"] = f"bytes={there}-"
+    hooks = {"request": [lambda request: _require_safe(str(request.url))]}
+    client = httpx.Client(follow_redirects=True, timeout=ANSWER_SECONDS, event_hooks=hooks)
+    with client, client.stream("GET", url, headers=headers) as answer:
+        if answer.status_code == 416:
+            return  # nothing lies behind the end: the file is there as a whole
+        answer.raise_for_status()
+        is_rest = answer.headers.get("Content-Range", "").startswith(f"bytes {there}-")
+        if answer.status_code == 206 and not is_rest:
+            raise OSError("the server sent another part of the file than was asked for")
+        done = there if answer.status_code == 206 else 0
+        total = done + int(answer.headers.get("Content-Length") or 0)
+        with part.open("ab" if done else "wb") as file:
+            for chunk in answer.iter_raw():
+                done += len(chunk)
+                if most is not None and done > most:
+                    break
+                file.write(chunk)
+                progress(done, total)
     if most is not None and done > most:
         part.unlink()
         raise OSError(f"the file is longer than {most} bytes, which is its pinned or largest size")
-    if done < given.total:
-        raise OSError(f"the connection ended after {done} of {given.total} bytes")
-
-
-def _range_of(answer: HTTPResponse) -> _Range:
-    length = int(answer.headers.get("Content-Length") or 0)
-    if answer.status == 206:
-        found = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", answer.headers.get("Content-Range", ""))
-        if found is None:
-            raise OSError("the server sent a part of the file without its place")
-        start = int(found[1])
-        return _Range(start, start + length if found[2] == "*" else int(found[2]))
-    return _Range(0, length)
 
 
 def _extract(name: str, file: CheckpointFile, archive: Path, path: Path) -> None:

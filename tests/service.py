@@ -37,7 +37,6 @@ class Served:
 
     def __init__(self, folder, webhook):
         self.environment = {}
-        self.launcher = []  # what begins the command: setpriv, nice
         self.options = {}
         self.project = folder / "project"
         self.webhook = webhook
@@ -66,7 +65,7 @@ class Served:
         options = [str(each) for pair in arguments.items() for each in pair]
         with self.said.open("ab") as output:
             self.process = subprocess.Popen(
-                [*self.launcher, *WORLDPOSE, "serve", *options],
+                [*WORLDPOSE, "serve", *options],
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=environment,

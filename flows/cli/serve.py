@@ -99,8 +99,8 @@ def serve(
     Open the printed address in a browser: its pages create, calibrate, run, review and show
     matches.
 
-    Alerts go to the webhook and the mail addresses in PROJECT/operations/secrets/alerts.toml, or as
-    WORLDPOSE_ALERT_URL and WORLDPOSE_ALERT_MAIL say.
+    Alerts go to the channels in PROJECT/operations/secrets/alerts.toml, or of WORLDPOSE_ALERT_URL
+    and WORLDPOSE_ALERT_MAIL.
     PREFECT_API_URL names a Prefect server that runs already.
 
     Example: worldpose serve --inbox /data/arriving
@@ -118,12 +118,12 @@ def serve(
     if test_alerts:
         _test_alerts(folder, as_json=as_json)
         return
-    from flows.service.senders import senders_of
+    from flows.service.channels import channels_of
     from flows.service.service_secrets import PAGES_TOKEN, secrets_of
     from flows.service.serving import serve as serve_all
     from flows.web.access import access_for
 
-    senders_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
+    channels_of(os.environ, folder.alert_settings)  # refused here, not in an unread log
     tls = certificate_and_key(certificate, key)
     if inbox is None and "://" in url:
         raise UsageError(
@@ -210,17 +210,17 @@ def _print_addresses(plan: ServePlan, pages: str, *, asks_for_login: bool) -> No
 
 
 def _test_alerts(folder: StateFolder, *, as_json: bool) -> None:
-    from flows.service.senders import send_test, senders_of
+    from flows.service.channels import channels_of, send_test
 
-    senders = senders_of(os.environ, folder.alert_settings)
-    if not senders:
+    channels = channels_of(os.environ, folder.alert_settings)
+    if not channels:
         raise UsageError(
             "worldpose serve --test-alerts",
-            expected=f"a webhook or mail in {folder.alert_settings}",
+            expected=f"a channel in {folder.alert_settings}",
             found="none",
             todo="Write the file as docs/how-to/operations.md says.",
         )
-    problems = send_test(senders)
+    problems = send_test(channels)
     if as_json:
         print_json({"channels": problems})
     for name, problem in {} if as_json else problems.items():
@@ -238,13 +238,8 @@ def _check(folder: StateFolder, *, as_json: bool) -> None:
             {
                 "healthy": all(finding.is_well for finding in findings),
                 "findings": [
-                    {
-                        "part": each.part,
-                        "well": each.is_well,
-                        "state": each.state,
-                        "mend": each.remedy,
-                    }
-                    for each in findings
+                    {"part": it.part, "well": it.is_well, "state": it.state, "mend": it.remedy}
+                    for it in findings
                 ],
             }
         )

@@ -40,6 +40,7 @@ ALWAYS = {
 AUTHORITIES = "PREFECT_API_SSL_CERT_FILE"
 LOOPBACK = "127.0.0.1,localhost"
 """Addresses that bypass proxies."""
+LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
 SERVER_LOGIN = "PREFECT_SERVER_API_AUTH_STRING"
 """Login that a Prefect server requires of its clients, as USER:PASSWORD."""
 CLIENT_LOGIN = "PREFECT_API_AUTH_STRING"
@@ -75,7 +76,7 @@ SERVED = {
     "DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": str(START_SECONDS),
 }
 """Defaults of serving processes."""
-BUNDLED_WEIGHTS = {
+EMBEDDED = {
     # Used by automations and blocks, which a run's own server does not have.
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
     "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
@@ -122,12 +123,16 @@ def served_environment(api: str, home: Path | None) -> dict[str, str]:
     given = {
         name: os.environ.get(name, value) for name, value in {**UNLESS_GIVEN, **SERVED}.items()
     }
-    proxies = {name: os.environ.get(name) for name in ("NO_PROXY", "no_proxy")}
-    no_proxy = {name: ",".join(filter(None, [had, LOOPBACK])) for name, had in proxies.items()}
     # The dashboard uses the API of the server that it came from, whatever its name and port.
     origins = {"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": api.removesuffix("/api")}
     pages = {"PREFECT_API_URL": api, "PREFECT_UI_API_URL": "/api", **origins}
-    return {**without_secrets(os.environ), **ALWAYS, **given, **no_proxy, **own, **pages}
+    return {**without_secrets(os.environ), **ALWAYS, **given, **_without_proxy(), **own, **pages}
+
+
+def _without_proxy() -> dict[str, str]:
+    """Return the variables that exempt this machine from proxies."""
+    names = ("NO_PROXY", "no_proxy")
+    return {name: ",".join(filter(None, [os.environ.get(name), LOOPBACK])) for name in names}
 
 
 def one_authority(folder: Path) -> dict[str, str]:
@@ -195,12 +200,8 @@ def prefect_server(project: str, *, is_local: bool = False) -> Iterator[Callable
     Raises:
         InputError: a given server does not answer.
     """
-    no_proxy = {
-        name: ",".join(filter(None, [os.environ.get(name), LOOPBACK]))
-        for name in ("NO_PROXY", "no_proxy")
-    }
     given = {name: os.environ.get(name, value) for name, value in UNLESS_GIVEN.items()}
-    with _environment({**ALWAYS, **given, **no_proxy}):
+    with _environment({**ALWAYS, **given, **_without_proxy()}):
         address = os.environ.get("PREFECT_API_URL")
         if address:
             _require_answer(address)
@@ -276,7 +277,7 @@ def _embedded_server(home: Path, log: Path) -> Iterator[tuple[str, Callable[[], 
             stderr=subprocess.STDOUT,
             pass_fds=[listening.fileno()],
             env={
-                **BUNDLED_WEIGHTS,
+                **EMBEDDED,
                 **without_secrets(os.environ, keep=DATABASE),
                 SERVER_LOGIN: os.environ[CLIENT_LOGIN],
                 "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": address.removesuffix("/api"),
@@ -304,7 +305,7 @@ def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path
     """
     deadline = time.monotonic() + START_SECONDS
     while server.poll() is None and time.monotonic() < deadline:
-        if _answers(address):
+        if not problem_at(f"{address}/health"):
             return
         time.sleep(0.1)
     said = log.read_text(errors="replace")[-2000:]
@@ -312,7 +313,7 @@ def _wait_until_healthy(server: subprocess.Popen[bytes], address: str, log: Path
 
 
 def _require_answer(address: str) -> None:
-    if not _answers(address):
+    if problem_at(f"{address}/health"):
         raise InputError(
             f"PREFECT_API_URL={address}",
             expected="a running Prefect server",
@@ -347,10 +348,17 @@ def require_login(address: str) -> None:
         return  # the next request reports why it does not answer
 
 
-def _answers(address: str) -> bool:
-    opener = urllib.request.build_opener()
+def problem_at(address: str) -> str:
+    """Return why a server does not answer with 200 within seconds; empty if it does.
+
+    Proxies are only asked about other machines.
+    """
+    is_here = urlsplit(address).hostname in LOOPBACK_NAMES
+    opener = urllib.request.build_opener(*[urllib.request.ProxyHandler({})] * is_here)
     try:
-        with opener.open(f"{address}/health", timeout=5) as answer:
-            return bool(answer.status == 200)
-    except (OSError, ValueError):
-        return False
+        with opener.open(address, timeout=5) as answer:
+            return "" if answer.status == 200 else f"{address} answers {answer.status}"
+    except urllib.error.HTTPError as error:
+        return f"{address} answers {error.code}"
+    except (OSError, ValueError) as error:
+        return f"{address} does not answer: {getattr(error, 'reason', error)}"

@@ -6,25 +6,19 @@ command line or in Prefect's own form. A resumed run restarts and finds all its 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
-from prefect.client.orchestration import get_client
-from prefect.client.schemas.filters import (
-    FlowRunFilter,
-    FlowRunFilterState,
-    FlowRunFilterStateType,
-)
-from prefect.client.schemas.objects import FlowRun, StateType
-from prefect.client.schemas.sorting import FlowRunSort
-from prefect.flow_runs import resume_flow_run, suspend_flow_run
+from prefect.flow_runs import suspend_flow_run
 from prefect.input import RunInput
 from pydantic import Field
 
 from data_contracts.review import ReviewDecision
 from data_contracts.run import WaitingUnit
-from flows.orchestration.result_pages import PAGE, page_offsets
+from flows.orchestration.prefect_api import PrefectApi, of_types
+from flows.orchestration.prefect_environment import CLIENT_LOGIN
 from flows.review.metric_words import all_reasons
 from worldpose.errors import WorldposeError
 from worldpose.review.journal import Journal, say
@@ -103,26 +97,28 @@ def resume_suspended(project: str, match_id: str) -> list[str]:
     Args:
         project: folder or URL of the store.
         match_id: the match.
+
+    Raises:
+        WorldposeError: Prefect does not answer, or refuses.
     """
-    paused = FlowRunFilter(
-        state=FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.PAUSED]))
-    )
-    found: list[FlowRun] = []
-    with get_client(sync_client=True) as client:
-        for offset in page_offsets(found):
-            found += client.read_flow_runs(
-                flow_run_filter=paused, sort=FlowRunSort.ID_DESC, limit=PAGE, offset=offset
-            )
+    api = os.environ["PREFECT_API_URL"].rstrip("/")
+    prefect = PrefectApi(api, os.environ.get(CLIENT_LOGIN))
     runs = [
         run
-        for run in {each.id: each for each in found}.values()
-        if run.deployment_id is not None  # else no worker would take it up
-        and run.parameters.get("match_id") == match_id
-        and open_blobs(str(run.parameters.get("project"))).url == project
+        for run in prefect.list_all("flow_runs", flow_runs={"state": of_types("PAUSED")})
+        if run["deployment_id"] is not None  # else no worker would take it up
+        and run["parameters"].get("match_id") == match_id
+        and open_blobs(str(run["parameters"].get("project"))).url == project
     ]
     for run in runs:
-        resume_flow_run(run.id, run_input={"verdict": "recorded", "who": "worldpose review"})
-    return [run.name for run in runs]
+        given = {"run_input": {"verdict": "recorded", "who": "worldpose review"}}
+        answer = prefect.ask(f"/flow_runs/{run['id']}/resume", given)
+        if answer["status"] == "REJECT":
+            raise WorldposeError(
+                f"Prefect does not resume {run['name']}: {answer['details'].get('reason')}. Start "
+                f"a new run of {match_id}: it continues equally well."
+            )
+    return [run["name"] for run in runs]
 
 
 def question_key(waiting: Sequence[WaitingUnit]) -> str:

@@ -1,30 +1,29 @@
-"""Alerts for operators, each sent once, by webhook and mail."""
+"""Alerts for operators, each sent once to every channel."""
 
 from __future__ import annotations
 
 import json
 import logging
 import shutil
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Final, Literal
 
 from data_contracts.operations import Arrival
 from flows.review.metric_words import all_reasons
+from flows.service.channels import Channel
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, age
 from flows.service.plan import ServePlan
-from flows.service.senders import Sender
 from worldpose.formats.files import whole_file
 
 AlertKind = Literal["run_failed", "gate_waiting", "quality", "disk_low", "arrival_refused"]
 
 FIRST_PAUSE: Final = 30.0
-"""After a sender's first failure; each further one doubles it [s]."""
+"""After a channel's first failure; each further one doubles it [s]."""
 LONGEST_PAUSE: Final = 3600.0
-"""Between two attempts of a failing sender [s]."""
+"""Between two attempts of a failing channel [s]."""
 
 LOG = logging.getLogger("worldpose.operations")
 
@@ -112,38 +111,18 @@ def _of_match(plan: ServePlan, match: MatchStatus) -> Iterator[Alert]:
 class AlertDispatcher:
     """Sends each alert once while its cause lasts, and retries failed deliveries.
 
-    Each sender has its own pace: `hold` sets the alerts to send and never blocks; `deliver` passes
-    them to one sender, stops at the first failure, and retries after a pause that doubles.
+    `hold` sets the alerts to send and never blocks; `deliver` passes them to one channel. Each
+    channel has its own pace, so that a slow one delays no other.
 
     Attributes:
         state: keeps which alerts were sent, so that a restart repeats none.
-        senders: the channels; without any, alerts go to the log alone.
-        pause: after a sender's first failure [s].
+        channels: the channels; without any, alerts go to the log alone.
     """
 
-    def __init__(
-        self, state: StateFolder, senders: Sequence[Sender], pause: float = FIRST_PAUSE
-    ) -> None:
-        self.state, self.senders, self.pause = state, tuple(senders), pause
+    def __init__(self, state: StateFolder, channels: Sequence[Channel]) -> None:
+        self.state, self.channels = state, tuple(channels)
         self._told = _kept_alerts(state)
         self._lock = Lock()
-        self._pauses: dict[str, float] = {}
-        self._due: dict[str, float] = {}
-
-    def tell(self, alerts: Iterable[Alert]) -> list[Alert]:
-        """Hold and deliver to all senders in turn; return the new alerts that all accepted."""
-        alerts = list({each.key: each for each in alerts}.values())
-        before = {key: kept.get("told_by") for key, kept in self._told.items()}
-        self.hold(alerts)
-        for sender in self.senders:
-            self.deliver(sender)
-        names = [sender.name for sender in self.senders]
-        told = {key: kept["told_by"] for key, kept in self._told.items()}
-        return [
-            each
-            for each in alerts
-            if told[each.key] != before.get(each.key) and set(told[each.key]) == set(names)
-        ]
 
     def hold(self, alerts: Iterable[Alert]) -> None:
         """Replace the alerts to send."""
@@ -158,35 +137,44 @@ class AlertDispatcher:
             if told != before:
                 self._keep()
 
-    def deliver(self, sender: Sender) -> None:
-        """Send a sender's outstanding alerts until it fails; does nothing during its pause."""
-        name = sender.name
-        while time.monotonic() >= self._due.get(name, float("-inf")):
-            with self._lock:
-                pending = [key for key, kept in self._told.items() if name not in kept["told_by"]]
-                if not pending:
-                    return
-                content = {at: it for at, it in self._told[pending[0]].items() if at != "told_by"}
+    def deliver(self, channel: Channel, pause: float = 0.0) -> float:
+        """Send a channel's outstanding alerts until it fails.
+
+        Args:
+            channel: the channel.
+            pause: the pause before this call, after a failure [s].
+
+        Returns:
+            The pause before the next call [s]; 0 = nothing failed.
+        """
+        while pending := self._pending(channel):
+            key, content = pending[0]
             try:
-                sender.send(content)
+                channel.send(content)
             except Exception as error:
-                pause = min(2.0 * self._pauses.get(name, 0.5 * self.pause), LONGEST_PAUSE)
-                self._pauses[name], self._due[name] = pause, time.monotonic() + pause
+                pause = min(2.0 * pause, LONGEST_PAUSE) or FIRST_PAUSE
                 # The error message can contain the address, and that a secret.
-                kind = type(error).__name__
                 LOG.warning(
                     "%s did not take an alert: %s; again in %.0f s, with %s more",
-                    *(name, kind, pause, len(pending) - 1),
+                    *(channel.name, type(error).__name__, pause, len(pending) - 1),
                 )
-                return
-            if self._pauses.pop(name, None) is not None:
-                LOG.warning("%s takes alerts again", name)
+                return pause
+            if pause:
+                LOG.warning("%s takes alerts again", channel.name)
+            pause = 0.0
             with self._lock:
-                kept = self._told.get(pending[0])
-                if kept is not None:  # its cause can have ended in between
-                    took = {*kept["told_by"], name}
-                    kept["told_by"] = [each.name for each in self.senders if each.name in took]
+                if key in self._told:  # its cause can have ended in between
+                    self._told[key]["told_by"].append(channel.name)
                     self._keep()
+        return 0.0
+
+    def _pending(self, channel: Channel) -> list[tuple[str, dict[str, str]]]:
+        with self._lock:
+            return [
+                (key, {name: text for name, text in kept.items() if name != "told_by"})
+                for key, kept in self._told.items()
+                if channel.name not in kept["told_by"]
+            ]
 
     def _keep(self) -> None:
         try:
@@ -210,7 +198,7 @@ def _kept_alerts(state: StateFolder) -> dict[str, dict[str, Any]]:
         return {}
 
 
-def _content(alert: Alert) -> Mapping[str, str]:
+def _content(alert: Alert) -> dict[str, str]:
     """Return the JSON content; chat services show `text`."""
     return {
         "alert": alert.alert,

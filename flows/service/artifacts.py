@@ -50,17 +50,11 @@ class ArtifactReporter(Reporter):
 
     def _tell(self, text: str) -> None:
         artifact, at = self.artifact, self.run_progress
-        if artifact is not None:
-            left = (
-                ""
-                if at.seconds_left is None
-                else f", about {format_duration(at.seconds_left)} left"
-            )
-            _show_artifact(
-                lambda: update_progress_artifact(
-                    artifact, 100.0 * at.share, description=f"{text}{left}"
-                )
-            )
+        if artifact is None:
+            return
+        if at.seconds_left is not None:
+            text += f", about {format_duration(at.seconds_left)} left"
+        _show_artifact(lambda: update_progress_artifact(artifact, 100.0 * at.share, text))
 
 
 @contextmanager

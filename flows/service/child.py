@@ -17,7 +17,7 @@ from worldpose.errors import WorldposeError
 
 def main() -> None:
     """Run one part until standard input closes."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     part, plan = sys.argv[1], ServePlan.model_validate_json(sys.argv[2])
     logging.basicConfig(format="%(asctime)s  %(message)s", level=logging.WARNING)
     for name in ("worldpose.operations", "worldpose.pages"):
@@ -44,15 +44,13 @@ def worker(plan: ServePlan) -> None:
     """Create the deployments, and run their flows."""
     import anyio
 
-    from flows.service.deployments import install, work
+    from flows.service.deployments import install, pools
     from flows.service.recovery import restart_lost_runs
+    from flows.service.worker import work
 
-    async def serve() -> None:
-        installed = await install(plan)
-        await restart_lost_runs(plan, at_start=True)
-        await work(plan, installed)
-
-    anyio.run(serve)
+    installed = install(plan)
+    restart_lost_runs(plan, at_start=True)
+    anyio.run(work, pools(plan), installed)
 
 
 def watch(plan: ServePlan) -> None:
@@ -86,8 +84,10 @@ PARTS = {"prefect": prefect, "worker": worker, "watch": watch, "pages": pages}
 """Functions of the parts, in start order."""
 
 
-def _end_with_parent() -> None:
-    sys.stdin.buffer.read()
+def end_with_parent() -> None:
+    """End this process and all that it started when its standard input closes."""
+    while os.read(0, 1024):  # a buffered read would hold a lock that the interpreter's end needs
+        continue
     import psutil
 
     for process in psutil.Process().children(recursive=True):

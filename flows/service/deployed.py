@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from data_contracts.run import GatePolicy, RunRecord
 from flows.gates import Gatekeeper, waiting_for_verdicts
 from flows.iterate import iterate_match
 from flows.match import require_complete, run_stages
-from flows.orchestration.prefect_environment import CLIENT_LOGIN, served_cluster
+from flows.orchestration.prefect_environment import served_cluster
 from flows.orchestration.suspension import take_verdict
 from flows.progress import reporter
 from flows.registering import open_match
@@ -34,8 +33,8 @@ from flows.run_record import RunLog, expected_work, latest_run
 from flows.running import RunRequest, keep_settings, kept_iterations
 from flows.service.artifacts import show_at_prefect
 from flows.service.inbox import take_in
-from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name
-from flows.service.plan import TITLES, ServePlan
+from flows.service.match_runs import MatchRuns, alone_with, match_runs_of, run_name, title_of
+from flows.service.plan import ServePlan
 from flows.settings import selected_stages
 from flows.stage import Match
 from tasks.tracing import start_tracing
@@ -51,7 +50,7 @@ RUNNER: Final = cast("TaskRunner[Any]", DaskTaskRunner(**served_cluster()))
 
 def _name_run() -> str:
     """Return the name that the run was created with, or one of the same form."""
-    what = str(flow_run.parameters.get("match_id") or TITLES[str(flow_run.flow_name)])
+    what = title_of(str(flow_run.flow_name), flow_run.parameters)
     name = str(flow_run.name or "")
     return name if name.startswith(f"{what}, ") else run_name(what)
 
@@ -165,7 +164,10 @@ def ingest(plan: dict[str, Any]) -> list[str]:
     served = ServePlan.model_validate(plan)
 
     def begin(opened: Match, arrival: Arrival) -> str:
-        return _begin(served, opened, arrival)
+        # After a kill, or for a moved folder, a second call returns the existing run.
+        key = f"arrival-{opened.registration.identity}"
+        runs = MatchRuns.of_plan(served)
+        return runs.start(opened.match_id, priority=arrival.priority, key=key).id
 
     decided = take_in(
         Store.create(served.project),
@@ -191,13 +193,6 @@ def ingest(plan: dict[str, Any]) -> list[str]:
             description=f"What arrived in {served.inbox}",
         )
     return [arrival.match_id for arrival in decided if arrival.match_id]
-
-
-def _begin(plan: ServePlan, opened: Match, arrival: Arrival) -> str:
-    runs = MatchRuns(plan.prefect, plan.name, os.environ.get(CLIENT_LOGIN), plan.pages)
-    # After a kill, or for a moved folder, a second call returns the existing run.
-    key = f"arrival-{opened.registration.identity}"
-    return runs.start(opened.match_id, priority=arrival.priority, key=key).id
 
 
 class UnprocessedError(WorldposeError):

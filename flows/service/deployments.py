@@ -4,45 +4,21 @@ from __future__ import annotations
 
 import importlib
 import json
-import logging
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import timedelta
 from typing import Any, Final
-from uuid import UUID
 
-import anyio
-import anyio.abc
 from prefect import Flow
-from prefect.client.orchestration import PrefectClient, get_client
-from prefect.client.schemas.actions import (
-    DeploymentScheduleCreate,
-    DeploymentUpdate,
-    WorkPoolCreate,
-    WorkPoolUpdate,
-)
-from prefect.client.schemas.objects import FlowRun, State
-from prefect.client.schemas.responses import DeploymentResponse
-from prefect.client.schemas.schedules import IntervalSchedule
-from prefect.exceptions import ObjectNotFound, ParameterTypeError, SignatureMismatchError
-from prefect.runner._flow_run_executor import FlowRunExecutorContext
-from prefect.runner._process_manager import ProcessHandle
-from prefect.runner._starter_engine import EngineCommandStarter
-from prefect.states import Failed
 from prefect.utilities.callables import parameter_schema
-from prefect.workers.process import (
-    ProcessJobConfiguration,
-    ProcessWorker,
-    ProcessWorkerResult,
-)
 
+from flows.orchestration.prefect_api import PrefectApi
 from flows.service.forms import form_schema, offer, offered_matches
 from flows.service.layout import PRIORITIES
+from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_name
+from flows.service.worker import JOB_TEMPLATE, Installed, ServedWorker
 from worldpose.errors import InputError
 
-LOG: Final = logging.getLogger("worldpose.operations")
 MODULE: Final = "flows.service.deployed"
 """Module of the deployed flows; it starts Prefect's task runner when it is imported."""
 
@@ -71,11 +47,6 @@ class Deployed:
     parameters: Callable[[ServePlan], dict[str, Any]] = field(default=_of_project)
     interval: str | None = None
     fixed: tuple[str, ...] = ("project",)
-
-    @property
-    def entrypoint(self) -> str:
-        """Module and name: importable wherever worldpose is installed."""
-        return f"{MODULE}.{self.flow}"
 
 
 DEPLOYED: Final = (
@@ -113,7 +84,7 @@ def pools(plan: ServePlan) -> tuple[str, str]:
     return plan.name, f"{plan.name}-arrivals"
 
 
-async def install(plan: ServePlan) -> dict[UUID, Installed]:
+def install(plan: ServePlan) -> dict[str, Installed]:
     """Create what is absent of deployments, pools and queues, and update what differs.
 
     Schedules, tags, pauses, limits and planned runs of a deployment stay as an operator set them.
@@ -124,42 +95,28 @@ async def install(plan: ServePlan) -> dict[UUID, Installed]:
     Raises:
         InputError: another project has deployments of this name at the server.
     """
-    async with get_client() as client:
-        await _refuse_other_project(client, plan)
-        matches, arrivals = pools(plan)
-        await _pool(client, matches, plan.max_concurrent, "Matches, urgent ones first")
-        await _pool(client, arrivals, 1, "What arrives, while matches run")
-        for rank, queue in enumerate(PRIORITIES, 1):
-            await _queue(client, matches, queue, rank)
-        return dict([await _deploy(client, plan, deployed) for deployed in DEPLOYED])
-
-
-async def work(plan: ServePlan, installed: Mapping[UUID, Installed]) -> None:
-    """Run due flow runs until this process ends.
-
-    Args:
-        plan: the served project.
-        installed: flows that can run; a run of any other flow fails.
-    """
-    import anyio
-
+    prefect = MatchRuns.of_plan(plan)
+    _refuse_other_project(prefect, plan)
     matches, arrivals = pools(plan)
-    async with anyio.create_task_group() as group:
-        for pool in (matches, arrivals):
-            worker = ServedWorker(pool, installed)
-            group.start_soon(worker.start, False, False, lambda text: None)
+    for pool, limit, about in (
+        (matches, plan.max_concurrent, "Matches, urgent ones first"),
+        (arrivals, 1, "What arrives, while matches run"),
+    ):
+        values = {"concurrency_limit": limit, "base_job_template": JOB_TEMPLATE}
+        _install(prefect, "work_pools/", pool, values, type=ServedWorker.type, description=about)
+    for rank, queue in enumerate(PRIORITIES, 1):
+        _install(prefect, f"work_pools/{matches}/queues", queue, {"priority": rank})
+    return dict(_deploy(prefect, plan, deployed) for deployed in DEPLOYED)
 
 
-async def _deploy(
-    client: PrefectClient, plan: ServePlan, deployed: Deployed
-) -> tuple[UUID, Installed]:
+def _deploy(prefect: PrefectApi, plan: ServePlan, deployed: Deployed) -> tuple[str, Installed]:
     flow: Flow[..., Any] = getattr(importlib.import_module(MODULE), deployed.flow)
     matches, arrivals = pools(plan)
     parameters = json.loads(json.dumps(deployed.parameters(plan)))
     form = form_schema(parameter_schema(flow).model_dump(), deployed.fixed)
     wanted: dict[str, Any] = {
         "description": deployed.about,
-        "entrypoint": deployed.entrypoint,
+        "entrypoint": f"{MODULE}.{deployed.flow}",
         "path": None,
         "pull_steps": [],
         "job_variables": {},
@@ -170,255 +127,82 @@ async def _deploy(
         "enforce_parameter_schema": False,  # the worker checks, with the flow that it runs
     }
     name = deployment_name(plan.name, deployed.flow)
-    try:
-        there = await client.read_deployment_by_name(name)
-    except ObjectNotFound:
-        schedules = []
-        if deployed.interval is not None:
-            polling = _every(plan, deployed.interval)
-            schedules = [DeploymentScheduleCreate(schedule=polling, slug=POLL)]
-        number = await client.create_deployment(
-            await client.create_flow_from_name(flow.name),
-            name.partition("/")[2],
-            schedules=schedules,
-            **wanted,
+    there = prefect.deployment(name)
+    if there is None:
+        of_flow = prefect.ask("/flows/", {"name": flow.name})["id"]
+        polling = [{"schedule": _every(plan, deployed.interval), "slug": POLL}]
+        there = prefect.ask(
+            "/deployments/",
+            {
+                "name": name.partition("/")[2],
+                "flow_id": of_flow,
+                "schedules": polling if deployed.interval else [],
+                **wanted,
+            },
         )
     else:
-        number = there.id
-        await _update(client, plan, deployed, there, wanted)
+        _update(prefect, plan, deployed, there, wanted)
     fixed = {name: parameters[name] for name in deployed.fixed}
-    return number, Installed(deployed.entrypoint, flow, fixed)
+    return there["id"], Installed(flow, fixed)
 
 
-def _every(plan: ServePlan, option: str) -> IntervalSchedule:
-    return IntervalSchedule(interval=timedelta(minutes=getattr(plan, option)))
+def _every(plan: ServePlan, option: str | None) -> dict[str, float] | None:
+    """Return Prefect's schedule whose interval is an option of the plan."""
+    return None if option is None else {"interval": 60.0 * getattr(plan, option)}
 
 
-async def _update(
-    client: PrefectClient,
+def _update(
+    prefect: PrefectApi,
     plan: ServePlan,
     deployed: Deployed,
-    there: DeploymentResponse,
+    there: Mapping[str, Any],
     wanted: Mapping[str, Any],
 ) -> None:
     """Update what the product decides of a deployment, if it differs.
 
     Each update makes Prefect remove the planned runs and plan them anew.
     """
-    before = there.parameters.get("plan") or {}
+    place = f"/deployments/{there['id']}"
+    before = there["parameters"].get("plan") or {}
     option = deployed.interval
     if option is not None and before.get(option) != getattr(plan, option):
         # Otherwise the schedule stays, also if the operator has changed it or removed it.
-        for schedule in there.schedules:
-            if schedule.slug == POLL:
-                await client.update_deployment_schedule(
-                    there.id, schedule.id, schedule=_every(plan, option)
-                )
+        for schedule in there["schedules"]:
+            if schedule["slug"] == POLL:
+                changed = {"schedule": _every(plan, option)}
+                prefect.ask(f"{place}/schedules/{schedule['id']}", changed, method="PATCH")
     form = wanted["parameter_openapi_schema"]
-    known = {name: value for name, value in there.parameters.items() if name in form["properties"]}
+    known = {name: it for name, it in there["parameters"].items() if name in form["properties"]}
     wanted = {
         **wanted,
         "parameters": {**known, **wanted["parameters"]},
-        "parameter_openapi_schema": offer(form, offered_matches(there.parameter_openapi_schema)),
+        "parameter_openapi_schema": offer(form, offered_matches(there["parameter_openapi_schema"])),
     }
-    if any(getattr(there, name) != value for name, value in wanted.items()):
-        await client.update_deployment(there.id, DeploymentUpdate(**wanted))
+    if any(there[name] != value for name, value in wanted.items()):
+        prefect.ask(place, wanted, method="PATCH")
 
 
-async def _refuse_other_project(client: PrefectClient, plan: ServePlan) -> None:
-    try:
-        there = await client.read_deployment_by_name(plan.match_deployment)
-    except ObjectNotFound:
+def _refuse_other_project(prefect: PrefectApi, plan: ServePlan) -> None:
+    there = prefect.deployment(plan.match_deployment)
+    if there is None or there["parameters"].get("project") == plan.project:
         return
-    project = there.parameters.get("project")
-    if project != plan.project:
-        raise InputError(
-            f"deployment {plan.match_deployment} at {plan.prefect}",
-            expected=f"that of project {plan.project}",
-            found=f"that of {project}",
-            todo=(
-                f"Was the project moved? Move it back, or remove {plan.state}: nothing is lost "
-                "but Prefect's history, and what lies in the inbox is taken in once more."
-                if plan.owns_prefect
-                else "Give this project's deployments another name with --name."
-            ),
-        )
+    raise InputError(
+        f"deployment {plan.match_deployment} at {plan.prefect}",
+        expected=f"that of project {plan.project}",
+        found=f"that of {there['parameters'].get('project')}",
+        todo=(
+            f"Was the project moved? Move it back, or remove {plan.state}: nothing is lost "
+            "but Prefect's history, and what lies in the inbox is taken in once more."
+            if plan.owns_prefect
+            else "Give this project's deployments another name with --name."
+        ),
+    )
 
 
-async def _pool(client: PrefectClient, name: str, limit: int, about: str) -> None:
-    try:
-        await client.read_work_pool(name)
-    except ObjectNotFound:
-        await client.create_work_pool(
-            WorkPoolCreate(
-                name=name,
-                type=ServedWorker.type,
-                base_job_template=JOB_TEMPLATE,
-                concurrency_limit=limit,
-                description=about,
-            )
-        )
+def _install(prefect: PrefectApi, kind: str, name: str, values: dict[str, Any], **new: str) -> None:
+    """Create a pool or a queue, or reset what was changed of it there."""
+    place = f"/{kind.rstrip('/')}/{name}"
+    if prefect.find(place) is None:
+        prefect.ask(f"/{kind}", {"name": name, **new, **values})
     else:
-        # Reset values that were changed there.
-        again = WorkPoolUpdate(concurrency_limit=limit, base_job_template=JOB_TEMPLATE)
-        await client.update_work_pool(name, again)
-
-
-async def _queue(client: PrefectClient, pool: str, name: str, rank: int) -> None:
-    try:
-        queue = await client.read_work_queue_by_name(name, pool)
-    except ObjectNotFound:
-        await client.create_work_queue(name, work_pool_name=pool, priority=rank)
-    else:
-        await client.update_work_queue(queue.id, priority=rank)
-
-
-JOB_TEMPLATE: Final[dict[str, Any]] = {
-    "job_configuration": {"stream_output": "{{ stream_output }}"},
-    "variables": {
-        "type": "object",
-        "properties": {
-            "stream_output": {
-                "type": "boolean",
-                "title": "Stream Output",
-                "default": True,
-                "description": "A run says what it does in the log of its worker.",
-            }
-        },
-        "additionalProperties": False,
-    },
-}
-"""A run of our pools can choose neither command, environment nor folder."""
-
-
-@dataclass(frozen=True)
-class Installed:
-    """A flow that the worker can run.
-
-    Attributes:
-        entrypoint: module and name.
-        flow: the flow.
-        fixed: parameters that a run must not change.
-    """
-
-    entrypoint: str
-    flow: Flow[..., Any]
-    fixed: Mapping[str, Any]
-
-
-class RefusedRunError(Exception):
-    """A run requests something that the worker does not allow."""
-
-
-def require_installed(run: FlowRun, installed: Mapping[UUID, Installed]) -> Installed:
-    """Return the installed flow of a run.
-
-    Args:
-        run: run from the server.
-        installed: flows by deployment id.
-
-    Raises:
-        RefusedRunError: the run belongs to another deployment, sets variables of its job, or has
-            unknown or fixed parameters.
-    """
-    if run.deployment_id is None or run.deployment_id not in installed:
-        raise RefusedRunError("it is of no deployment that was installed with this service")
-    found = installed[run.deployment_id]
-    chosen = sorted(set(run.job_variables or {}) - {"stream_output"})
-    if chosen:
-        raise RefusedRunError(f"a run may not choose {', '.join(chosen)}")
-    for name, value in found.fixed.items():
-        if run.parameters.get(name) != value:
-            raise RefusedRunError(f"parameter {name}: a run may not change it")
-    try:
-        found.flow.validate_parameters(run.parameters)
-    except (ParameterTypeError, SignatureMismatchError, ValueError, TypeError) as error:
-        raise RefusedRunError(f"parameters: {error}") from error
-    return found
-
-
-class _OwnJob(ProcessJobConfiguration):
-    """Job that takes nothing from the server: its templates could read the server's blocks."""
-
-    @classmethod
-    async def from_template_and_values(
-        cls,
-        base_job_template: dict[str, Any],
-        values: dict[str, Any],
-        client: PrefectClient | None = None,
-    ) -> _OwnJob:
-        return cls()
-
-
-class _NoHooks:
-    """Our flows have no hooks; to look for them, Prefect would load the deployment's code."""
-
-    async def run_cancellation_hooks(self, flow_run: FlowRun, state: State[Any]) -> None:
-        """Do nothing."""
-
-    async def run_crashed_hooks(self, flow_run: FlowRun, state: State[Any]) -> None:
-        """Do nothing."""
-
-
-class ServedWorker(ProcessWorker):
-    """Worker that runs installed flows in processes with this process's environment.
-
-    Attributes:
-        installed: flows by deployment id.
-    """
-
-    type = "process"
-    job_configuration = _OwnJob
-
-    def __init__(self, pool: str, installed: Mapping[UUID, Installed]) -> None:
-        super().__init__(pool, name=f"{pool} on this machine", limit=None)
-        self.installed = installed
-
-    @classmethod
-    def __dispatch_key__(cls) -> str:
-        return "worldpose"  # "process" stays Prefect's own worker if requested by type
-
-    async def run(
-        self,
-        flow_run: FlowRun,
-        configuration: ProcessJobConfiguration,
-        task_status: anyio.abc.TaskStatus[int] | None = None,
-    ) -> ProcessWorkerResult:
-        """Run an installed flow to its end; a refused run is set to failed, with the reason."""
-        status = task_status or anyio.TASK_STATUS_IGNORED
-        try:
-            found = require_installed(flow_run, self.installed)
-        except RefusedRunError as refusal:
-            LOG.warning("run %r is refused: %s", flow_run.name, refusal)
-            refused: State[Any] = Failed(message=f"The worker refused this run: {refusal}")
-            await self.client.set_flow_run_state(flow_run.id, refused, force=True)
-            status.started(0)
-            return ProcessWorkerResult(identifier="refused", status_code=0)
-        with tempfile.TemporaryDirectory(suffix="prefect") as folder:
-            async with FlowRunExecutorContext() as context:
-                starter = EngineCommandStarter(
-                    entrypoint=found.entrypoint,
-                    cwd=folder,
-                    stream_output=configuration.stream_output,
-                    control_channel=context.control_channel,
-                )
-                executor = context.create_executor(
-                    flow_run, starter, hook_runner=_NoHooks(), propose_submitting=False
-                )
-                code: list[int | None] = []
-
-                async def execute(
-                    *,
-                    task_status: anyio.abc.TaskStatus[ProcessHandle] = anyio.TASK_STATUS_IGNORED,
-                ) -> None:
-                    done = await executor.submit(task_status=task_status)
-                    code.append(None if done is None else done.status_code)
-
-                async with anyio.create_task_group() as group:
-                    handle = await group.start(execute)
-                    if handle.pid is None:
-                        raise RuntimeError("the process of a run has no id")
-                    status.started(handle.pid)
-        if not code or code[0] is None:
-            raise RuntimeError("the process of a run did not start")
-        return ProcessWorkerResult(identifier=str(handle.pid), status_code=code[0])
+        prefect.ask(place, values, method="PATCH")

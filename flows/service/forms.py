@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from prefect.client.orchestration import get_client
-from prefect.client.schemas.actions import DeploymentUpdate
-from prefect.exceptions import ObjectNotFound
-
 from data_contracts.release import EXPORT_FORMATS
 from flows.method import METHOD
+from flows.service.match_runs import MatchRuns
 from flows.service.plan import ServePlan, deployment_name
 
 STAGES: Final = tuple(stage.name for stage in METHOD)
@@ -80,16 +77,15 @@ def offer(schema: Mapping[str, Any], matches: Sequence[str]) -> dict[str, Any]:
     return {**schema, "properties": fields}
 
 
-async def offer_matches(plan: ServePlan, matches: Sequence[str]) -> None:
+def offer_matches(plan: ServePlan, matches: Sequence[str]) -> None:
     """Let the forms of the deployments offer the registered matches."""
-    async with get_client() as client:
-        for flow in WITH_MATCHES:
-            try:
-                found = await client.read_deployment_by_name(deployment_name(plan.name, flow))
-            except ObjectNotFound:
-                continue  # the worker installs it soon
-            changed = offer(found.parameter_openapi_schema or {}, matches)
-            if changed != found.parameter_openapi_schema:
-                await client.update_deployment(
-                    found.id, DeploymentUpdate(parameter_openapi_schema=changed)
-                )
+    prefect = MatchRuns.of_plan(plan)
+    for flow in WITH_MATCHES:
+        found = prefect.deployment(deployment_name(plan.name, flow))
+        if found is None:
+            continue  # the worker installs it soon
+        form = found["parameter_openapi_schema"] or {}
+        changed = offer(form, matches)
+        if changed != form:
+            update = {"parameter_openapi_schema": changed}
+            prefect.ask(f"/deployments/{found['id']}", update, method="PATCH")

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from data_contracts.operations import Serving
-from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, authorization
+from flows.orchestration.prefect_api import PrefectApi, UnreachablePrefectError, parse_time
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN, problem_at
 from flows.service.layout import StateFolder, is_alive
-from flows.service.plan import FLOWS, deployment_names
+from flows.service.plan import FLOWS, deployment_name, deployment_names
 
 WORKER_SECONDS: Final = 90.0
 """Without a heartbeat for so long, a worker counts as lost; it sends one every 30 s."""
 LOW_DISK_GB: Final = 1.0
 """With less free space, computation will soon fail [GB]."""
+AGAIN: Final = "End worldpose serve and begin it again: it installs what is missing."
 
 
 @dataclass(frozen=True)
@@ -53,15 +51,17 @@ def check(state: StateFolder) -> list[Finding]:
         return [Finding("serve", False, f"nothing serves this project: {was}", begin)]
     pid = serving.services["serve"].pid
     found = [Finding("serve", True, f"process {pid}, since {serving.started_at:%Y-%m-%d %H:%M}Z")]
-    found += _processes(state, serving)
-    found += _check_answer(state, serving)
-    found += at_prefect(serving, _login(state, serving))
-    found += _inbox(state, serving)
-    found.append(_disk(state.folder))
+    found += _check_processes(state, serving)
+    found += _check_servers(state, serving)
+    found += at_prefect(serving, state.client_login(serving))
+    found.append(_check_inbox(state, serving))
+    free = shutil.disk_usage(state.folder).free / 1e9
+    remedy = "Free some: worldpose gc --keep-last 3 --delete."
+    found.append(Finding("disk", free >= LOW_DISK_GB, f"{free:.1f} GB free", remedy))
     return found
 
 
-def _processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+def _check_processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     for name, service in serving.services.items():
         if name != "serve" and not is_alive(service.pid):
             log = state.logs / f"{name}.log"
@@ -69,7 +69,7 @@ def _processes(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, "its process has ended", remedy)
 
 
-def _check_answer(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+def _check_servers(state: StateFolder, serving: Serving) -> Iterator[Finding]:
     addresses = {"prefect": f"{serving.prefect}/health"}
     for name, path in (("pages", "/api/health"), ("watch", "/health")):
         service = serving.services.get(name)
@@ -77,7 +77,7 @@ def _check_answer(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             origin = "/".join(service.address.split("/")[:3])
             addresses[name] = origin.replace("0.0.0.0", "127.0.0.1") + path
     for name, address in addresses.items():
-        problem = _ask(address)[1]
+        problem = problem_at(address)
         if not problem:
             yield Finding(name, True, f"answers at {address}")
         elif name == "prefect" and not serving.owns_prefect:
@@ -87,113 +87,54 @@ def _check_answer(state: StateFolder, serving: Serving) -> Iterator[Finding]:
             yield Finding(name, False, problem, f"See {log}; end worldpose serve and begin again.")
 
 
-def _login(state: StateFolder, serving: Serving) -> str | None:
-    if not serving.owns_prefect:
-        return os.environ.get(CLIENT_LOGIN)
-    try:
-        return os.environ.get(SERVER_LOGIN) or state.prefect_login.read_text().strip()
-    except OSError:
-        return None  # the check then reports that the server refuses
-
-
-def at_prefect(serving: Serving, login: str | None = None) -> Iterator[Finding]:
-    """Check that deployments exist, and that a worker takes their runs.
+def at_prefect(serving: Serving, login: str | None) -> Iterator[Finding]:
+    """Check that deployments exist, that a worker takes their runs, and that no run hangs.
 
     Args:
         serving: the served project.
         login: login of clients at its server; None = it needs none.
     """
-    again = "End worldpose serve and begin it again: it installs what is missing."
-    ask = _ask if login is None else partial(_ask, login=login)
-    deployments, problem = ask(
-        f"{serving.prefect}/deployments/filter",
-        {"deployments": {"name": {"any_": deployment_names(serving.name)}}},
-    )
-    if problem:
+    prefect = PrefectApi(serving.prefect, login, tries=1)
+    try:
+        names = {flow: deployment_name(serving.name, flow) for flow in FLOWS}
+        missing = [flow for flow, name in names.items() if prefect.deployment(name) is None]
+        words = f"missing: {', '.join(missing)}" if missing else ", ".join(FLOWS)
+        yield Finding("deployments", not missing, words, AGAIN)
+        for pool in (serving.name, f"{serving.name}-arrivals"):
+            yield _check_worker(prefect, pool)
+        before = {"before_": (datetime.now(UTC) - timedelta(days=1)).isoformat()}
+        long = {"state": {"name": {"any_": ["Running"]}}, "expected_start_time": before}
+        named = {"name": {"any_": deployment_names(serving.name)}}
+        late = prefect.ask("/flow_runs/count", {"deployments": named, "flow_runs": long})
+    except UnreachablePrefectError as error:
         variable = SERVER_LOGIN if serving.owns_prefect else CLIENT_LOGIN
-        is_refused = problem.endswith(" 401")
-        remedy = f"Set {variable} as it was when the service began." if is_refused else ""
-        yield Finding("deployments", False, problem, remedy or "Fix prefect first.")
+        remedy = "Fix prefect first."
+        if error.status == 401:
+            remedy = f"Set {variable} as it was when the service began."
+        yield Finding("deployments", False, f"Prefect {error.problem}", remedy)
         return
-    offered = {each["name"] for each in _flows(serving, deployments, ask)}
-    missing = set(FLOWS) - offered
-    words = f"missing: {', '.join(sorted(missing))}" if missing else ", ".join(sorted(offered))
-    yield Finding("deployments", not missing, words, again)
-    for pool in (serving.name, f"{serving.name}-arrivals"):
-        address = f"{serving.prefect}/work_pools/{pool}/workers/filter"
-        workers, problem = ask(address, {})
-        seen = [_time(each["last_heartbeat_time"]) for each in workers or ()]
-        silent = (datetime.now(UTC) - max(seen)).total_seconds() if seen else float("inf")
-        is_well = not problem and silent < WORKER_SECONDS
-        words = f"was heard of {silent:.0f} s ago" if seen else problem or "never heard of"
-        yield Finding(f"worker of {pool}", is_well, words, f"See the log worker.log. {again}")
-    late, problem = ask(
-        f"{serving.prefect}/flow_runs/count",
-        {
-            "deployments": {"name": {"any_": deployment_names(serving.name)}},
-            "flow_runs": {
-                "state": {"name": {"any_": ["Running"]}},
-                "expected_start_time": {
-                    "before_": (datetime.now(UTC) - timedelta(days=1)).isoformat()
-                },
-            },
-        },
-    )
     if late:
-        yield Finding(
-            "runs",
-            False,
-            f"{late} seem to run for more than a day",
-            f"Look at them at {serving.prefect.removesuffix('/api')}, and cancel what hangs.",
-        )
+        dashboard = serving.prefect.removesuffix("/api")
+        remedy = f"Look at them at {dashboard}, and cancel what hangs."
+        yield Finding("runs", False, f"{late} seem to run for more than a day", remedy)
 
 
-def _flows(
-    serving: Serving, deployments: list[Mapping[str, Any]], ask: Callable[..., tuple[Any, str]]
-) -> list[Mapping[str, Any]]:
-    ids = sorted({each["flow_id"] for each in deployments})
-    asked = {"flows": {"id": {"any_": ids}}}
-    flows, problem = ask(f"{serving.prefect}/flows/filter", asked)
-    return [] if problem else flows
+def _check_worker(prefect: PrefectApi, pool: str) -> Finding:
+    remedy = f"See the log worker.log. {AGAIN}"
+    if prefect.find(f"/work_pools/{pool}") is None:
+        return Finding(f"worker of {pool}", False, "its pool is missing", remedy)
+    workers = prefect.ask(f"/work_pools/{pool}/workers/filter", {})
+    seen = [parse_time(each["last_heartbeat_time"]) for each in workers]
+    silent = (datetime.now(UTC) - max(seen)).total_seconds() if seen else float("inf")
+    words = f"was heard of {silent:.0f} s ago" if seen else "never heard of"
+    return Finding(f"worker of {pool}", silent < WORKER_SECONDS, words, remedy)
 
 
-def _inbox(state: StateFolder, serving: Serving) -> Iterator[Finding]:
+def _check_inbox(state: StateFolder, serving: Serving) -> Finding:
     inbox = Path(serving.inbox)
     if not os.access(inbox, os.R_OK | os.X_OK):
         remedy = f"Make the folder {inbox}, readable for this user."
-        yield Finding("inbox", False, "cannot be read", remedy)
-        return
+        return Finding("inbox", False, "cannot be read", remedy)
     arrivals = list(state.arrivals().values())
     refused = [each for each in arrivals if each.state == "refused"]
-    words = f"{len(arrivals)} known, {len(refused)} refused"
-    yield Finding("inbox", True, words)
-
-
-def _disk(folder: Path) -> Finding:
-    free = shutil.disk_usage(folder).free / 1e9
-    remedy = "Free some: worldpose gc --keep-last 3 --delete."
-    return Finding("disk", free >= LOW_DISK_GB, f"{free:.1f} GB free", remedy)
-
-
-def _ask(
-    address: str, body: Mapping[str, Any] | None = None, login: str | None = None
-) -> tuple[Any, str]:
-    """Request an address; return the response, and an error message if it failed."""
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    data = None if body is None else json.dumps(body).encode()
-    headers = {"content-type": "application/json"}
-    if login:
-        headers["authorization"] = authorization(login)
-    request = urllib.request.Request(address, data, headers)
-    try:
-        with opener.open(request, timeout=10) as answer:
-            content = answer.read()
-    except urllib.error.HTTPError as error:
-        return None, f"{address} answers {error.code}"
-    except (OSError, ValueError) as error:
-        return None, f"{address} does not answer: {getattr(error, 'reason', error)}"
-    return (json.loads(content) if body is not None else content), ""
-
-
-def _time(text: str) -> datetime:
-    return datetime.fromisoformat(text.replace("Z", "+00:00"))
+    return Finding("inbox", True, f"{len(arrivals)} known, {len(refused)} refused")

@@ -10,11 +10,11 @@ import hashlib
 import os
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from data_contracts.operations import Arrival, ArrivalState, Priority
 from flows.registering import register
@@ -63,58 +63,6 @@ def entries(inbox: Path) -> Iterator[Entry]:
         is_queue = entry.name in PRIORITIES and entry.path.is_dir() and not entry.path.is_symlink()
         if not is_queue or _is_match(entry.path):
             yield entry
-
-
-def look(
-    inbox: Path, known: Mapping[str, Arrival], *, now: float, quiet: float
-) -> list[tuple[Entry, Arrival, bool]]:
-    """Return each arrival that is not taken yet, its state now, and whether to take it in.
-
-    The caller must hold the lock of the arrivals.
-
-    It is complete when match.yaml is there and nothing changed for `quiet` seconds. A refused or
-    incomplete arrival is checked again after a change.
-
-    Args:
-        inbox: the folder.
-        known: previous states, by name.
-        now: time on the machine's monotonic clock [s].
-        quiet: required time without changes [s].
-    """
-    found = []
-    for entry in entries(inbox):
-        before = known.get(entry.name)
-        if before is not None and before.state == "taken":
-            continue
-        try:
-            fingerprint = fingerprint_of(entry.path)
-        except RefusalError as refusal:
-            found.append((entry, _change_arrival(entry, before, "refused", str(refusal)), False))
-            continue
-        except OSError as error:  # it changes during the scan, or is not readable
-            reason = f"cannot be read: {error.strerror}"
-            found.append((entry, _change_arrival(entry, before, "incomplete", reason), False))
-            continue
-        is_same = before is not None and before.fingerprint == fingerprint
-        # We hold the lock, so a process that began an intake is dead.
-        deaths = before.deaths + before.is_begun if before is not None and is_same else 0
-        # The clock restarts at a reboot: then the quiet time starts again.
-        since = before.unchanged_since if before is not None and is_same else now
-        since = min(since, now)
-        if is_same and before is not None and before.state in ("refused", "incomplete"):
-            found.append((entry, before, False))
-            continue
-        arrival = _change_arrival(
-            entry,
-            before,
-            "arriving",
-            f"taken in when nothing of it has changed for {quiet:g} s{_describe_deaths(deaths)}",
-            fingerprint=fingerprint,
-            unchanged_since=since,
-            deaths=deaths,
-        )
-        found.append((entry, arrival, is_same and now - since >= quiet))
-    return found
 
 
 def fingerprint_of(path: Path) -> str:
@@ -174,11 +122,11 @@ def missing_of(path: Path) -> str:
     return ""
 
 
-def change_state(
-    arrival: Arrival, state: ArrivalState, reason: str, **more: str | bool | None
-) -> Arrival:
-    """Return the arrival in another state."""
-    update = {"state": state, "reason": reason, "changed_at": datetime.now(UTC), **more}
+def change_state(arrival: Arrival, state: ArrivalState, reason: str, **more: Any) -> Arrival:  # noqa: ANN401
+    """Return the arrival in another state, or with other fields; the time is that of the state."""
+    is_news = (arrival.state, arrival.reason) != (state, reason)
+    changed_at = datetime.now(UTC) if is_news else arrival.changed_at
+    update = {"state": state, "reason": reason, "changed_at": changed_at, **more}
     return arrival.model_copy(update=update)
 
 
@@ -222,38 +170,6 @@ def _require_plain(name: str) -> None:
         raise RefusalError(f"the name {name!a} has characters that names here may not have")
 
 
-def _describe_deaths(deaths: int) -> str:
-    if deaths == 0:
-        return ""
-    return f"; the process that took it in died {deaths} time{'s' if deaths > 1 else ''}"
-
-
-def _change_arrival(
-    entry: Entry,
-    before: Arrival | None,
-    state: ArrivalState,
-    reason: str,
-    *,
-    fingerprint: str = "",
-    unchanged_since: float = 0.0,
-    deaths: int = 0,
-) -> Arrival:
-    arrival = Arrival(
-        name=entry.name,
-        state=state,
-        reason=reason,
-        priority=entry.priority,
-        fingerprint=fingerprint,
-        unchanged_since=unchanged_since,
-        deaths=deaths,
-        changed_at=datetime.now(UTC),
-    )
-    is_news = before is None or (before.state, before.reason) != (state, reason)
-    if not is_news and before is not None:
-        return arrival.model_copy(update={"changed_at": before.changed_at})
-    return arrival
-
-
 MAX_DEATHS: Final = 2
 """Processes that end during the intake of an arrival before it is refused."""
 
@@ -270,7 +186,7 @@ def watch_once(state: StateFolder, inbox: Path, quiet: float) -> list[str]:
         quiet: time without changes after which an arrival is complete [s].
     """
     with state.only_one("arrivals", wait=False) as is_held:
-        ready = _look_at_entries(state, inbox, quiet) if is_held else []
+        ready = _scan(state, inbox, quiet) if is_held else []
     return [f"{each.name} {each.fingerprint} {each.deaths}" for _, each in ready]
 
 
@@ -292,7 +208,7 @@ def take_in(
     """
     decided = []
     with state.only_one("arrivals", wait=True):
-        ready = _look_at_entries(state, inbox, quiet)
+        ready = _scan(state, inbox, quiet)
         for entry, arrival in sorted(ready, key=lambda each: each[1].deaths):
             result = _take(store, state, entry, arrival, begin)
             state.write_arrival(result)
@@ -322,17 +238,56 @@ def _take(
         raise
 
 
-def _look_at_entries(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Arrival]]:
-    known = state.arrivals()
-    seen = look(inbox, known, now=time.monotonic(), quiet=quiet)
-    names = {arrival.name for _, arrival, _ in seen}
+def _scan(state: StateFolder, inbox: Path, quiet: float) -> list[tuple[Entry, Arrival]]:
+    """Save the state of the inbox, and return the entries to take in; the caller holds the lock."""
+    known, names, ready = state.arrivals(), set(), []
+    for entry in entries(inbox):
+        names.add(entry.name)
+        before = known.get(entry.name)
+        if before is not None and before.state == "taken":
+            continue
+        arrival, is_ready = _look_at(entry, before, quiet)
+        if arrival != before:
+            state.write_arrival(arrival)
+        if is_ready:
+            ready.append((entry, arrival))
     for name, before in known.items():
         if before.state != "taken" and name not in names:
             state.forget_arrival(name)
-    for _, arrival, _ in seen:
-        if arrival != known.get(arrival.name):
-            state.write_arrival(arrival)
-    return [(entry, arrival) for entry, arrival, is_ready in seen if is_ready]
+    return ready
+
+
+def _look_at(entry: Entry, before: Arrival | None, quiet: float) -> tuple[Arrival, bool]:
+    """Return the state of an entry now, and whether to take it in.
+
+    It is complete when nothing changed for `quiet` seconds. A refused or incomplete arrival is
+    checked again after a change.
+    """
+    arrival = before or Arrival(
+        name=entry.name, state="arriving", priority=entry.priority, changed_at=datetime.now(UTC)
+    )
+    try:
+        fingerprint = fingerprint_of(entry.path)
+    except RefusalError as refusal:
+        return change_state(arrival, "refused", str(refusal), fingerprint=""), False
+    except OSError as error:  # it changes during the scan, or is not readable
+        reason = f"cannot be read: {error.strerror}"
+        return change_state(arrival, "incomplete", reason, fingerprint=""), False
+    is_same = arrival.fingerprint == fingerprint
+    if is_same and arrival.state in ("refused", "incomplete"):
+        return arrival, False
+    now = time.monotonic()
+    # The clock restarts at a reboot: then the quiet time starts again.
+    since = min(arrival.unchanged_since, now) if is_same else now
+    # We hold the lock, so a process that began an intake is dead.
+    deaths = arrival.deaths + arrival.is_begun if is_same else 0
+    reason = f"taken in when nothing of it has changed for {quiet:g} s"
+    if deaths:
+        times = f"{deaths} time{'s' if deaths > 1 else ''}"
+        reason += f"; the process that took it in died {times}"
+    update = {"unchanged_since": since, "deaths": deaths, "is_begun": False}
+    arrival = change_state(arrival, "arriving", reason, fingerprint=fingerprint, **update)
+    return arrival, is_same and now - since >= quiet
 
 
 def _decide(store: Store, entry: Entry, arrival: Arrival, begin: Begin) -> Arrival:

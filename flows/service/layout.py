@@ -14,6 +14,7 @@ from typing import Final
 from pydantic import ValidationError
 
 from data_contracts.operations import Arrival, Priority, Serving
+from flows.orchestration.prefect_environment import CLIENT_LOGIN, SERVER_LOGIN
 from worldpose.errors import UsageError
 from worldpose.formats.files import whole_file
 from worldpose.store.blobs import storage_errors
@@ -93,6 +94,15 @@ class StateFolder:
     def prefect_login(self) -> Path:
         """Login of clients at our own Prefect server; readable by this user only."""
         return self.folder / "secrets" / "prefect"
+
+    def client_login(self, serving: Serving) -> str | None:
+        """Return the login of clients at the server of a project; None if it is not known."""
+        if not serving.owns_prefect or "WORLDPOSE_STATE" in os.environ:  # a part of the service
+            return os.environ.get(CLIENT_LOGIN)
+        try:
+            return os.environ.get(SERVER_LOGIN) or self.prefect_login.read_text().strip()
+        except OSError:
+            return None  # the server's refusal then says so
 
     @property
     def alert_settings(self) -> Path:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cache
 from typing import Final, Literal
 
 from data_contracts.review import ReviewRecord, ReviewRequest
-from data_contracts.run import ResultManifest, RunRecord
+from data_contracts.run import RunRecord
 from flows.gates import GATES
 from flows.method import METHOD
 from flows.results.timings import Cost
@@ -104,8 +106,8 @@ class Overview:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._manifests: dict[tuple[str, str, str], ResultManifest] = {}
-        self._poses: dict[tuple[str, str], tuple[datetime, float]] = {}
+        self._manifest = cache(store.manifest)
+        self._poses = cache(lambda match_id, run_id: _poses_of(store.run(match_id, run_id)))
         self._known: dict[str, tuple[object, MatchStatus]] = {}
         self._read_at: dict[str, float] = {}
         self._seen_at: dict[str, float] = {}
@@ -134,16 +136,12 @@ class Overview:
 
     def poses(self) -> list[tuple[datetime, float]]:
         """Return for each run of any match its end and the number of fitted bodies."""
-        found = {}
+        found = []
         for match_id in self.store.matches():
             for run_id in self.store.runs(match_id):
-                key = (match_id, run_id)
-                try:
-                    found[key] = self._poses.get(key) or _poses_of(self.store.run(match_id, run_id))
-                except (OSError, WorldposeError):  # `look` reports it
-                    continue
-        self._poses = found
-        return list(found.values())
+                with suppress(OSError, WorldposeError):  # `look` reports it
+                    found.append(self._poses(match_id, run_id))
+        return found
 
     def _match(self, match_id: str) -> None:
         """Read the status of a match again after a new run or journal entry, or when it is old."""
@@ -170,7 +168,10 @@ class Overview:
         units: dict[str, list[UnitSummary]] = {}
         for name, glance in (
             *((name, self._result(run, name, records, asked)) for name in sorted(run.results)),
-            *((each.unit, _failed_unit(each.unit, each.message)) for each in run.failed),
+            *(
+                (it.unit, UnitSummary(_unit(it.unit), "failed", why=it.message))
+                for it in run.failed
+            ),
             *((name, UnitSummary(_unit(name), "blocked")) for name in run.blocked),
         ):
             units.setdefault(name.partition("/")[0], []).append(glance)
@@ -187,14 +188,15 @@ class Overview:
         records: tuple[ReviewRecord, ...],
         asked: Mapping[str, ReviewRequest],
     ) -> UnitSummary:
-        manifest = self._manifest(run.match_id, name, run.results[name])
+        stage, _, unit = name.partition("/")
+        manifest = self._manifest(run.match_id, stage, unit, run.results[name])
         decision = last_decision(records, name, manifest.content)
         is_approved = decision is not None and decision.verdict == "approve"
-        gate = {each.stage: each for each in GATES}.get(name.partition("/")[0])
+        gate = {each.stage: each for each in GATES}.get(stage)
         objections = () if gate is None or is_approved else gate.objections(manifest.figures)
         waits = next((each for each in run.waiting if each.unit == name), None)
         done = UnitSummary(
-            _unit(name),
+            unit,
             "done",
             manifest.seconds,
             manifest.figures,
@@ -207,22 +209,10 @@ class Overview:
         since = run.finished_at if request is None else request.created_at
         return replace(done, state="waiting", waiting_since=since, why=all_reasons(waits.reasons))
 
-    def _manifest(self, match_id: str, name: str, key: str) -> ResultManifest:
-        stage, _, unit = name.partition("/")
-        known = self._manifests.get((match_id, name, key))
-        if known is None:
-            known = self.store.manifest(match_id, stage, unit, key)
-            self._manifests[match_id, name, key] = known
-        return known
-
 
 def age(since: datetime | None) -> float:
     """Return the elapsed time [s]; never negative, even if the clock was changed."""
     return 0.0 if since is None else max(0.0, (datetime.now(UTC) - since).total_seconds())
-
-
-def _failed_unit(name: str, message: str) -> UnitSummary:
-    return UnitSummary(_unit(name), "failed", why=message)
 
 
 def _unit(name: str) -> str:

@@ -9,7 +9,6 @@ from pydantic import Field
 from data_contracts.records import Name, Record
 from flows.service.layout import StateFolder
 
-METRICS_PORT = 8573
 FLOWS = ("match", "ingest", "reprocess", "release", "finetune")
 """Flows that the Prefect server offers, known without importing Prefect."""
 TITLES = {"ingest": "inbox", "reprocess": "stale matches", "finetune": "fine-tuning"}
@@ -60,7 +59,7 @@ class ServePlan(Record):
     """Further names of this machine in browsers and scrapers."""
     pages_port: int = 8571
     """Port of the review and status pages."""
-    metrics_port: int = METRICS_PORT
+    metrics_port: int = 8573
     """Port of the metrics for Prometheus."""
     certificate: Path | None = None
     """PEM file of the pages' certificate."""
@@ -99,8 +98,3 @@ class ServePlan(Record):
     def match_deployment(self) -> str:
         """Name of the Prefect deployment that processes matches."""
         return deployment_name(self.name, "match")
-
-    @property
-    def ingest_deployment(self) -> str:
-        """Prefect's name of the deployment that registers arrivals."""
-        return deployment_name(self.name, "ingest")

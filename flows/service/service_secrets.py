@@ -45,27 +45,23 @@ class Secrets:
 
     def of(self, part: str, plan: ServePlan) -> dict[str, str]:
         """Return only the secrets that a part needs."""
-        environ = os.environ
-        names: list[str] = []
-        found: dict[str, str] = {}
+        urls = [plan.project, *([plan.bucket or ""] if part == "watch" else [])]
+        cloud = [name for name in os.environ if name.startswith("AWS_")]
+        names = {
+            "prefect": DATABASE,
+            "worker": (CLOUD_LOGIN, LINEAGE),
+            "watch": (CLOUD_LOGIN, *ALERTS),
+            "pages": (CLOUD_LOGIN,),
+        }[part]
+        if part != "prefect" and any("://" in url for url in urls):
+            names = (*names, *cloud)
+        found = {name: os.environ[name] for name in names if name in os.environ}
         if part == "prefect":
-            names += DATABASE
             found[SERVER_LOGIN] = self.prefect or ""
-        else:
-            names.append(CLOUD_LOGIN)
-            if self.prefect is not None:
-                found[CLIENT_LOGIN] = self.prefect
-            urls = [plan.project, *([plan.bucket or ""] if part == "watch" else [])]
-            if any("://" in url for url in urls):
-                names += [name for name in environ if name.startswith("AWS_")]
-        if part == "worker":
-            names.append(LINEAGE)
-        if part == "watch":
-            names += ALERTS
-            found[METRICS_TOKEN] = self.metrics
-        if part == "pages":
-            found[PAGES_TOKEN] = self.pages
-        return {**{name: environ[name] for name in names if name in environ}, **found}
+        elif self.prefect is not None:
+            found[CLIENT_LOGIN] = self.prefect
+        own = {"watch": {METRICS_TOKEN: self.metrics}, "pages": {PAGES_TOKEN: self.pages}}
+        return found | own.get(part, {})
 
 
 def secrets_of(plan: ServePlan, pages: str) -> Secrets:

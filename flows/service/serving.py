@@ -9,8 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.request
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -21,7 +20,12 @@ from urllib.parse import urlsplit
 
 from data_contracts.operations import Service, Serving
 from flows.orchestration.prefect_database import begin_database, keep_database
-from flows.orchestration.prefect_environment import one_authority, require_login, served_environment
+from flows.orchestration.prefect_environment import (
+    one_authority,
+    problem_at,
+    require_login,
+    served_environment,
+)
 from flows.service.health import at_prefect
 from flows.service.layout import PRIORITIES
 from flows.service.plan import ServePlan
@@ -50,7 +54,8 @@ class _Part:
 
     Attributes:
         name: name of the part.
-        address: address for health checks.
+        address: address for people.
+        log: file of its output.
         process: None until its restart.
         said: size of its log before the start [byte].
         began: start time on the monotonic clock [s].
@@ -60,11 +65,27 @@ class _Part:
 
     name: str
     address: str | None
+    log: Path
     process: subprocess.Popen[bytes] | None = None
     said: int = 0
     began: float = 0.0
     pause: float = 0.0
     due: float = 0.0
+
+    def wait_until(self, is_well: Callable[[], bool], told: threading.Event) -> None:
+        """Wait until it is well, or the service is told to end.
+
+        Raises:
+            WorldposeError: it ended, or took too long.
+        """
+        deadline = time.monotonic() + BEGIN_SECONDS
+        while not told.wait(0.2):
+            has_ended = self.process is None or self.process.poll() is not None
+            if has_ended or time.monotonic() > deadline:
+                said = self.log.read_bytes()[self.said :].decode(errors="replace")
+                raise WorldposeError(f"{self.name} did not start. It said:\n{said[-2000:]}")
+            if is_well():
+                return
 
 
 @dataclass
@@ -83,7 +104,7 @@ class _Supervisor:
     parts: list[_Part] = field(default_factory=list)
 
     def start(self, name: str, address: str | None = None) -> _Part:
-        part = _Part(name, address)
+        part = _Part(name, address, self.plan.state_folder.logs / f"{name}.log")
         self.parts.append(part)
         self._begin(part)
         return part
@@ -92,21 +113,20 @@ class _Supervisor:
         """Restart parts that have ended."""
         now = time.monotonic()
         for part in self.parts:
-            bound_log(self.plan.state_folder.logs / f"{part.name}.log")
+            bound_log(part.log)
             if part.process is not None and part.process.poll() is not None:
                 code = part.process.returncode
                 is_steady = now - part.began > STEADY_SECONDS
                 part.pause = 0.0 if is_steady else min(2.0 * part.pause + 1.0, LONGEST_PAUSE)
                 part.due, part.process = now + part.pause, None
-                log = self.plan.state_folder.logs / f"{part.name}.log"
                 self.tell(
-                    f"{part.name} ended ({code}), see {log}; it restarts in {part.pause:.0f} s"
+                    f"{part.name} ended ({code}), see {part.log}; it restarts in {part.pause:.0f} s"
                 )
             elif part.process is None and now >= part.due:
                 self._begin(part)
                 self.write()
 
-    def write(self) -> None:
+    def write(self) -> Serving:
         """Write the plan and processes to the state folder."""
         plan = self.plan
         services = {
@@ -114,18 +134,17 @@ class _Supervisor:
             for part in self.parts
             if part.process is not None
         }
-        services["serve"] = Service(pid=os.getpid())
-        plan.state_folder.write_serving(
-            Serving(
-                project=plan.project,
-                inbox=str(plan.inbox),
-                name=plan.name,
-                prefect=plan.prefect,
-                owns_prefect=plan.owns_prefect,
-                services=services,
-                started_at=datetime.now(UTC),
-            )
+        serving = Serving(
+            project=plan.project,
+            inbox=str(plan.inbox),
+            name=plan.name,
+            prefect=plan.prefect,
+            owns_prefect=plan.owns_prefect,
+            services={**services, "serve": Service(pid=os.getpid())},
+            started_at=datetime.now(UTC),
         )
+        plan.state_folder.write_serving(serving)
+        return serving
 
     def end(self) -> None:
         """End all parts in reverse order: runs end before the server that they report to."""
@@ -142,16 +161,13 @@ class _Supervisor:
                 process.wait()
 
     def _begin(self, part: _Part) -> None:
-        log = self.plan.state_folder.logs / f"{part.name}.log"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        bound_log(log)
-        with log.open("ab") as output:
+        part.log.parent.mkdir(parents=True, exist_ok=True)
+        bound_log(part.log)
+        child = [sys.executable, "-m", "flows.service.child"]
+        with part.log.open("ab") as output:
             part.said = output.tell()
             part.process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "flows.service.child"),
-                    *(part.name, self.plan.model_dump_json()),
-                ],
+                [*child, part.name, self.plan.model_dump_json()],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -187,7 +203,7 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 found=f"another process; see {state.serving}",
                 todo="Read its state with --check, or end it first.",
             )
-        require_free_ports(_ports(plan))
+        _require_free_ports(plan)
         with _until_told() as told:
             supervisor = _Supervisor(plan, secrets, tell)
             try:
@@ -202,8 +218,7 @@ def serve(plan: ServePlan, secrets: Secrets, ready: Callable[[], None], tell: Te
                 state.serving.unlink(missing_ok=True)
 
 
-def _ports(plan: ServePlan) -> dict[str, tuple[str, int]]:
-    """Return the ports that this service opens, by option."""
+def _require_free_ports(plan: ServePlan) -> None:
     ports = {
         "--port": (plan.host, plan.pages_port),
         "--metrics-port": (plan.host, plan.metrics_port),
@@ -211,7 +226,7 @@ def _ports(plan: ServePlan) -> dict[str, tuple[str, int]]:
     if plan.owns_prefect:
         address = urlsplit(plan.prefect)
         ports["--prefect-port"] = (address.hostname or "127.0.0.1", address.port or 80)
-    return ports
+    require_free_ports(ports)
 
 
 def bound_log(log: Path) -> None:
@@ -226,36 +241,19 @@ def bound_log(log: Path) -> None:
     os.truncate(log, 0)
 
 
-def answers(address: str) -> bool:
-    """Return whether one of our servers answers at `address` within seconds."""
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    try:
-        with opener.open(address, timeout=5) as answer:
-            return bool(answer.status == 200)
-    except (OSError, ValueError):
-        return False
-
-
-def health_addresses(plan: ServePlan) -> Mapping[str, str]:
-    """Return the health check address of each part."""
-    local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
-    return {
-        "prefect": f"{plan.prefect}/health",
-        "pages": f"http://{local}:{plan.pages_port}/api/health",
-        "watch": f"http://{local}:{plan.metrics_port}/health",
-    }
-
-
 def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
     plan = supervisor.plan
-    addresses = health_addresses(plan)
+    local = "127.0.0.1" if plan.host in ("0.0.0.0", "::") else plan.host
+
+    def wait_for(part: _Part, health: str) -> None:
+        part.wait_until(lambda: not problem_at(health), told)
+
     if plan.owns_prefect:
         is_first = begin_database(plan.state / "prefect")
-        part = supervisor.start("prefect", plan.prefect)
-        _wait_for(supervisor, part, lambda: answers(addresses["prefect"]), told)
+        wait_for(supervisor.start("prefect", plan.prefect), f"{plan.prefect}/health")
         if is_first and not told.is_set():
             keep_database(plan.state / "prefect")
-    elif not answers(addresses["prefect"]):
+    elif problem_at(f"{plan.prefect}/health"):
         raise UsageError(
             f"PREFECT_API_URL={plan.prefect}",
             expected="a running Prefect server",
@@ -267,34 +265,17 @@ def _bring_up(supervisor: _Supervisor, told: threading.Event) -> None:
     pages = supervisor.start("pages", plan.pages)
     worker = supervisor.start("worker")
     watch = supervisor.start("watch", f"http://{plan.host}:{plan.metrics_port}/metrics")
-    supervisor.write()
+    serving, login = supervisor.write(), supervisor.secrets.prefect
     if plan.certificate is None:
-        _wait_for(supervisor, pages, lambda: answers(addresses["pages"]), told)
-    _wait_for(supervisor, watch, lambda: answers(addresses["watch"]), told)
-    serving = plan.state_folder.read_serving()
-    if serving is not None:
-        login = supervisor.secrets.prefect
-        _wait_for(supervisor, worker, lambda: _is_at_work(serving, login), told)
+        wait_for(pages, f"http://{local}:{plan.pages_port}/api/health")
+    wait_for(watch, f"http://{local}:{plan.metrics_port}/health")
 
+    def is_at_work() -> bool:
+        """Return whether a worker takes runs; a hanging run is handled elsewhere."""
+        findings = at_prefect(serving, login)
+        return all(finding.is_well for finding in findings if finding.part != "runs")
 
-def _is_at_work(serving: Serving, login: str | None) -> bool:
-    """Return whether a worker takes runs; a hanging run is handled elsewhere."""
-    findings = at_prefect(serving, login)
-    return all(finding.is_well for finding in findings if finding.part != "runs")
-
-
-def _wait_for(
-    supervisor: _Supervisor, part: _Part, is_well: Callable[[], bool], told: threading.Event
-) -> None:
-    deadline = time.monotonic() + BEGIN_SECONDS
-    while not told.wait(0.2):
-        process = part.process
-        if process is None or process.poll() is not None or time.monotonic() > deadline:
-            log = supervisor.plan.state_folder.logs / f"{part.name}.log"
-            said = log.read_bytes()[part.said :].decode(errors="replace")
-            raise WorldposeError(f"{part.name} did not start. It said:\n{said[-2000:]}")
-        if is_well():
-            return
+    worker.wait_until(is_at_work, told)
 
 
 def environment_of(plan: ServePlan) -> dict[str, str]:

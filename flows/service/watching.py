@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import logging
 import os
-import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from typing import Any, Final
+from threading import Thread
+from typing import Final
 
-from prefect.client.orchestration import get_client
-from prefect.client.schemas.objects import FlowRun, State
-from prefect.deployments import arun_deployment
-
+from flows.orchestration.prefect_api import of_types, parse_time
 from flows.service.alerts import AlertDispatcher, FailedRun, alerts_now
+from flows.service.channels import Channel, channels_of
 from flows.service.forms import offer_matches
 from flows.service.inbox import watch_once
-from flows.service.match_runs import run_name
-from flows.service.metrics import ProjectMetrics, metrics_server
+from flows.service.match_runs import MatchRuns, run_name
+from flows.service.metrics import MAX_SCRAPES, ProjectMetrics, metrics_app
 from flows.service.overview import Overview
-from flows.service.plan import ServePlan
+from flows.service.plan import ServePlan, deployment_names
 from flows.service.recovery import (
     ENDED_BADLY,
+    PrefectRun,
     may_restart,
     name_scheduled_runs,
-    project_runs,
     restart_lost_runs,
 )
-from flows.service.senders import Sender, senders_of
 from flows.service.service_secrets import METRICS_TOKEN
+from flows.web.http_server import serve_http
 from worldpose.store.store import Store
 
 INBOX_SECONDS: Final = 2.0
@@ -43,7 +39,7 @@ BUCKET_SECONDS: Final = 10.0
 ALERT_SECONDS: Final = 30.0
 """Between two checks for alerts and lost runs."""
 DELIVERY_SECONDS: Final = 2.0
-"""Between two checks of a sender for outstanding alerts."""
+"""Between two checks of a channel for outstanding alerts."""
 TROUBLE_SECONDS: Final = 3600.0
 """Between two log lines about a lasting failure."""
 TROUBLE_LENGTH: Final = 500
@@ -59,24 +55,31 @@ LOG = logging.getLogger("worldpose.operations")
 
 
 def watch(plan: ServePlan) -> None:
-    """Watch until this process ends."""
-    store = Store.create(plan.project)
-    metrics = ProjectMetrics(store, plan.state_folder)
-    server = metrics_server(plan, metrics, os.environ[METRICS_TOKEN])
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    asyncio.run(_watch(plan, store))
+    """Watch, and serve metrics, until this process ends."""
+    store, state = Store.create(plan.project), plan.state_folder
+    dispatcher = AlertDispatcher(state, channels_of(os.environ, state.alert_settings))
+    # Each at its own interval: none blocks another.
+    _start("looking at the inbox", INBOX_SECONDS, lambda: _look_at_inbox(plan))
+    if plan.bucket is not None:
+        from flows.service.bucket import BucketInbox  # imported here: object storage is an extra
 
-
-async def _watch(plan: ServePlan, store: Store) -> None:
-    dispatcher = AlertDispatcher(
-        plan.state_folder, senders_of(os.environ, plan.state_folder.alert_settings)
-    )
-    await asyncio.gather(  # each at its own interval: none blocks another
-        _watch_bucket(plan),
-        _watch_inbox(plan),
-        _watch_lost_runs(plan, store),
-        _watch_alerts(plan, store, dispatcher),
-        *(_deliver(dispatcher, sender) for sender in dispatcher.senders),
+        bucket = BucketInbox(plan.bucket, plan.inbox, state)
+        settle = plan.settle_seconds
+        fetch = lambda: bucket.fetch(time.monotonic(), settle)  # noqa: E731
+        _start("looking at the bucket", BUCKET_SECONDS, fetch)
+    _start("naming runs and matches", ALERT_SECONDS, lambda: _name_all(plan, store))
+    _start("looking for lost runs", ALERT_SECONDS, _restart_lost_runs(plan))
+    _start("looking for alerts", ALERT_SECONDS, _hold_alerts(plan, store, dispatcher))
+    for channel in dispatcher.channels:
+        Thread(target=_deliver, args=(dispatcher, channel), daemon=True).start()
+    app = metrics_app(plan, ProjectMetrics(store, state), os.environ[METRICS_TOKEN])
+    serve_http(
+        app,
+        host=plan.host,
+        port=plan.metrics_port,
+        max_connections=MAX_SCRAPES,
+        server_header=False,
+        timeout_graceful_shutdown=2,
     )
 
 
@@ -110,85 +113,71 @@ class Trouble:
                 self._said = None
 
 
-async def _watch_bucket(plan: ServePlan) -> None:
-    if plan.bucket is None:
-        return
-    from flows.service.bucket import BucketInbox  # imported here: object storage is an extra
+def _start(what: str, seconds: float, step: Callable[[], object]) -> None:
+    """Repeat a step in a thread of its own until this process ends."""
+    trouble = Trouble(what)
 
-    bucket = BucketInbox(plan.bucket, plan.inbox, plan.state_folder)
-    trouble = Trouble("looking at the bucket")
-    while True:
-        with trouble.log_failure():
-            await asyncio.to_thread(bucket.fetch, time.monotonic(), plan.settle_seconds)
-        await asyncio.sleep(BUCKET_SECONDS)
+    def repeat() -> None:
+        while True:
+            with trouble.log_failure():
+                step()
+            time.sleep(seconds)
 
-
-async def _watch_inbox(plan: ServePlan) -> None:
-    trouble = Trouble("looking at the inbox")
-    while True:
-        began = time.monotonic()
-        with trouble.log_failure():
-            ready = await asyncio.to_thread(
-                watch_once, plan.state_folder, plan.inbox, plan.settle_seconds
-            )
-            if ready:
-                await _ingest(plan, ready)
-        took = time.monotonic() - began
-        await asyncio.sleep(max(INBOX_SECONDS, 10.0 * took))
+    Thread(target=repeat, name=what, daemon=True).start()
 
 
-async def _ingest(plan: ServePlan, ready: list[str]) -> None:
+def _look_at_inbox(plan: ServePlan) -> None:
     """Start the intake of arrivals now; a second call for the same ones starts no second run."""
-    key = hashlib.sha256("\n".join(sorted(ready)).encode()).hexdigest()[:16]
-    await arun_deployment(
-        plan.ingest_deployment,
-        timeout=0,
-        as_subflow=False,
-        idempotency_key=f"arrived-{key}",
-        flow_run_name=run_name("arrivals"),
-    )
+    began = time.monotonic()
+    ready = watch_once(plan.state_folder, plan.inbox, plan.settle_seconds)
+    if ready:
+        key = hashlib.sha256("\n".join(sorted(ready)).encode()).hexdigest()[:16]
+        MatchRuns.of_plan(plan).create_run(
+            "ingest", name=run_name("arrivals"), idempotency_key=f"arrived-{key}"
+        )
+    time.sleep(9.0 * (time.monotonic() - began))  # a tenth of the time, however long a scan takes
 
 
-async def _watch_lost_runs(plan: ServePlan, store: Store) -> None:
-    trouble, naming = Trouble("looking for lost runs"), Trouble("naming runs and matches")
+def _name_all(plan: ServePlan, store: Store) -> None:
+    name_scheduled_runs(plan)
+    offer_matches(plan, store.matches())
+
+
+def _restart_lost_runs(plan: ServePlan) -> Callable[[], None]:
     looked: datetime | None = None  # the first look takes all runs that ever failed
-    while True:
-        with naming.log_failure():
-            await name_scheduled_runs(plan)
-            await offer_matches(plan, await asyncio.to_thread(store.matches))
-        await asyncio.sleep(ALERT_SECONDS)
-        with trouble.log_failure():
-            now = datetime.now(UTC)
-            since = None if looked is None else min(looked, now) - LOOK_BACK
-            await restart_lost_runs(plan, since=since)
-            looked = now
+
+    def restart() -> None:
+        nonlocal looked
+        now = datetime.now(UTC)
+        restart_lost_runs(plan, since=None if looked is None else min(looked, now) - LOOK_BACK)
+        looked = now
+
+    return restart
 
 
-async def _watch_alerts(plan: ServePlan, store: Store, dispatcher: AlertDispatcher) -> None:
-    overview = Overview(store)
-    at_prefect = Trouble("asking Prefect for failed runs")
-    trouble = Trouble("looking for alerts")
+def _hold_alerts(plan: ServePlan, store: Store, dispatcher: AlertDispatcher) -> Callable[[], None]:
+    overview, at_prefect = Overview(store), Trouble("asking Prefect for failed runs")
     failed: list[FailedRun] = []
     began = datetime.now(UTC)
-    while True:
-        await asyncio.sleep(ALERT_SECONDS)
+
+    def hold() -> None:
+        nonlocal failed
         with at_prefect.log_failure():
-            failed = await failed_runs(plan, began)
-        with trouble.log_failure():
-            matches = await asyncio.to_thread(overview.look)
-            arrivals = plan.state_folder.arrivals().values()
-            await asyncio.to_thread(dispatcher.hold, alerts_now(plan, matches, arrivals, failed))
+            failed = failed_runs(plan, began)
+        arrivals = plan.state_folder.arrivals().values()
+        dispatcher.hold(alerts_now(plan, overview.look(), arrivals, failed))
+
+    return hold
 
 
-async def _deliver(dispatcher: AlertDispatcher, sender: Sender) -> None:
-    """Deliver alerts to one sender in its own thread, so that a slow sender delays no other."""
-    pool = ThreadPoolExecutor(1, thread_name_prefix=sender.name)
+def _deliver(dispatcher: AlertDispatcher, channel: Channel) -> None:
+    pause = 0.0
     while True:
-        await asyncio.sleep(DELIVERY_SECONDS)
-        await asyncio.get_running_loop().run_in_executor(pool, dispatcher.deliver, sender)
+        time.sleep(pause or DELIVERY_SECONDS)
+        pause = dispatcher.deliver(channel, pause)
 
 
-async def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
+def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
     """Return failed runs of this project's deployments that do not restart, or have not in time.
 
     Args:
@@ -196,30 +185,27 @@ async def failed_runs(plan: ServePlan, began: datetime) -> list[FailedRun]:
         began: start of the restarts; runs that ended before had to wait for it.
     """
     now = datetime.now(UTC)
-    async with get_client() as client:
-        since = now - timedelta(days=FAILED_DAYS)
-        runs = await project_runs(client, plan, ENDED_BADLY, ended_since=since)
-    overdue = now - RESTART_PATIENCE
+    since = {"after_": (now - timedelta(days=FAILED_DAYS)).isoformat()}
+    runs = MatchRuns.of_plan(plan).runs(
+        deployment_names(plan.name), state=of_types(*ENDED_BADLY), end_time=since
+    )
 
-    def describe(run: FlowRun) -> str | None:
-        message = _describe_state(run.state)
+    def describe(run: PrefectRun) -> str | None:
+        message = str((run["state"] or {}).get("message") or "")
         if not may_restart(run):
             return message
-        is_overdue = max(run.end_time or began, began) <= overdue
+        ended = parse_time(run["end_time"]) if run["end_time"] else began
+        is_overdue = max(ended, began) <= now - RESTART_PATIENCE
         return f"{message}; it was not restarted" if is_overdue else None
 
     return [
         FailedRun(
-            str(run.id),
-            run.name,
-            str(run.state_name).lower(),
+            run["id"],
+            run["name"],
+            str(run["state_name"]).lower(),
             message,
-            str(run.parameters.get("match_id") or ""),
+            str(run["parameters"].get("match_id") or ""),
         )
         for run in runs
         if (message := describe(run)) is not None
     ]
-
-
-def _describe_state(state: State[Any] | None) -> str:
-    return "" if state is None else str(state.message or "")

@@ -18,6 +18,7 @@ from fastapi import Depends, HTTPException, Request
 from data_contracts.review import ReviewRequest
 from data_contracts.run import EXIT_CODES
 from data_contracts.static_calibration import ClickedMarkings
+from flows.orchestration.prefect_api import UnreachablePrefectError
 from flows.orchestration.prefect_environment import has_server
 from flows.registering import open_for_review
 from flows.review.verdicts import resume
@@ -26,7 +27,6 @@ from flows.service.match_runs import (
     AT_WORK,
     QUEUED,
     MatchRun,
-    UnreachablePrefectError,
     match_runs_of,
 )
 from flows.stage import Match

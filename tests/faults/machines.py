@@ -19,10 +19,10 @@ from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
     SERVER_LOGIN,
     new_login,
+    problem_at,
     served_environment,
 )
 from flows.service.plan import ServePlan
-from flows.service.serving import answers
 
 START_SECONDS = 300.0
 """Time limit for starting a process: machines are busy."""
@@ -140,8 +140,8 @@ class Machines:
         dask: address of the scheduler.
     """
 
-    def __init__(self, folder, workers=2, megabytes=96, preload=None):
-        self.folder, self.workers, self.preload = folder, workers, preload
+    def __init__(self, folder, workers=2, megabytes=96):
+        self.folder, self.workers = folder, workers
         self.link, self.small = Link(), Disk(folder / "disk", megabytes)
         self.disk = self.small.folder
         here = self.link.here
@@ -164,7 +164,7 @@ class Machines:
                     environment[SERVER_LOGIN] = self.environment[CLIENT_LOGIN]
                 self.parts[name] = Part(command, environment, self.folder / f"{name}.log")
                 self.parts[name].start()
-            self._wait_until(lambda: answers(f"{self.api}/health"))
+            self._wait_until(lambda: not problem_at(f"{self.api}/health"))
             host, port = self.dask.removeprefix("tcp://").split(":")
             self._wait_until(lambda: _listens(host, int(port)))
             self._stack = stack.pop_all()
@@ -193,8 +193,6 @@ class Machines:
         scheduler = ["distributed.cli.dask_scheduler", "--host", host, "--port", port]
         worker = ["distributed.cli.dask_worker", self.dask, "--nthreads", "1"]
         worker += ["--host", self.link.there, "--memory-limit", "0", "--no-dashboard"]
-        if self.preload is not None:
-            worker += ["--preload", str(self.preload)]
         return {
             "prefect": [*python, "flows.service.child", "prefect", plan.model_dump_json()],
             "scheduler": [*python, *scheduler, "--no-dashboard"],

@@ -30,6 +30,8 @@ from worldpose.simulation.scenarios import SCENARIOS
 WORLDPOSE = [sys.executable, "-c", "from flows.cli import main; main()"]
 SMALL = {"duration": 0.2, "cameras": 3, "players": 2}
 LANES = 2
+MATCHES = 3
+"""Number per round."""
 STUCK_SECONDS = 420.0
 """A run without progress for this long hangs, whatever the fault was [s]."""
 MAX_STARTS = 60
@@ -58,13 +60,11 @@ class Stream:
     Attributes:
         machines: the machines that compute.
         folders: match folders.
-        max_starts: maximum number of starts per match.
         problems: descriptions of what went wrong.
     """
 
     machines: Machines
     folders: list
-    max_starts: int = 1
     problems: list = field(default_factory=list)
     endings: Counter = field(default_factory=Counter)
     tracebacks: list = field(default_factory=list)
@@ -101,7 +101,7 @@ class Stream:
         return found
 
     def _until_done(self, folder):
-        for _ in range(self.max_starts):
+        for _ in range(MAX_STARTS):
             code, said = self._run(folder)
             self.begun += 1
             if code == 0:
@@ -111,9 +111,7 @@ class Stream:
             if UNFORESEEN in said:
                 self.tracebacks.append(said[said.index(UNFORESEEN) :][-3000:])
             time.sleep(1.0)
-        self.problems.append(
-            f"{folder.name} was begun {self.max_starts} times and is not done: {said}"
-        )
+        self.problems.append(f"{folder.name} was begun {MAX_STARTS} times and is not done: {said}")
 
     def _run(self, folder):
         command = ["run", str(folder), "--project", str(self.project), "--dask", self.machines.dask]
@@ -141,7 +139,7 @@ class Stream:
         return process.returncode, log.read_text(errors="replace")
 
 
-def disturb(stream, dice, kinds, pause, faults):
+def disturb(stream, dice, pause, faults):
     """Faults until the stream is over."""
     machines = stream.machines
 
@@ -156,7 +154,7 @@ def disturb(stream, dice, kinds, pause, faults):
 
     while not stream.is_over.is_set():
         wait(dice.uniform(*pause))
-        kind = dice.choice(kinds)
+        kind = dice.choice(list(FAULTS))
         seconds, target = dice.uniform(*FAULTS[kind]), dice.random()
         held = None if stream.is_over.is_set() else _strike(stream, kind, target)
         if held is None:
@@ -197,41 +195,26 @@ def _strike(stream, kind, target):
     return (name,)
 
 
-def soak(
-    minutes,
-    seed,
-    folder,
-    matches=3,
-    preload=None,
-    kinds=tuple(FAULTS),
-    between=BETWEEN,
-    max_starts=MAX_STARTS,
-):
+def soak(minutes, seed, folder):
     """Run matches under random faults, and return the report as plain values.
 
     Args:
         minutes: time during which rounds start; the last round still ends.
         seed: of the faults.
         folder: a new folder for matches and projects.
-        matches: number per round.
-        preload: a file that workers load when they begin, in which a test spoils them.
-        kinds: of faults.
-        between: from the end of one to the next, as a share of an undisturbed match's time.
-        max_starts: maximum number of starts per match.
     """
     folders = []
-    for number in range(matches):
+    for number in range(MATCHES):
         folders.append(folder / f"match-{number}")
         options = {**SMALL, "calibrated": True, "stills": False, "video": False}
         simulate_match(SCENARIOS["tiny"], number, folders[-1], MatchOptions(**options))
     faults, rounds, problems = [], [], []
-    with Machines(folder / "machines", preload=preload) as machines:
+    with Machines(folder / "machines") as machines:
         stream = Stream(machines, folders)
         undisturbed = folder / "undisturbed"
         calm = stream.round(undisturbed)
         problems += [f"undisturbed: {each}" for each in stream.problems]
         stream.problems.clear()
-        stream.max_starts = max_starts
         began = time.monotonic()
         dice = random.Random(seed)
         while time.monotonic() - began < 60.0 * minutes and not problems:
@@ -240,9 +223,9 @@ def soak(
             stream.project = project
             stream.is_over.clear()
             struck = []
-            pause = [share * min(calm.values()) for share in between]  # others compiled kernels
+            pause = [share * min(calm.values()) for share in BETWEEN]  # others compiled kernels
             trouble = threading.Thread(
-                target=disturb, args=(stream, dice, list(kinds), pause, struck), daemon=True
+                target=disturb, args=(stream, dice, pause, struck), daemon=True
             )
             trouble.start()
             seconds = stream.round(project)
@@ -263,8 +246,8 @@ def soak(
         "seed": seed,
         "minutes": round(took / 60.0, 1),
         "rounds": len(rounds),
-        "matches_done": stream.done - matches,
-        "runs_begun": stream.begun - matches,
+        "matches_done": stream.done - MATCHES,
+        "runs_begun": stream.begun - MATCHES,
         "seconds_a_match_undisturbed": calm,
         "seconds_a_match": summary_of([each for round_ in rounds for each in round_.values()]),
         "faults": by_kind(faults),

@@ -6,13 +6,12 @@ import os
 import random
 import signal
 import subprocess
-import time
 from contextlib import contextmanager
 
 import pytest
 from checker import differences
 from command_line import WORLDPOSE, succeed
-from test_killed_runs import assert_nothing_half_written, assert_same_store, files_of
+from test_killed_runs import assert_nothing_half_written, assert_same_store
 
 from data_contracts.review import DeletedDetection
 from flows import iterate
@@ -119,23 +118,6 @@ def test_killed_at_a_random_commit_point_of_the_loop(seed, short, undisturbed, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_the_whole_command_killed_at_a_random_moment(seed, server, short, tmp_path):
-    undisturbed, project = tmp_path / "undisturbed", tmp_path / "project"
-    succeed("run", short, "--project", undisturbed, *LOOPED)
-    moment = random.Random(seed).randrange(1, len(files_of(undisturbed)) - 1)
-    process = start(short, project)
-    while len(files_of(project)) < moment:
-        assert process.poll() is None, "the run ended before it was killed"
-        time.sleep(0.002)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    assert_nothing_half_written(project)
-    succeed("run", short, "--project", project, *LOOPED)
-    assert_same_store(project, undisturbed)
-
-
-@pytest.mark.slow
 def test_two_loops_over_one_match_at_once_end_with_one_result(server, short, tmp_path):
     undisturbed, project = tmp_path / "undisturbed", tmp_path / "project"
     succeed("run", short, "--project", undisturbed, *LOOPED)
@@ -210,21 +192,6 @@ def test_an_edit_at_a_random_moment_of_the_loop(seed, short, undisturbed, edited
     assert_every_run_is_of_one_piece(project)
     assert standing(project) in (standing(reference), standing(edited))
     loop(project, short, None)
-    assert standing(project) == standing(edited)
-
-
-@pytest.mark.slow
-def test_an_edit_while_the_command_is_at_work(server, short, undisturbed, edited, tmp_path):
-    project = tmp_path / "project"
-    process = start(short, project)
-    while not list(project.glob("results/*/triangulation/*/*/manifest.json")):
-        assert process.poll() is None, "the run ended before the edit"
-        time.sleep(0.01)
-    delete_a_box(project)
-    assert process.wait() == 0
-    assert_every_run_is_of_one_piece(project)
-    assert standing(project) in (standing(undisturbed[0]), standing(edited))
-    succeed("run", short, "--project", project, *LOOPED)
     assert standing(project) == standing(edited)
 
 

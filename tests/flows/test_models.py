@@ -8,13 +8,12 @@ import re
 import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from data_contracts.checkpoint import Checkpoint
-from flows.checkpoint_downloads import CATALOG, pull, resolve_address
+from flows.checkpoint_downloads import pull, read_catalog, resolve_address
 from flows.cli.app import app
 from worldpose.detection.models import load_detectors, weights_of
 from worldpose.detection.settings import DetectionSettings
@@ -22,6 +21,7 @@ from worldpose.errors import InputError, UsageError, WorldposeError
 
 REVISION = "0123456789abcdef0123456789abcdef01234567"
 NET = os.urandom(3 << 20)
+CATALOG = read_catalog(None)
 CONFIG = b'{"model_type": "rt_detr"}'
 
 
@@ -30,57 +30,40 @@ class Hub(BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
 
-    def do_HEAD(self):
-        self.answer(with_body=False)
-
     def do_GET(self):
-        self.answer(with_body=True)
-
-    def answer(self, *, with_body):
         hub = self.server
         hub.asked.append((self.command, self.path, self.headers.get("Range")))
         found = re.fullmatch(rf"/team/net/resolve/{REVISION}/(.+)", self.path)
         if found and found[1] in hub.large:
             content = hub.large[found[1]]
-            linked = hub.linked.get(found[1], hashlib.sha256(content).hexdigest())
-            headers = {
-                "Location": hub.elsewhere or f"{hub.contents}/cdn/{found[1]}",
-                "X-Linked-Etag": f'"{linked}"',
-                "X-Linked-Size": str(len(content)),
-                "X-Repo-Commit": REVISION,
-            }
-            self.send(302, b"", headers)
+            self.send(302, b"", {"Location": hub.elsewhere or f"{hub.contents}/cdn/{found[1]}"})
         elif found and found[1] in hub.small:
-            content = hub.small[found[1]]
-            etag = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
-            headers = {"ETag": f'"{etag}"', "X-Repo-Commit": REVISION}
-            self.send(200, content, headers, with_body=with_body)
+            self.send(200, hub.small[found[1]], {})
         elif self.path.startswith("/cdn/"):
             content = hub.large[self.path.removeprefix("/cdn/")]
             start = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range") or "")
             first = int(start[1]) if start and hub.has_ranges else 0
-            headers = {"ETag": f'"{hashlib.sha256(content).hexdigest()}"'}
+            headers = {}
             if start and first >= len(content):
                 self.send(416, b"", {"Content-Range": f"bytes */{len(content)}"})
                 return
             if start and hub.has_ranges:
                 headers["Content-Range"] = f"bytes {first}-{len(content) - 1}/{len(content)}"
             status = 206 if "Content-Range" in headers else 200
-            self.send(status, content[first:], headers, with_body=with_body)
+            self.send(status, content[first:], headers)
         else:
             self.send(404, b"", {})
 
-    def send(self, status, content, headers, *, with_body=True):
+    def send(self, status, content, headers):
         self.send_response(status)
         for name, value in headers.items():
             self.send_header(name, value)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
-        if with_body:
-            cut = self.server.cut_after
-            self.wfile.write(content[:cut])
-            if cut is not None and len(content) > cut:
-                self.close_connection = True
+        cut = self.server.cut_after
+        self.wfile.write(content[:cut])
+        if cut is not None and len(content) > cut:
+            self.close_connection = True
 
     def log_message(self, *_):
         pass
@@ -91,7 +74,7 @@ def hub(monkeypatch):
     """The local hub; `HF_ENDPOINT` names it."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), Hub)
     server.large, server.small = {"model.safetensors": NET}, {"config.json": CONFIG}
-    server.asked, server.linked, server.elsewhere = [], {}, None
+    server.asked, server.elsewhere = [], None
     server.cut_after, server.has_ranges = None, True
     server.url = f"http://127.0.0.1:{server.server_port}"
     server.contents = f"http://localhost:{server.server_port}"  # another host, as the hub has it
@@ -148,15 +131,6 @@ def test_a_checkpoint_is_pulled_once_and_found_by_its_name(hub, tmp_path, monkey
     assert weights_of(DetectionSettings(detector="model:toy")) != before
 
 
-def test_the_local_hub_speaks_the_protocol_that_the_hubs_own_client_expects(hub, tmp_path):
-    client = pytest.importorskip("huggingface_hub")
-    for name, content in (("model.safetensors", NET), ("config.json", CONFIG)):
-        path = client.hf_hub_download(
-            "team/net", name, revision=REVISION, endpoint=hub.url, cache_dir=tmp_path, token=False
-        )
-        assert Path(path).read_bytes() == content
-
-
 def test_an_interrupted_pull_shows_nothing_and_goes_on_where_it_stopped(hub, tmp_path):
     hub.cut_after = 1_500_000
     with pytest.raises(WorldposeError, match="resumes where it stopped"):
@@ -171,20 +145,16 @@ def test_an_interrupted_pull_shows_nothing_and_goes_on_where_it_stopped(hub, tmp
 
 def test_a_server_without_ranges_sends_the_whole_file_again(hub, tmp_path):
     hub.cut_after = 1_500_000
-    with pytest.raises(WorldposeError, match=r"connection ended|IncompleteRead"):
+    with pytest.raises(WorldposeError, match="RemoteProtocolError"):
         pull(checkpoint(), tmp_path, quiet)
     hub.cut_after, hub.has_ranges = None, False
     place = pull(checkpoint(), tmp_path, quiet)
     assert (place / "files" / "model.safetensors").read_bytes() == NET
 
 
-def test_another_file_than_the_pinned_one_is_refused_before_and_after_the_download(hub, tmp_path):
+def test_another_file_than_the_pinned_one_is_refused(hub, tmp_path):
     other = bytes(len(NET))
     hub.large["model.safetensors"] = other
-    with pytest.raises(InputError, match=f"expected SHA-256 {digest(NET)}, found {digest(other)}"):
-        pull(checkpoint(), tmp_path, quiet)
-    assert not any(path.startswith("/cdn/") for _, path, _ in hub.asked)
-    hub.linked["model.safetensors"] = digest(NET)  # the hub says one thing, and sends another
     with pytest.raises(InputError, match=f"expected SHA-256 {digest(NET)}, found {digest(other)}"):
         pull(checkpoint(), tmp_path, quiet)
     assert not list(tmp_path.rglob("model.safetensors*"))
@@ -193,7 +163,6 @@ def test_another_file_than_the_pinned_one_is_refused_before_and_after_the_downlo
 
 def test_a_file_longer_than_pinned_is_not_downloaded_to_its_end(hub, tmp_path):
     hub.large["model.safetensors"] = NET + NET
-    hub.linked["model.safetensors"] = digest(NET)
     with pytest.raises(WorldposeError, match=f"longer than {len(NET)} bytes"):
         pull(checkpoint(), tmp_path, quiet)
     assert not list(tmp_path.rglob("model.safetensors*"))
@@ -217,9 +186,9 @@ def test_a_net_in_a_zip_archive_is_taken_out_and_checked(hub, tmp_path):
 
 
 def test_a_missing_file_and_a_silent_host_are_clear_errors(hub, tmp_path):
-    with pytest.raises(WorldposeError, match="404: Not Found"):
+    with pytest.raises(WorldposeError, match="404 Not Found"):
         pull(single(f"{hub.url}/absent", b""), tmp_path, quiet)
-    with pytest.raises(WorldposeError, match=r"refused.*Run the command again"):
+    with pytest.raises(WorldposeError, match=r"ConnectError.*Run the command again"):
         pull(single("http://127.0.0.1:9/net", b""), tmp_path, quiet)
 
 
@@ -228,7 +197,7 @@ def test_only_safe_addresses_are_followed(hub, tmp_path):
         with pytest.raises(UsageError, match="https://HOST/PATH"):
             resolve_address(url)
     hub.elsewhere = "http://192.0.2.1/stolen"
-    with pytest.raises(WorldposeError, match="302"):
+    with pytest.raises(WorldposeError, match="stolen"):
         pull(checkpoint(), tmp_path, quiet)
 
 

@@ -2,16 +2,13 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 from command_line import TINY, succeed, worldpose
-from store_comparison import compare_stores
 
 from flows.orchestration.prefect_environment import CLIENT_LOGIN, authorization
 from worldpose.store.store import Store
@@ -59,51 +56,6 @@ def test_a_run_is_visible_at_the_server_by_name(server, tiny, tmp_path):
     assert run["parameters"]["match_id"] == TINY
     tasks = {task["name"] for task in ask("task_runs") if task["flow_run_id"] == run["id"]}
     assert {"tracking clip", "triangulation clip"} <= tasks
-
-
-def test_dask_workers_of_their_own_give_the_same_bytes(server, tiny, tiny_run, tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker"]
-    processes = [
-        subprocess.Popen(
-            [*dask, "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        ),
-        *(
-            subprocess.Popen(
-                [*worker, address, "--nthreads", "1", "--no-dashboard"],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                cwd=tmp_path,
-            )
-            for _ in range(2)
-        ),
-    ]
-    try:
-        wait_for_port(port)
-        project = tmp_path / "worldpose-data"
-        succeed("run", tiny, "--project", project, "--dask", address)
-        assert compare_stores(Store.open(str(project)), Store.open(str(tiny_run))) == []
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait()
-
-
-def wait_for_port(port):
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.1)
-    raise TimeoutError(port)
 
 
 @pytest.mark.slow

@@ -93,18 +93,17 @@ def require_answers_for_its_run_alone():
     return login
 
 
-def test_a_database_that_is_there_stays(tmp_path, kept):
+def test_a_database_is_copied_and_kept_only_where_there_is_none_and_a_place(tmp_path, kept):
+    keep_database(tmp_path)  # there is none: it is elsewhere
+    assert not kept.exists()
     kept.parent.mkdir()
     kept.write_bytes(b"empty")
     (tmp_path / DATABASE).write_bytes(b"full")
     assert not begin_database(tmp_path)
     assert (tmp_path / DATABASE).read_bytes() == b"full"
-
-
-def test_without_a_place_to_keep_it_every_server_makes_its_own(tmp_path, kept):
-    kept.parent.touch()  # a file where the folder should be
-    assert begin_database(tmp_path)
-    (tmp_path / DATABASE).touch()
+    kept.unlink()
+    kept.parent.rmdir()
+    kept.parent.touch()  # a file where the folder should be: every server makes its own
     keep_database(tmp_path)
     assert begin_database(tmp_path / "another")
 
@@ -118,27 +117,18 @@ def test_a_project_in_which_no_server_can_write_says_what_to_do(tmp_path, kept):
         pass
 
 
-def test_a_database_elsewhere_is_not_kept(tmp_path, kept):
-    keep_database(tmp_path)
-    assert not kept.exists()
-
-
-def test_one_authority_is_read_instead_of_all(tmp_path, monkeypatch):
+def test_one_authority_is_read_by_those_on_this_machine_who_talk_plainly(tmp_path, monkeypatch):
     monkeypatch.delenv(AUTHORITIES, raising=False)
     file = one_authority(tmp_path)[AUTHORITIES]
     assert len(ssl.create_default_context(cafile=file).get_ca_certs()) == 1
-    monkeypatch.setenv(AUTHORITIES, "/of/somebody.pem")
-    assert one_authority(tmp_path)[AUTHORITIES] == "/of/somebody.pem"
-
-
-def test_only_those_on_this_machine_who_talk_plainly_are_given_it(tmp_path, monkeypatch):
-    monkeypatch.delenv(AUTHORITIES, raising=False)
     own = {"prefect": "http://127.0.0.1:4200/api"}
     plan = ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path, **own)
     assert AUTHORITIES in environment_of(plan)
     # Workers elsewhere do not see the file, and another's server may be one with TLS.
     for other in ({"dask": "tcp://far:8786"}, {"owns_prefect": False}):
         assert AUTHORITIES not in environment_of(plan.model_copy(update=other))
+    monkeypatch.setenv(AUTHORITIES, "/of/somebody.pem")
+    assert one_authority(tmp_path)[AUTHORITIES] == "/of/somebody.pem"
 
 
 def test_a_prefect_server_without_a_login_does_not_start():

@@ -1,7 +1,6 @@
 // An operator's day on the pages: a match from videos, its calibration, run, corrections, results and schedule. Prints what
 // was seen as one JSON object.
 
-import { existsSync, writeFileSync } from "node:fs";
 import { clicking, open, shoot, shootSizes, task, tell } from "../chromium.mjs";
 
 const seen = { errors: [], outside: [], states: [] };
@@ -12,20 +11,10 @@ const matchPage = `${task.pages}/#/match/${match}`;
 const state = async () => (await page.request.get(`${task.pages}/api/matches/${match}`)).json();
 const settled = () => page.waitForLoadState("networkidle", { timeout: 5000 }).catch(() => {});
 const until = async (what, isSo) => {
-  // Where the test kills the service, it does not answer for a while.
-  const isNow = () => isSo().catch((error) => (task.kills ? false : Promise.reject(error)));
-  for (const end = Date.now() + 1000 * task.patience; !(await isNow()); ) {
+  for (const end = Date.now() + 1000 * task.patience; !(await isSo()); ) {
     if (Date.now() > end) throw new Error(`waited for ${what} in vain`);
     await page.waitForTimeout(1000);
   }
-};
-let kills = 0;
-// From now on the test kills the service once and starts it again; returns whether it has.
-const survive = () => {
-  if (!task.kills) return () => true;
-  const number = kills++;
-  writeFileSync(`${task.kills}.${number}`, "");
-  return () => existsSync(`${task.kills}.${number}.restarted`);
 };
 
 const STEPS = [create, calibrate, answer, correct, complete, mend, watch, download, schedule, leave];
@@ -91,8 +80,7 @@ async function answer() {
   await page.click("button >> text=Run it");
   await page.waitForSelector(".progress");
   await shootSizes(page, seen, "running");
-  const isBack = survive();
-  await until("a question", async () => isBack() && (await state()).waiting.length > 0 && (await state()).at_work?.state !== "running");
+  await until("a question", async () => (await state()).waiting.length > 0 && (await state()).at_work?.state !== "running");
   seen.asked = (await state()).waiting.map((each) => each.unit);
   await page.waitForSelector(".evidence figure img", { timeout: 120000 });
   await settled();
@@ -120,13 +108,11 @@ async function correct() {
 // Whatever else waits is approved, until the run is complete.
 async function complete() {
   await page.goto(matchPage);
-  const isBack = survive();
   await until("a complete run", async () => {
     const now = await state();
     const at = now.at_work?.state === "running" ? "running" : now.run?.state;
     if (seen.states.at(-1) !== at) seen.states.push(at);
     if (at === "failed") throw new Error(`the run failed: ${JSON.stringify(now.failures)}`);
-    if (!isBack()) return false;
     if (at === "waiting" && now.waiting.some((each) => !each.rejected)) {
       await page.locator("button.first >> text=Approve").first().click();
       await page.waitForTimeout(1500);
@@ -198,7 +184,6 @@ async function download() {
 
 // Every night, what has become stale is computed again: Prefect's own page has the schedule.
 async function schedule() {
-  if (task.kills) seen.errors = seen.errors.filter((text) => !/ERR_CONNECTION|ERR_EMPTY|ERR_INCOMPLETE|Failed to fetch/.test(text));
   await page.goto(`${task.pages}/status`);
   await page.waitForSelector(`text=${task.match}`);
   await shootSizes(page, seen, "status");

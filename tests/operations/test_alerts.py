@@ -1,22 +1,241 @@
-"""Each alert is sent once, to a real server."""
+"""Each alert is sent once to every channel, to real servers."""
 
-import socket
+import os
+import socketserver
 from datetime import UTC, datetime, timedelta
+from email import message_from_bytes
 from threading import Thread
-from types import SimpleNamespace
 
+import apprise
 import pytest
+from command_line import worldpose
 
 from data_contracts.operations import Arrival
-from flows.service.alerts import Alert, AlertDispatcher, FailedRun, alerts_now
+from flows.service.alerts import LONGEST_PAUSE, Alert, AlertDispatcher, FailedRun, alerts_now
+from flows.service.channels import Channel, apprise_mail, channels_of
 from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, UnitSummary
 from flows.service.plan import ServePlan
-from flows.service.senders import Webhook, senders_of
 from flows.service.watching import Trouble
 from worldpose.errors import UsageError
 
 NOW = datetime.now(UTC)
+ABSENT = Channel("absent", "http://127.0.0.1:9/secret")
+
+
+def hook(webhook):
+    return Channel("webhook", webhook.address)
+
+
+def tell(folder, channel, *alerts):
+    """Hold alerts and deliver them once, as after a restart; return the pause that follows [s]."""
+    dispatcher = AlertDispatcher(StateFolder(folder), [channel])
+    dispatcher.hold(alerts)
+    return dispatcher.deliver(channel)
+
+
+def many(count):
+    return [Alert(str(number), "quality", f"alert {number}") for number in range(count)]
+
+
+def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
+    alert = Alert("disk_low", "disk_low", "3.0 GB are free", "http://127.0.0.1:8571/status")
+    for _ in range(2):  # a restart repeats nothing
+        assert tell(tmp_path, hook(webhook), alert) == 0.0
+    content = {"alert": "disk_low", "match": "", "text": "3.0 GB are free", "link": alert.link}
+    assert webhook.posted == [("application/json", content)]
+    assert "secret" not in (tmp_path / "alerts.json").read_text()
+    tell(tmp_path, hook(webhook))  # what was over and is again is a new matter
+    tell(tmp_path, hook(webhook), alert)
+    assert len(webhook.posted) == 2
+    (tmp_path / "alerts.json").write_text('{"disk_low": ')
+    tell(tmp_path, hook(webhook), alert)
+    assert len(webhook.posted) == 3
+
+
+def test_a_failed_channel_is_tried_again_later_and_keeps_no_other_waiting(
+    webhook, tmp_path, caplog
+):
+    dispatcher = AlertDispatcher(StateFolder(tmp_path), [ABSENT, hook(webhook)])
+    dispatcher.hold(many(5))
+    pauses = [0.0]
+    for _ in range(10):
+        pauses.append(dispatcher.deliver(ABSENT, pauses[-1]))
+    assert pauses[1:4] == [30.0, 60.0, 120.0]
+    assert pauses[-1] == LONGEST_PAUSE
+    webhook.codes += [204, 500]
+    pause = dispatcher.deliver(dispatcher.channels[1])
+    assert (pause, len(webhook.posted)) == (30.0, 2)  # it stops at the first failure
+    assert dispatcher.deliver(dispatcher.channels[1], pause) == 0.0
+    posted = [each["text"] for _, each in webhook.posted]
+    assert posted == [f"alert {number}" for number in (0, 1, 1, 2, 3, 4)]
+    assert "webhook takes alerts again" in caplog.text
+    assert "secret" not in caplog.text
+    webhook.codes += [302, 307]  # a redirect is a failure and is not followed
+    for _ in range(2):
+        assert tell(tmp_path / "redirected", hook(webhook), *many(1)) == 30.0
+
+
+class Conversation(socketserver.StreamRequestHandler):
+    """A mail server's side of one session, as RFC 5321 has it."""
+
+    def handle(self):
+        self.say("220 test")
+        while line := self.rfile.readline():
+            verb, _, rest = line.decode().strip().partition(" ")
+            if verb.upper() == "RCPT":
+                self.server.receivers.append(rest[4:-1])
+            if verb.upper() == "DATA":
+                self.say("354 start mail input")
+                lines = b"".join(iter(self.rfile.readline, b".\r\n"))
+                self.server.letters.append(message_from_bytes(lines))
+            self.say("221 bye" if verb.upper() == "QUIT" else "250 ok")
+
+    def say(self, text):
+        self.wfile.write(f"{text}\r\n".encode())
+
+
+@pytest.fixture
+def mail_server():
+    """A mail server, which keeps letters."""
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Conversation) as server:
+        server.letters, server.receivers = [], []
+        Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+FILE = """
+webhook = "{webhook}"
+channels = ["json://127.0.0.1:9/other"]
+
+[mail]
+server = "smtp://127.0.0.1:{port}"
+sender = "worldpose@example.org"
+receivers = ["ada@example.org", "bob@example.org"]
+"""
+
+
+def write_settings(project, text, mode=0o600):
+    file = StateFolder(project / "operations").alert_settings
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    file.chmod(mode)
+    return file
+
+
+def test_channels_of_a_file_get_a_test_alert_by_a_command(mail_server, webhook, tmp_path):
+    text = FILE.format(webhook=webhook.address, port=mail_server.server_address[1])
+    file = write_settings(tmp_path, text)
+    command = ("serve", "--test-alerts", "--project", tmp_path)
+    answer = worldpose(*command)
+    accepted, failed, mailed = answer.out.splitlines()
+    assert (accepted, mailed) == (
+        "webhook: accepted a test alert",
+        "mail: accepted a test alert",
+    )
+    assert answer.code == 1 and failed.startswith("json: failed: A Connection error")
+    ((_, posted),) = webhook.posted
+    assert posted["alert"] == "test" and "arrive here" in posted["text"]
+    letter, _ = mail_server.letters
+    assert set(mail_server.receivers) == {"ada@example.org", "bob@example.org"}
+    assert "worldpose@example.org" in letter["From"]
+    assert letter["Subject"] == "worldpose: test"
+    assert "arrive here" in letter.get_payload(decode=True).decode()
+    # The environment comes first; a channel that fails is named, without its address.
+    webhook.codes = [403]
+    answer = worldpose(*command, "--json", environment={"WORLDPOSE_ALERT_URL": webhook.address})
+    problems = {"webhook": "it answered 403", "mail": ""}
+    assert (answer.code, answer.json["channels"]) == (1, problems)
+    assert "secret" not in answer.out + answer.err
+    file.unlink()
+    answer = worldpose(*command)
+    assert answer.code == 2 and "found none" in answer.err
+
+
+def test_a_letter_has_the_run_in_its_subject_on_one_line(mail_server, tmp_path):
+    port = mail_server.server_address[1]
+    mail = Channel("mail", apprise_mail(f"smtp://127.0.0.1:{port}/?to=ann@example.org"))
+    lines = "run m failed: it\nhas two lines"
+    assert tell(tmp_path, mail, Alert("1", "run_failed", lines, "http://here/run", "m")) == 0.0
+    (letter,) = mail_server.letters
+    assert letter["Subject"] == "worldpose: run failed, m"  # an error's lines become no headers
+    body = letter.get_payload(decode=True).decode()
+    assert body.split() == [*lines.split(), "http://here/run"]
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("smtps://ann:a%40b@mail.org/?to=a@b.org", ("mail.org", 465, "ssl", "ann", "a@b")),
+        ("smtp://ann:p@mail.org/?to=a@b.org", ("mail.org", 25, "starttls", "ann", "p")),
+        ("smtp://mail.org:2525/?to=a@b.org", ("mail.org", 2525, "insecure", None, None)),
+    ],
+)
+def test_a_password_goes_under_tls_alone(address, expected):
+    mail = apprise.Apprise.instantiate(apprise_mail(address))
+    assert (mail.smtp_host, mail.port, mail.secure_mode, mail.user, mail.password) == expected
+    assert mail.verify_certificate
+
+
+def test_channels_are_named_by_the_environment_and_a_bad_one_says_no_secret(tmp_path):
+    assert channels_of({}, tmp_path / "absent") == ()
+    slack = "slack://T1JJ3T3L2/A1BRTD4JD/TIiajkdnlazkcOXrIdevi7FQ"
+    found = channels_of(
+        {
+            "WORLDPOSE_ALERT_URL": f"http://hook/ {slack} {slack}/#two",
+            "WORLDPOSE_ALERT_MAIL": "smtps://a:b@mail.example.org/?to=c@example.org",
+        }
+    )
+    assert [each.name for each in found] == ["webhook", "slack", "slack 2", "mail"]
+    bad = ("mail.example.org", "smtp://ann:secret@mail/", "http://secret/?to=a", "smtp://x:y/")
+    addresses = ("file:///secret", "ftp://h/x", "//h/x", "http://", "http://h:99999/", "h/secret")
+    for variable, values in (("WORLDPOSE_ALERT_MAIL", bad), ("WORLDPOSE_ALERT_URL", addresses)):
+        for value in values:
+            with pytest.raises(UsageError, match=variable) as refused:
+                channels_of({variable: value})
+            assert value not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "problem"),
+    [
+        ("webhook = 'http://h/'", 0o644, "mode 644"),
+        ("webhook = http://secret/", 0o600, "may hold a secret"),
+        ("hook = 'http://secret/'", 0o600, "hook"),
+        ("channels = ['secret://x']", 0o600, "may hold a secret"),
+        ("[mail]\nserver = 'smtp://h'\nreceivers = []", 0o600, "mail.receivers"),
+        ("[mail]\nserver = 'secret'\nreceivers = ['a@b']", 0o600, "may hold a secret"),
+    ],
+)
+def test_a_bad_file_is_refused_without_its_secrets(text, mode, problem, tmp_path):
+    file = write_settings(tmp_path, text, mode)
+    with pytest.raises(UsageError, match=problem) as refused:
+        channels_of({}, file)
+    assert "http://secret" not in str(refused.value)
+
+
+def test_a_login_of_the_file_may_have_any_characters(tmp_path):
+    login = "server = 'smtps://h:4650'\nuser = 'a@b'\npassword = 'p:/?#@ä'"
+    file = write_settings(tmp_path, f"[mail]\n{login}\nreceivers = ['c+d@e.org']")
+    (channel,) = channels_of({}, file)
+    mail = apprise.Apprise.instantiate(channel.address)
+    assert (mail.smtp_host, mail.port, mail.user, mail.password) == ("h", 4650, "a@b", "p:/?#@ä")
+    assert mail.targets == [(False, "c+d@e.org")]
+
+
+def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
+    trouble = Trouble("looking at the inbox")
+    for _ in range(100):
+        with trouble.log_failure():
+            raise OSError(28, os.strerror(28))
+    with trouble.log_failure():
+        pass
+    assert [record.message for record in caplog.records] == [
+        "looking at the inbox failed: OSError: [Errno 28] No space left on device; "
+        "it is tried again",
+        "looking at the inbox works again",
+    ]
 
 
 @pytest.fixture
@@ -29,145 +248,6 @@ def plan(tmp_path):
         gate_hours=1.0,
         disk_gb=0.0,
     )
-
-
-def kinds(alerts):
-    return [alert.alert for alert in alerts]
-
-
-def test_each_matter_is_posted_once_as_json_with_text(webhook, tmp_path):
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
-    alert = Alert("disk_low", "disk_low", "3.0 GB are free", "http://127.0.0.1:8571/status")
-    assert teller.tell([alert]) == [alert]
-    assert teller.tell([alert]) == []
-    (posted,) = webhook.posted
-    assert posted == (
-        "application/json",
-        {"alert": "disk_low", "match": "", "text": "3.0 GB are free", "link": alert.link},
-    )
-    # A restart repeats nothing; what was over and is again is a new matter.
-    again = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
-    assert again.tell([alert]) == []
-    assert again.tell([]) == []
-    assert again.tell([alert]) == [alert]
-    assert "secret" not in (tmp_path / "alerts.json").read_text()
-
-
-def test_what_the_webhook_did_not_take_is_posted_again(webhook, tmp_path, caplog):
-    alert = Alert("disk_low", "disk_low", "little")
-    webhook.codes += [500]
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
-    assert teller.tell([alert]) == []
-    assert (
-        AlertDispatcher(StateFolder(tmp_path), [Webhook("http://127.0.0.1:9/secret")]).tell([alert])
-        == []
-    )
-    assert AlertDispatcher(StateFolder(tmp_path), [Webhook("no address")]).tell([alert]) == []
-    assert (
-        AlertDispatcher(StateFolder(tmp_path), [Webhook("file:///etc/passwd")]).tell([alert]) == []
-    )
-    assert AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)]).tell([alert]) == [
-        alert
-    ]
-    assert len(webhook.posted) == 2
-    assert "secret" not in caplog.text
-
-
-@pytest.fixture
-def silent():
-    """The address of a server that accepts connections and never answers."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"http://127.0.0.1:{server.getsockname()[1]}/secret"
-
-
-def many(count):
-    return [Alert(str(number), "quality", f"alert {number}") for number in range(count)]
-
-
-def test_a_silent_webhook_is_asked_once_and_then_left_for_a_while(
-    silent, tmp_path, caplog, monkeypatch
-):
-    """Sixty alerts were sixty times ten seconds, and a line of the log each, for ever."""
-    monkeypatch.setattr("flows.service.senders.ANSWER_SECONDS", 0.05)
-    clock = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr("flows.service.alerts.time", SimpleNamespace(monotonic=lambda: clock.now))
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(silent)])
-    for _ in range(2880):  # a day of looks
-        clock.now += 30.0
-        teller.tell(many(60))
-    told = [record.message for record in caplog.records if "did not take" in record.message]
-    assert 20 < len(told) < 35, "the pause doubles up to an hour"
-    assert "59 more" in told[0]
-    assert "secret" not in caplog.text
-
-
-def test_a_silent_webhook_keeps_no_mail_from_being_sent(silent, tmp_path):
-    class Box:
-        name, taken = "mail", []
-
-        def send(self, content):
-            self.taken.append(content["text"])
-
-    box, hook = Box(), Webhook(silent)
-    teller = AlertDispatcher(StateFolder(tmp_path), [hook, box])
-    teller.hold(many(60))
-    waiting = Thread(target=teller.deliver, args=[hook], daemon=True)
-    waiting.start()
-    teller.deliver(box)
-    assert len(box.taken) == 60
-    assert waiting.is_alive(), "the webhook is still waited for"
-    teller.hold([])  # nor does that keep others from saying what holds
-
-
-def test_delivery_stops_at_the_first_failure_and_goes_on_after_it(webhook, tmp_path, caplog):
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
-    webhook.codes += [204, 500]
-    assert [each.key for each in teller.tell(many(5))] == ["0"]
-    assert len(webhook.posted) == 2
-    assert [each.key for each in teller.tell(many(5))] == ["1", "2", "3", "4"]
-    assert [posted["text"] for _, posted in webhook.posted][2:] == [
-        f"alert {number}" for number in (1, 2, 3, 4)
-    ]
-    assert "takes alerts again" in caplog.text
-
-
-def test_a_redirect_is_a_failure_and_is_not_followed(webhook, tmp_path):
-    webhook.codes += [302, 307]
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)], pause=0.0)
-    assert teller.tell(many(1)) == []
-    assert teller.tell(many(1)) == []
-    assert len(webhook.posted) == 2
-
-
-@pytest.mark.parametrize(
-    "address",
-    ["file:///etc/passwd", "ftp://h/x", "//h/x", "http://", "http://h:99999/", "h/secret"],
-)
-def test_an_address_that_is_no_web_address_is_refused_at_start(address):
-    with pytest.raises(UsageError, match="WORLDPOSE_ALERT_URL") as caught:
-        senders_of({"WORLDPOSE_ALERT_URL": address})
-    assert "secret," not in str(caught.value).replace("hold a secret", "")
-    assert address not in str(caught.value)
-
-
-def test_damaged_notes_of_what_was_told_are_begun_anew(webhook, tmp_path):
-    (tmp_path / "alerts.json").write_text('{"disk_low": ')
-    teller = AlertDispatcher(StateFolder(tmp_path), [Webhook(webhook.address)])
-    assert len(teller.tell(many(1))) == 1
-
-
-def test_a_trouble_that_lasts_is_one_line_and_its_end_another(caplog):
-    trouble = Trouble("looking at the inbox")
-    for _ in range(100):
-        with trouble.log_failure():
-            raise OSError(28, "No space left on device")
-    with trouble.log_failure():
-        pass
-    assert [record.message for record in caplog.records] == [
-        "looking at the inbox failed: OSError: [Errno 28] No space left on device; "
-        "it is tried again",
-        "looking at the inbox works again",
-    ]
 
 
 def test_a_question_is_no_alert_before_its_time(plan):
@@ -185,11 +265,17 @@ def test_a_question_is_no_alert_before_its_time(plan):
 
 
 def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
-    unit = UnitSummary("clip", "done", objections=("offset_rms_m is 0.05, at most 0.03 passes",))
-    match = MatchStatus("m", stages={"body_fitting": (unit,)})
-    (poor,) = alerts_now(plan, [match], [], [])
-    assert poor.alert == "quality"
-    assert poor.text == "m/body_fitting/clip: offset rms: 0.05 m, limit 0.03 m"
+    def body(**unit):
+        return MatchStatus("m", stages={"body_fitting": (UnitSummary("clip", "done", **unit),)})
+
+    assert alerts_now(plan, [body(figures={"offset_rms_m": 0.01})], [], []) == []
+    (poor,) = alerts_now(
+        plan, [body(objections=("offset_rms_m is 0.05, at most 0.03 passes",))], [], []
+    )
+    assert (poor.alert, poor.text) == (
+        "quality",
+        "m/body_fitting/clip: offset rms: 0.05 m, limit 0.03 m",
+    )
     arrivals = [
         Arrival(name=state, state=state, reason="it is a link", changed_at=NOW)
         for state in ("arriving", "incomplete", "refused", "taken")
@@ -198,10 +284,5 @@ def test_quality_refusals_failed_runs_and_a_full_disk_are_alerts(plan):
     assert "refused in the inbox is refused: it is a link" in refused.text
     (failed,) = alerts_now(plan, [], [], [FailedRun("1f2e", "m", "crashed", "killed")])
     assert failed.link == "http://127.0.0.1:4200/runs/flow-run/1f2e"
-    full = plan.model_copy(update={"disk_gb": 1e9})
-    assert kinds(alerts_now(full, [], [], [])) == ["disk_low"]
-
-
-def test_a_good_match_raises_nothing(plan):
-    unit = UnitSummary("clip", "done", 1.0, {"offset_rms_m": 0.01})
-    assert alerts_now(plan, [MatchStatus("m", stages={"body_fitting": (unit,)})], [], []) == []
+    (full,) = alerts_now(plan.model_copy(update={"disk_gb": 1e9}), [], [], [])
+    assert full.alert == "disk_low"

@@ -1,12 +1,8 @@
 """An operator's day in a real browser: no command after `worldpose serve`."""
 
 import json
-import random
-import time
 import zipfile
 from pathlib import Path
-from signal import SIGKILL
-from threading import Thread
 
 import pytest
 from chromium import IN_BROWSER, drive
@@ -21,7 +17,6 @@ from worldpose.store.store import Store
 pytestmark = [*IN_BROWSER, pytest.mark.timeout(3600)]
 SCRIPT = Path(__file__).with_name("day_in_browser.mjs")
 SIZE = (1920, 1080)
-KILLS = 3
 
 
 @pytest.fixture
@@ -42,19 +37,7 @@ def recorded(tmp_path):
     return folder, clicks
 
 
-def kill_when_asked(served, signal, rng):
-    """Kill the service at a random moment after each signal of the browser, and start it again."""
-    for number in range(KILLS):
-        while not signal.with_suffix(f".{number}").exists():
-            time.sleep(0.2)
-        time.sleep(rng.uniform(0.0, 40.0))
-        served.end(SIGKILL)
-        served.begin()
-        signal.with_suffix(f".{number}.restarted").touch()
-
-
-@pytest.mark.parametrize("seed", [None, 1], ids=["undisturbed", "killed thrice"])
-def test_a_match_of_videos_becomes_results_by_clicks_alone(seed, served, recorded, tmp_path):
+def test_a_match_of_videos_becomes_results_by_clicks_alone(served, recorded, tmp_path):
     folder, clicks = recorded
     served.options = {"--videos": folder / "videos"}
     served.begin()
@@ -71,11 +54,7 @@ def test_a_match_of_videos_becomes_results_by_clicks_alone(seed, served, recorde
         "size": SIZE,
         "saved": str(saved),
         "patience": 1200,
-        "kills": None if seed is None else str(tmp_path / "kill"),
     }
-    if seed is not None:
-        killing = (served, tmp_path / "kill", random.Random(seed))
-        Thread(target=kill_when_asked, args=killing, daemon=True).start()
     seen = drive(SCRIPT, task, tmp_path, 3500)
     assert {name: value for name, value in seen.items() if "overflow" in name and value} == {}
     # The gate asks about the camera with the wrong click, over images of its video.

@@ -1,15 +1,12 @@
-"""Many matches at once, many small units, and a finished match run again."""
+"""Many small units, and a finished match run again."""
 
 import resource
 import shutil
-import subprocess
-import threading
 import time
 
-import psutil
 import pytest
 import yaml
-from command_line import WORLDPOSE, succeed
+from command_line import succeed
 
 from flows.method import METHOD
 from flows.registering import register
@@ -20,76 +17,11 @@ from worldpose.store.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600), pytest.mark.usefixtures("server")]
 
-MATCHES = 10
 CAMERAS = 5000
 """Each is two small units, of `ingest` and of `static_calibration`."""
 WORKERS = 2
 MOST_OVERHEAD = 0.01
 """Of a small unit, more than in a plain loop of the same functions [s of processor]."""
-
-
-class Memory:
-    """The most memory that any worker below some processes had while this was the context [MB]."""
-
-    def __init__(self, pids):
-        self.pids, self.most, self.is_over = pids, 0.0, threading.Event()
-
-    def __enter__(self):
-        self.thread = threading.Thread(target=self.look)
-        self.thread.start()
-        return self
-
-    def __exit__(self, *error):
-        self.is_over.set()
-        self.thread.join()
-
-    def look(self):
-        while not self.is_over.wait(0.5):
-            for pid in self.pids:
-                for each in psutil.Process(pid).children(recursive=True):
-                    self.most = max(self.most, each.memory_info().rss / 1e6)
-
-
-def test_ten_matches_at_once_take_no_more_memory_and_hardly_more_time(dask, tmp_path, capsys):
-    address, workers = dask
-    folders = [tmp_path / f"match-{number}" for number in range(MATCHES)]
-    for number, folder in enumerate(folders):
-        small = {"duration": 0.2, "cameras": 3, "players": 2}
-        bare = {"calibrated": True, "stills": False, "video": False}
-        simulate_match(SCENARIOS["tiny"], number, folder, MatchOptions(**small, **bare))
-
-    def command(folder, project):
-        return ["run", str(folder), "--project", str(project), "--dask", address]
-
-    def one_by_one(some):
-        began = time.monotonic()
-        for folder in some:
-            succeed(*command(folder, tmp_path / "one-by-one"))
-        return time.monotonic() - began
-
-    succeed(*command(folders[0], tmp_path / "first"))  # workers load what they need
-    # Half of them before and half after: what else the machine does is then in both.
-    half = MATCHES // 2
-    with Memory(workers) as alone:
-        sequential = one_by_one(folders[:half])
-    began = time.monotonic()
-    with Memory(workers) as together:
-        running = [
-            subprocess.Popen(
-                [*WORLDPOSE, *command(folder, tmp_path / "together")],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            for folder in folders
-        ]
-        assert [process.wait() for process in running] == [0] * MATCHES
-    at_once = time.monotonic() - began
-    sequential += one_by_one(folders[half:])
-    with capsys.disabled():
-        print(f"\n{sequential:.0f} s one by one, {at_once:.0f} s at once;", end=" ")
-        print(f"{alone.most:.0f} and {together.most:.0f} MB a worker")
-    assert together.most <= 1.1 * alone.most
-    assert at_once <= sequential / 0.9
 
 
 def test_ten_thousand_small_units_are_computed_and_found_again(tmp_path, capsys):

@@ -14,10 +14,10 @@ from flows.orchestration.prefect_environment import (
     CLIENT_LOGIN,
     SERVER_LOGIN,
     new_login,
+    problem_at,
     served_environment,
 )
 from flows.service.plan import ServePlan
-from flows.service.serving import answers
 from worldpose.store.integrity import verify
 from worldpose.store.store import Store
 
@@ -36,7 +36,7 @@ def prefect_on_postgres(postgres, tmp_path):
     environment[SERVER_LOGIN] = LOGIN
     program = [sys.executable, "-m", "flows.service.child", "prefect", plan.model_dump_json()]
     server = subprocess.Popen(program, stdin=subprocess.PIPE, env=environment)
-    wait_until(lambda: answers(f"{api}/health"))
+    wait_until(lambda: not problem_at(f"{api}/health"))
     yield api
     server.stdin.close()  # it ends with its standard input
     server.wait(60)

@@ -1,88 +1,67 @@
 """Runs that restart automatically."""
 
-import asyncio
 from datetime import UTC, datetime, timedelta
-from types import SimpleNamespace
-from uuid import uuid4
 
 import pytest
-from prefect.client.schemas.objects import FlowRun
-from prefect.states import Completed, Crashed, Failed, Pending, Running
 
 from flows.service import recovery
-from flows.service.recovery import (
-    DEATHS,
-    MOST_BEGINNINGS,
-    MOST_SERVICE_DEATHS,
-    may_restart,
-)
+from flows.service.match_runs import MatchRuns
+from flows.service.plan import ServePlan
+from flows.service.recovery import DEATHS, MOST_BEGINNINGS, MOST_SERVICE_DEATHS, may_restart
 
 LOST = "Flow run encountered an exception: LostWorkersError: the Dask scheduler was lost"
+KILLED = "its process was killed"
+
+
+def ended(kind, message=KILLED, count=1, labels=None):
+    state = {"type": kind, "message": message}
+    return {"state": state, "state_type": kind, "run_count": count, "labels": labels}
 
 
 @pytest.mark.parametrize(
-    ("state", "again"),
+    ("run", "again"),
     [
-        (Crashed(message="its process was killed"), True),
-        (Failed(message=LOST), True),
-        (Failed(message="Flow run encountered an exception: IncompleteRunError: 1 failed"), False),
-        (Completed(), False),
+        (ended("CRASHED"), True),
+        (ended("FAILED", LOST), True),
+        (ended("FAILED", "Flow run encountered an exception: IncompleteRunError"), False),
+        (ended("COMPLETED"), False),
+        (ended("CRASHED", count=MOST_BEGINNINGS), False),
+        # A start that ended with the whole service does not count.
+        (ended("CRASHED", count=MOST_BEGINNINGS, labels={DEATHS: 1}), True),
+        (ended("CRASHED", count=MOST_BEGINNINGS + 1, labels={DEATHS: 1}), False),
+        (ended("CRASHED", count=MOST_BEGINNINGS + MOST_SERVICE_DEATHS, labels={DEATHS: 99}), False),
     ],
 )
-def test_runs_begin_again_that_ended_by_no_fault_of_their_own(state, again):
-    run = FlowRun(flow_id=uuid4(), state=state, state_type=state.type, run_count=1)
+def test_runs_begin_again_that_ended_by_no_fault_of_their_own(run, again):
     assert may_restart(run) is again
-    tired = run.model_copy(update={"run_count": MOST_BEGINNINGS})
-    assert not may_restart(tired)
-
-
-def test_a_start_that_ended_with_the_whole_service_does_not_count():
-    state = Crashed(message="its process was killed")
-    run = FlowRun(flow_id=uuid4(), state=state, state_type=state.type, run_count=MOST_BEGINNINGS)
-    assert not may_restart(run)
-    killed = run.model_copy(update={"labels": {DEATHS: 1}})
-    assert may_restart(killed)
-    assert not may_restart(killed.model_copy(update={"run_count": MOST_BEGINNINGS + 1}))
-    often = {"labels": {DEATHS: 99}, "run_count": MOST_BEGINNINGS + MOST_SERVICE_DEATHS}
-    assert not may_restart(run.model_copy(update=often))
-
-
-class Server:
-    """A Prefect server with one run, whose process is gone or at work."""
-
-    def __init__(self, run):
-        self.run, self.given = run, []
-
-    async def __aenter__(self):
-        return self
-
-    async def __aexit__(self, *error):
-        pass
-
-    async def read_flow_runs(self, *, flow_run_filter, **page):
-        return [self.run] if self.run.state_type in flow_run_filter.state.type.any_ else []
-
-    async def set_flow_run_state(self, flow_run_id, state, *, force):
-        self.given.append(state.name)
-        self.run = self.run.model_copy(update={"state": state, "state_type": state.type})
 
 
 @pytest.mark.parametrize("is_alive", [False, True])
 @pytest.mark.parametrize(
     ("kind", "minutes", "is_due"),
-    [(Running, 1, False), (Running, 2, True), (Pending, 4, False), (Pending, 6, True)],
+    [("RUNNING", 1, False), ("RUNNING", 2, True), ("PENDING", 4, False), ("PENDING", 6, True)],
 )
 def test_a_run_whose_process_is_gone_begins_again_also_while_it_starts(
-    kind, minutes, is_due, is_alive, monkeypatch
+    kind, minutes, is_due, is_alive, monkeypatch, tmp_path
 ):
-    at = datetime.now(UTC) - timedelta(minutes=minutes)
-    state = kind().model_copy(update={"timestamp": at})
-    run = FlowRun(flow_id=uuid4(), name="inbox", state=state, state_type=state.type, run_count=1)
-    server = Server(run.model_copy(update={"infrastructure_pid": "host:4711"}))
-    monkeypatch.setattr(recovery, "get_client", lambda: server)
+    at = (datetime.now(UTC) - timedelta(minutes=minutes)).isoformat()
+    run = {**ended(kind), "id": "1f2e", "name": "inbox", "expected_start_time": at}
+    run["state"]["timestamp"], run["infrastructure_pid"] = at, "4711"
+    given = []
+
+    def set_state(prefect, run_id, kind, message, name=None):
+        given.append(name or kind)
+        run["state"]["type"] = run["state_type"] = kind
+
+    def runs(prefect, names, *, state):
+        return [run] if run["state_type"] in state["type"]["any_"] else []
+
+    monkeypatch.setattr(MatchRuns, "set_state", set_state)
+    monkeypatch.setattr(MatchRuns, "runs", runs)
     monkeypatch.setattr(recovery, "is_alive", lambda pid: pid == 4711 and is_alive)
-    plan = SimpleNamespace(owns_prefect=True, name="worldpose")
-    again = asyncio.run(recovery.restart_lost_runs(plan))
+    api = "http://127.0.0.1:9/api"
+    plan = ServePlan(project=str(tmp_path), inbox=tmp_path, state=tmp_path, prefect=api)
+    again = recovery.restart_lost_runs(plan)
     expected = is_due and not is_alive
     assert again == (["inbox"] if expected else [])
-    assert server.given == (["Crashed", "AwaitingRetry"] if expected else [])
+    assert given == (["CRASHED", "AwaitingRetry"] if expected else [])

@@ -28,16 +28,3 @@ def test_a_log_is_set_aside_while_its_process_writes_on(tmp_path, monkeypatch):
     kept = (log.with_suffix(".log.1").read_bytes() + log.read_bytes()).decode()
     assert "\0" not in kept
     assert kept.endswith(f"{199:010d}" * 10 + "\n")
-
-
-def test_a_log_on_a_full_disk_makes_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(serving, "LOG_BYTES", 1000)
-    log = tmp_path / "pages.log"
-    log.write_text("x" * 2000)
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(serving.shutil, "copyfile", full)
-    serving.bound_log(log)
-    assert log.stat().st_size == 0

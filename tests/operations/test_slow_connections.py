@@ -8,9 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from statistics import quantiles
 
-import pytest
 from page_client import TOKEN
 from service import free_ports
 from websockets.sync.client import connect
@@ -193,33 +191,3 @@ def test_a_web_socket_may_be_silent_beside_slow_connections(tmp_path):
     finally:
         server.terminate()
         server.wait(60)
-
-
-@pytest.mark.slow
-def test_eleven_hundred_slow_connections(tmp_path, capsys):
-    """As many as end a server with 1,024 files that waits for each of them."""
-    if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 4096:
-        pytest.skip("this process may not open so many connections")
-    with pages(tmp_path, files=1024) as (port, log, server):
-        quiet = [seconds_of(port) for _ in range(50)]
-        size = log.stat().st_size
-        took, left = attack(port, 1100, 45.0)
-        with capsys.disabled():
-            print(
-                f"\n{len(took)} requests during 1,100 slow connections: "
-                f"p50 {1e3 * quantiles(took, n=100)[49]:.0f} ms, "
-                f"p99 {1e3 * quantiles(took, n=100)[98]:.0f} ms, "
-                f"most {1e3 * max(took):.0f} ms (before: p50 {1e3 * sorted(quiet)[25]:.0f} ms); "
-                f"{left} left open, log grew by {log.stat().st_size - size} bytes",
-                file=sys.stderr,
-            )
-        assert left <= 200
-        assert log.stat().st_size - size < 10_000
-        assert quantiles(took, n=100)[98] < 1.0
-        assert server.poll() is None
-
-
-def seconds_of(port):
-    began = time.monotonic()
-    assert ask(port) == 200
-    return time.monotonic() - began

@@ -11,7 +11,6 @@ from flows.service.layout import StateFolder
 from flows.service.overview import MatchStatus, Overview, UnitSummary
 from flows.service.status_page import (
     MAX_DETAILS,
-    STYLE,
     UNSEEN_SECONDS,
     StatusRow,
     status_html,
@@ -60,7 +59,8 @@ def test_strangers_see_nothing_and_others_the_matches_by_stage(app, project_copy
     assert text.count(OWN) == 1
     assert "<script" not in text.replace(OWN, "")
     assert "&lt;script&gt;" in text
-    assert browser.get("/status/page.css").text == STYLE
+    for path in ("/status/page.css", "/status/page.js"):
+        assert browser.get(path).status_code == 200
     answer = browser.get("/api/status").json()
     (match,) = answer["matches"]
     assert (match["match"], match["state"]) == (TINY, "complete")

@@ -13,8 +13,6 @@ from page_client import log_in, served
 
 from flows.registering import register
 from flows.service.overview import Overview
-from worldpose.errors import InputError
-from worldpose.ingest.match_folder import read_match
 from worldpose.store.store import Store
 
 
@@ -76,16 +74,6 @@ def test_status_names_a_folder_without_permission_and_shows_the_others(locked):
     assert '"problems"' in answer.stdout
 
 
-def test_another_match_can_be_registered_beside_a_folder_without_permission(locked, small_match):
-    third = Path(shutil.copytree(small_match, locked / "third"))
-    text = (third / "match.yaml").read_text()
-    (third / "match.yaml").write_text(re.sub("match_id: .*", "match_id: third", text))
-    file = third / "pitch.json"
-    file.write_text(file.read_text() + "\n\n")
-    answer = without_rights("ingest", third, "--project", locked / "project")
-    assert answer.returncode == 0, answer.stderr
-
-
 def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
     browser = log_in(served(stale_mount / "project"), "Ada")
     answer = browser.get("/api/matches")
@@ -96,11 +84,6 @@ def test_pages_show_the_others_beside_a_stale_mount(stale_mount):
     assert browser.get("/api/matches/first").status_code == 422
     assert browser.get("/api/matches/second").status_code == 200
     assert browser.get("/status").status_code == 200
-
-
-def test_a_match_folder_that_does_not_answer_is_one_clear_refusal(stale_mount):
-    with pytest.raises(InputError, match=r"first.*Stale file handle.*Mount its disk"):
-        read_match(stale_mount / "first")
 
 
 @pytest.mark.parametrize("record", ["runs/first/0001.json", "matches/first.json"])
