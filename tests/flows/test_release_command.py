@@ -8,7 +8,7 @@ import pytest
 from command_line import TINY, succeed, worldpose
 
 from worldpose.errors import InputError
-from worldpose.simulation.recordings import read_bvh
+from worldpose.simulation.recorded_files import read_bvh
 from worldpose.store.garbage import plan_gc
 from worldpose.store.runs import list_pins
 from worldpose.store.store import Store
